@@ -22,6 +22,7 @@ from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import AlarmChanged, publish
 from ground_service.ground import Ground
 from ground_service.store import parameters, telemetry
+from ground_service.store.vehicles import lock_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.timescales import format_utc
@@ -43,7 +44,7 @@ def examine_packets(ground: Ground, vehicle: int) -> int:
         ground.check_stopping()
         with ground.database.writing() as connection:
             # Ids of packets that other transactions are storing may be smaller than those already visible.
-            parameters.lock_vehicle(connection, vehicle)
+            lock_vehicle(connection, vehicle)
             packets = parameters.packets_after(
                 connection, vehicle, store.position(connection, vehicle), core.WATCHED_APIDS, BATCH
             )

@@ -16,7 +16,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.ingest.edges import MIDDLE, OPENER, UNKNOWN, Edge
 from ground_service.ingest.stream import BARE, Link
-from ground_service.store.repository import KNOWN_LINKS, PIECES, STREAM_EDGES
+from ground_service.store.repository import GOOD_LINKS, KNOWN_LINKS, PIECES, STREAM_EDGES, VEHICLES
 from tmtc.link import LinkSettings
 
 DIGEST_OCTETS = 16
@@ -207,6 +207,48 @@ def learn_link(connection: Connection, scope: str, link: Link) -> None:
         KNOWN_LINKS,
         [{"scope": scope, "digest": link_digest(link), "settings": _settings(link)}],
     )
+
+
+def good_links(connection: Connection, piece: Piece, station: str | None) -> list[LinkSettings]:
+    """Return the last good settings of the spacecraft of a piece, of one station or of any, newest first."""
+    query = (
+        select(GOOD_LINKS.c.vehicle_id, GOOD_LINKS.c.station, GOOD_LINKS.c.settings)
+        .join(VEHICLES, VEHICLES.c.id == GOOD_LINKS.c.vehicle_id)
+        .where(VEHICLES.c.instance == piece.scope)
+        .order_by(GOOD_LINKS.c.id.desc())
+        .limit(_BLOCK)
+    )
+    if station is not None:
+        query = query.where(GOOD_LINKS.c.station == station)
+    if piece.spacecraft_id is not None:
+        query = query.where(VEHICLES.c.ccsds_id == piece.spacecraft_id)
+    newest: dict[tuple[int, str], LinkSettings] = {}
+    for vehicle, place, settings in connection.execute(query):
+        newest.setdefault((vehicle, place), LinkSettings(**settings))
+    return list(newest.values())
+
+
+def add_good_link(
+    connection: Connection, piece: Piece, vehicle: int, settings: LinkSettings, now_utc_ns: int
+) -> bool:
+    """Add good settings of a vehicle; return False if they are its last ones of the station of the piece."""
+    last = connection.execute(
+        select(GOOD_LINKS.c.settings)
+        .where(GOOD_LINKS.c.vehicle_id == vehicle, GOOD_LINKS.c.station == piece.station)
+        .order_by(GOOD_LINKS.c.id.desc())
+        .limit(1)
+    ).scalar()
+    if last == asdict(settings):
+        return False
+    values = {
+        "vehicle_id": vehicle,
+        "station": piece.station,
+        "settings": asdict(settings),
+        "ingest_id": piece.ingest_id,
+        "since_utc_ns": now_utc_ns,
+    }
+    connection.execute(insert(GOOD_LINKS).values(values))
+    return True
 
 
 def link_digest(link: Link) -> str:

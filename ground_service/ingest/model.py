@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from pydantic import Field
 
 from ground_service.http.model import Entity
@@ -19,6 +17,95 @@ class IngestAccepted(Entity):
     octets: int
 
 
+class ReceivedSection(Entity):
+    """Octets [start, stop) of a file, the settings of their link, and the origin of the settings."""
+
+    start: int
+    stop: int
+    source: str = Field(description="stated, mission, remembered or proposed", examples=["mission"])
+    frame_length: int = Field(examples=[1115])
+    cadu_length: int = Field(examples=[1279])
+    coding: str = Field(examples=["rs"])
+    interleave: int | None
+    rs_errors: int | None
+    dual_basis: bool | None
+    randomiser: str = Field(examples=["legacy"])
+    checksum: bool
+
+
+class ReceivedLink(Entity):
+    """Link quality of one file, see `ingest.quality.LinkQuality`; null: unknown."""
+
+    station: str = Field(description="Empty: not stated", examples=["madrid"])
+    ambiguous: bool = Field(description="Other link settings have equal support")
+    frames: int
+    frames_good: int
+    codewords: int
+    codewords_lost: int
+    symbols_corrected: int
+    wrong_bits: int
+    checked_bits: int
+    bit_error_rate: float | None
+    lock_losses: int
+    frames_inverted: int
+    octets: int
+    octets_frames: int
+    octets_records: int
+    octets_other: int
+    first_utc_ns: int | None
+    last_utc_ns: int | None
+    sections: tuple[ReceivedSection, ...]
+
+
+class ReceivedControlWords(Entity):
+    """Telecommand channel of a spacecraft as reported in the frames of one file, see `tmtc.clcw.UplinkSeen`."""
+
+    spacecraft_id: int
+    virtual_channel: int
+    frames: int
+    changes: int
+    frames_lockout: int
+    frames_wait: int
+    frames_retransmit: int
+    frames_no_rf: int
+    report_value: int
+    farm_b_counter: int
+    lockout: bool
+    wait: bool
+    retransmit: bool
+    no_rf_available: bool
+    no_bit_lock: bool
+
+
+class IngestResult(Entity):
+    """Content of an ingested file, and the new part of it.
+
+    `first_ticks` and `last_ticks` are the earliest and the latest on-board time of the complete packets in the file.
+    """
+
+    ingest_id: int
+    vehicle_id: int | None
+    octets: int
+    packets: int
+    packets_new: int = Field(description="Packets that were not in the archive")
+    packets_joined: int = Field(description="Packets completed with earlier files")
+    packets_repeated: int
+    samples: int
+    crc_errors: int
+    octets_skipped: int
+    octets_pending: int = Field(description="Octets that wait for the octets before or after them")
+    frames: int
+    frames_bad: int
+    frames_joined: int = Field(description="Frames completed with earlier files")
+    symbols_corrected: int
+    unknown: int = Field(description="Packets without a definition")
+    first_ticks: int | None = None
+    last_ticks: int | None = None
+    vehicle_ids: tuple[int, ...] = Field(default=(), description="Vehicles whose packets the file contains")
+    reception: ReceivedLink | None = Field(default=None, description="null: bare packets")
+    uplink: tuple[ReceivedControlWords, ...] = ()
+
+
 class Ingest(Entity):
     """One ingest of one file."""
 
@@ -29,4 +116,4 @@ class Ingest(Entity):
     finished: UtcTime | None
     error: str | None
     dictionary_version: int = Field(examples=[1])
-    accounting: dict[str, Any]
+    accounting: IngestResult | None = Field(description="null: not ingested yet, or by an earlier version")

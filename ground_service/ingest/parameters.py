@@ -16,8 +16,9 @@ from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import PacketDefinitions, packet_definitions
 from ground_service.missions.model import EPOCH_TAI, PacketTime
-from ground_service.store import parameters, repository
+from ground_service.store import parameters
 from ground_service.store.parameters import Decoding, StoredPackets
+from ground_service.store.vehicles import get_vehicle, lock_vehicle
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import (
     NS,
@@ -58,14 +59,16 @@ def decode_declared(ground: Ground, vehicle: int) -> int:
 
 
 def definitions_in_force(connection: Connection, vehicle: int) -> tuple[PacketDefinitions, int]:
-    """Return the packets that the newest mission description of a spacecraft declares, and the id of its revision."""
-    spacecraft = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")["ccsds_id"]
-    return definitions_of_spacecraft(connection, int(spacecraft))
+    """Return the packets that are declared for a vehicle, and the id of the revision that declares them."""
+    found = get_vehicle(connection, vehicle)
+    return definitions_of_spacecraft(connection, found.ccsds_id, found.instance)
 
 
-def definitions_of_spacecraft(connection: Connection, spacecraft: int) -> tuple[PacketDefinitions, int]:
-    """As `definitions_in_force`, by spacecraft id."""
-    mission_id = missions.newest_of_spacecraft(connection, spacecraft)
+def definitions_of_spacecraft(
+    connection: Connection, spacecraft: int, instance: str
+) -> tuple[PacketDefinitions, int]:
+    """As `definitions_in_force`, by spacecraft id and instance."""
+    mission_id = missions.packets_in_force(connection, spacecraft, instance)
     if mission_id is None:
         return PacketDefinitions("", ()), 0
     return packet_definitions(missions.get_mission(connection, mission_id)), mission_id
@@ -73,7 +76,7 @@ def definitions_of_spacecraft(connection: Connection, spacecraft: int) -> tuple[
 
 def _next_block(connection: Connection, vehicle: int) -> int | None:
     """Decode the next packets; None if none are left."""
-    parameters.lock_vehicle(connection, vehicle)
+    lock_vehicle(connection, vehicle)
     definitions, mission_id = definitions_in_force(connection, vehicle)
     if not definitions.declared:
         parameters.forget_others(connection, vehicle, None)

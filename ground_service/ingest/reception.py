@@ -7,17 +7,16 @@ settings follow from the evidence of the file. Only settings that the sender sta
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection
 
 from ground_service.access.service import audit
-from ground_service.ingest.edge_store import Piece
+from ground_service.ingest.edge_store import Piece, add_good_link, good_links
 from ground_service.ingest.quality import NO_RECORD, RecordFormat
 from ground_service.missions.model import FrameSettings, Link, StationLink
 from ground_service.missions.store import links_in_force
-from ground_service.store import repository
 from tmtc.link import LinkSettings
 
 STATED, MISSION, REMEMBERED, PROPOSED = "stated", "mission", "remembered", "proposed"
@@ -106,26 +105,6 @@ def _record(station: StationLink) -> RecordFormat:
     )
 
 
-def good_links(connection: Connection, piece: Piece, station: str | None) -> list[LinkSettings]:
-    """Return the last good settings of the spacecraft of a piece, of one station or of any, newest first."""
-    table, vehicles = repository.GOOD_LINKS, repository.VEHICLES
-    query = (
-        select(table.c.vehicle_id, table.c.station, table.c.settings)
-        .join(vehicles, vehicles.c.id == table.c.vehicle_id)
-        .where(vehicles.c.instance == piece.scope)
-        .order_by(table.c.id.desc())
-        .limit(64)
-    )
-    if station is not None:
-        query = query.where(table.c.station == station)
-    if piece.spacecraft_id is not None:
-        query = query.where(vehicles.c.ccsds_id == piece.spacecraft_id)
-    newest: dict[tuple[int, str], LinkSettings] = {}
-    for vehicle, place, settings in connection.execute(query):
-        newest.setdefault((vehicle, place), LinkSettings(**settings))
-    return list(newest.values())
-
-
 def remember_link(
     connection: Connection,
     piece: Piece,
@@ -134,24 +113,8 @@ def remember_link(
     now_utc_ns: int,
 ) -> None:
     """Record settings under which frames of spacecraft were valid, if they differ from the last ones."""
-    table = repository.GOOD_LINKS
     for vehicle in vehicles:
-        last = connection.execute(
-            select(table.c.settings)
-            .where(table.c.vehicle_id == vehicle, table.c.station == piece.station)
-            .order_by(table.c.id.desc())
-            .limit(1)
-        ).scalar()
-        if last == asdict(settings):
+        if not add_good_link(connection, piece, vehicle, settings, now_utc_ns):
             continue
-        repository.add(
-            connection,
-            table,
-            vehicle_id=vehicle,
-            station=piece.station,
-            settings=asdict(settings),
-            ingest_id=piece.ingest_id,
-            since_utc_ns=now_utc_ns,
-        )
         detail = {"ingest_id": piece.ingest_id, "station": piece.station, "settings": describe(settings)}
         audit(connection, ACTOR, "remember link settings", f"vehicle {vehicle}", detail)

@@ -6,11 +6,10 @@ files or on how often they came. An ingest that was cut off can simply be run ag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -19,13 +18,14 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput
 from ground_service.ground import Ground
 from ground_service.ingest import edge_store as edges
+from ground_service.ingest import store
 from ground_service.ingest.frames import ChannelEdge, is_checked
 from ground_service.ingest.joining import Joiner
+from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
 from ground_service.ingest.packets import PacketBatch
-from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
+from ground_service.ingest.parameters import decode_declared, definitions_in_force, definitions_of_spacecraft
 from ground_service.ingest.reception import ExpectedLink, expected_link, remember_link
-from ground_service.ingest.redecode import catch_up
-from ground_service.ingest.store import store_batch
+from ground_service.ingest.redecode import catch_up, redecode
 from ground_service.ingest.stream import (
     BARE,
     CADU_MAX_OCTETS,
@@ -37,13 +37,15 @@ from ground_service.ingest.stream import (
     fragment_edges,
     reaches_of,
 )
+from ground_service.jobs.model import Job
 from ground_service.jobs.service import OTHER_REQUEST, add_job
+from ground_service.jobs.store import find_job
 from ground_service.missions.definitions import PacketDefinitions
-from ground_service.store import parameters, repository
+from ground_service.store import parameters
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
-from ground_service.store.stored_files import register_file
-from ground_service.store.vehicles import FLOWN
+from ground_service.store.stored_files import recorded_name, register_file
+from ground_service.store.vehicles import FLOWN, all_vehicles
 from tmtc.arrays import as_octets
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
@@ -67,41 +69,6 @@ class Place:
 
     stream: str
     offset: int
-
-
-@dataclass(frozen=True, slots=True)
-class IngestResult:
-    """Content of an ingested file, and the new part of it.
-
-    `packets_joined` is the number of packets completed with earlier files, `frames_joined` that of frames.
-    `octets_pending` cannot be used yet: they wait for the octets before or after them. `first_ticks` and
-    `last_ticks` are the earliest and the latest on-board time of the complete packets in the file, None without any.
-    `vehicle_ids` are the vehicles whose packets it contains. `reception` is the link quality with the sections of the
-    file and the origin of their settings; None for bare packets. `uplink` contains a `tmtc.clcw.UplinkSeen` for each
-    spacecraft and telecommand channel reported in the frames.
-    """
-
-    ingest_id: int
-    vehicle_id: int | None
-    octets: int
-    packets: int
-    packets_new: int
-    packets_joined: int
-    packets_repeated: int
-    samples: int
-    crc_errors: int
-    octets_skipped: int
-    octets_pending: int
-    frames: int
-    frames_bad: int
-    frames_joined: int
-    symbols_corrected: int
-    unknown: int
-    first_ticks: int | None = None
-    last_ticks: int | None = None
-    vehicle_ids: tuple[int, ...] = ()
-    reception: dict[str, Any] | None = None
-    uplink: tuple[dict[str, Any], ...] = ()
 
 
 def ingest_file(
@@ -195,17 +162,8 @@ def add_ingest(
         _check_link(link)
     now = utc_now_ns()
     register_file(connection, stored, "downlink", name, now)
-    ingest_id = int(
-        repository.add(
-            connection,
-            repository.INGESTS,
-            vehicle_id=None,
-            file_sha256=stored.sha256,
-            state=state,
-            dictionary_version=DICTIONARY.version,
-            received_utc_ns=now,
-            accounting={},
-        )
+    ingest_id = store.add_ingest(
+        connection, stored.sha256, state=state, dictionary_version=DICTIONARY.version, now_utc_ns=now
     )
     edges.add_piece(
         connection,
@@ -254,7 +212,7 @@ def enter_ingest(
     with ground.database.writing() as connection:
         if job_id is not None:
             hold(connection, f"job {job_id}")
-            known = repository.find(connection, repository.JOBS, id=job_id)
+            known = find_job(connection, job_id)
             if known is not None:
                 return _known_ingest(connection, known, stored, spacecraft_id, instance), job_id
         ingest_id = add_ingest(
@@ -273,17 +231,16 @@ def enter_ingest(
 
 def _known_ingest(
     connection: Connection,
-    job: Mapping[str, Any],
+    job: Job,
     stored: StoredFile,
     spacecraft_id: int | None,
     instance: str,
 ) -> int:
     """Return the ingest of an existing job with the same file and the same spacecraft."""
     asked = {"spacecraft_id": spacecraft_id, "instance": instance}
-    if job["kind"] == "ingest" and asked.items() <= job["arguments"].items():
-        ingest_id = int(job["arguments"]["ingest_id"])
-        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
-        if record["file_sha256"] == stored.sha256:
+    if job.kind == "ingest" and asked.items() <= job.arguments.items():
+        ingest_id = int(job.arguments["ingest_id"])
+        if store.get_ingest(connection, ingest_id).sha256 == stored.sha256:
             return ingest_id
     raise Conflict(OTHER_REQUEST)
 
@@ -299,8 +256,7 @@ def run_ingest(
     `progress` is called with the stored share of the file, several times for a long file.
     """
     with ground.database.writing() as connection:
-        repository.get(connection, repository.INGESTS, ingest_id, "ingest")
-        repository.change(connection, repository.INGESTS, ingest_id, state="running")
+        store.start_ingest(connection, ingest_id)
     return _run(ground, ingest_id, progress=progress)
 
 
@@ -316,26 +272,10 @@ def _run_held(ground: Ground, ingest_id: int, progress: Progress | None) -> Inge
         raise
     except (GroundError, TmtcError) as error:
         with ground.database.writing() as connection:
-            repository.change(
-                connection,
-                repository.INGESTS,
-                ingest_id,
-                state="failed",
-                error=str(error),
-                finished_utc_ns=utc_now_ns(),
-            )
+            store.fail_ingest(connection, ingest_id, str(error), utc_now_ns())
         raise
     with ground.database.writing() as connection:
-        repository.change(
-            connection,
-            repository.INGESTS,
-            ingest_id,
-            state="done",
-            error=None,
-            vehicle_id=result.vehicle_id,
-            finished_utc_ns=utc_now_ns(),
-            accounting=asdict(result),
-        )
+        store.finish_ingest(connection, result, utc_now_ns())
     return result
 
 
@@ -353,9 +293,7 @@ def _read_piece(
         late = _Reading(ground, other, None, vehicles=reading.vehicles)
         late.read()
         with ground.database.writing() as connection:
-            repository.change(
-                connection, repository.INGESTS, other.ingest_id, accounting=asdict(late.result())
-            )
+            store.change_result(connection, late.result())
     for vehicle in reading.vehicles.values():
         catch_up(ground, vehicle)
         decode_declared(ground, vehicle)
@@ -363,7 +301,7 @@ def _read_piece(
 
 
 def apply_definition(ground: Ground, vehicle: int) -> int:
-    """Decode a vehicle's packets with the newest mission description; return the number of samples.
+    """Decode a vehicle's packets with the definitions in force for it; return the number of samples.
 
     Packets without a checksum that no earlier description declared are not stored yet: the raw files are read again.
     """
@@ -379,11 +317,24 @@ def apply_definition(ground: Ground, vehicle: int) -> int:
     return stored + decode_declared(ground, vehicle)
 
 
-def undecoded_vehicles(ground: Ground, spacecraft_id: int) -> list[int]:
-    """Return the vehicles of a spacecraft whose packets are not decoded with its newest mission description."""
+def decode_all_again(ground: Ground) -> int:
+    """Decode all packets with this version's dictionary and the mission descriptions; return the number of rows."""
     with ground.database.reading() as connection:
-        definitions, _ = definitions_of_spacecraft(connection, spacecraft_id)
-        return parameters.undecoded(connection, spacecraft_id, definitions.digest)
+        vehicles = [one.id for one in all_vehicles(connection)]
+    return sum(redecode(ground, one, DICTIONARY) + apply_definition(ground, one) for one in vehicles)
+
+
+def undecoded_vehicles(ground: Ground, spacecraft_id: int) -> list[int]:
+    """Return the vehicles of a spacecraft whose packets are not decoded with the definitions in force for them."""
+    with ground.database.reading() as connection:
+        mine = [one for one in all_vehicles(connection) if one.ccsds_id == spacecraft_id]
+        return [
+            one.id
+            for one in mine
+            if not parameters.is_decoded(
+                connection, one.id, definitions_in_force(connection, one.id)[0].digest
+            )
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +374,9 @@ class _Reading:
         """Return the packets that the mission description of a spacecraft declares."""
         if spacecraft not in self.definitions:
             with self.ground.database.reading() as connection:
-                self.definitions[spacecraft] = definitions_of_spacecraft(connection, spacecraft)[0]
+                self.definitions[spacecraft] = definitions_of_spacecraft(
+                    connection, spacecraft, self.piece.scope
+                )[0]
         return self.definitions[spacecraft]
 
     def _unchecked_apids(self, spacecraft: int) -> frozenset[int]:
@@ -478,7 +431,7 @@ class _Reading:
                 unchecked_apids=unchecked,
             )
         except UnknownCoding as error:
-            source = _name(self.ground, self.piece.file_sha256)
+            source = self._name()
             raise InvalidInput(source, "", error.expected, error.found) from error
         self.ambiguous = plan is not None and plan.ambiguous
         return reaches
@@ -544,7 +497,7 @@ class _Reading:
         assert found.packets.spacecraft_id is not None
         vehicle = self.joiner.vehicle(connection, found.packets.spacecraft_id)
         self.joiner.keep_channel_edges(connection, found.channel_edges)
-        stored = store_batch(connection, vehicle, found.packets)
+        stored = store.store_batch(connection, vehicle, found.packets)
         self.new += stored.new
         edges.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=False)
         defined = np.isin(found.packets.apid, self._definitions(found.packets.spacecraft_id).apids)
@@ -594,7 +547,7 @@ class _Reading:
         limit = 2 * CADU_MAX_OCTETS if self.spacecraft_id is None else PACKET_MAX_LENGTH
         if self.piece.octets > limit:
             raise InvalidInput(
-                _name(self.ground, self.piece.file_sha256),
+                self._name(),
                 "",
                 "a stream of CADUs or of space packets",
                 f"{self.piece.octets} octets without a valid packet",
@@ -628,32 +581,33 @@ class _Reading:
             vehicle_ids=tuple(sorted(self.vehicles.values())),
             reception=self._reception(),
             uplink=tuple(
-                {"spacecraft_id": spacecraft_id, **asdict(seen)}
+                ReceivedControlWords(spacecraft_id=spacecraft_id, **asdict(seen))
                 for (spacecraft_id, _), seen in sorted(found.uplink.items())
             ),
         )
 
-    def _reception(self) -> dict[str, Any] | None:
+    def _reception(self) -> ReceivedLink | None:
         """Return the link quality, the sections of the file and the origin of their settings."""
         framed = [(one, one.link.settings) for one in self.sections if one.link.settings is not None]
         if not framed:
             return None
-        return {
-            "station": self.piece.station,
+        return ReceivedLink(
+            station=self.piece.station,
+            ambiguous=self.ambiguous,
             **self.accounting.quality.describe(),
-            "ambiguous": self.ambiguous,
-            "sections": [
-                {
-                    "start": one.start,
-                    "stop": one.stop,
-                    "source": self.expected.source_of(settings),
-                    **settings.describe(),
-                }
+            sections=tuple(
+                ReceivedSection.model_validate(
+                    {
+                        "start": one.start,
+                        "stop": one.stop,
+                        "source": self.expected.source_of(settings),
+                        **settings.describe(),
+                    }
+                )
                 for one, settings in framed
-            ],
-        }
+            ),
+        )
 
-
-def _name(ground: Ground, sha256: str) -> str:
-    with ground.database.reading() as connection:
-        return str(repository.get(connection, repository.FILES, sha256, "file")["name"])
+    def _name(self) -> str:
+        with self.ground.database.reading() as connection:
+            return recorded_name(connection, self.piece.file_sha256)

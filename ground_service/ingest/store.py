@@ -1,4 +1,4 @@
-"""Storing batches of packets: each packet once by content, its decoded rows with it, in one transaction."""
+"""SQL of ingests, and of packets: each stored once by content, in one transaction with its decoded rows."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from sqlalchemy import Connection, bindparam, func, select
+from pydantic import ValidationError
+from sqlalchemy import Connection, bindparam, delete, func, select
 
 from ground_service.events import TelemetryReceived, publish
+from ground_service.ingest.model import Ingest, IngestResult
+from ground_service.store import repository
 from ground_service.store.bulk import insert_columns
 from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
 from ground_service.store.models import NO_TICKS, SAMPLE_TABLES, Packet, Vehicle
-from ground_service.store.rollups import add_to_rollups
+from ground_service.store.rollups import add_to_rollups, forget_rollups
 from lunar.arrays import IntArray
 
 RANGE_GAP_TICKS = 600 << 16
@@ -22,6 +25,8 @@ with one stray packet of another year does not read the years between."""
 
 _TABLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
 _PACKETS: Any = Packet.__table__
+_INGESTS = repository.INGESTS
+_FILES = repository.FILES
 
 _PACKED: dict[str, Callable[..., list[bytes]]] = {
     "detections": pack_detections,
@@ -204,3 +209,124 @@ def _insert_packets(connection: Connection, vehicle_id: int, batch: Batch, new: 
         connection, _PACKETS, {"id": found, "vehicle_id": np.full(len(chosen), vehicle_id), **columns}
     )
     return found
+
+
+def add_ingest(
+    connection: Connection, sha256: str, *, state: str, dictionary_version: int, now_utc_ns: int
+) -> int:
+    """Add an ingest of a file; return its id."""
+    return int(
+        repository.add(
+            connection,
+            _INGESTS,
+            vehicle_id=None,
+            file_sha256=sha256,
+            state=state,
+            dictionary_version=dictionary_version,
+            received_utc_ns=now_utc_ns,
+            accounting={},
+        )
+    )
+
+
+def get_ingest(connection: Connection, ingest_id: int) -> Ingest:
+    """Return an ingest.
+
+    Raises
+    ------
+    NotFound
+        There is no such ingest.
+    """
+    return _ingest(repository.get(connection, _INGESTS, ingest_id, "ingest"))
+
+
+def list_ingests(connection: Connection, *, limit: int, offset: int) -> tuple[list[Ingest], int]:
+    """Return a page of the ingests, newest first, and the total number."""
+    page = repository.page(connection, _INGESTS, limit=limit, offset=offset)
+    return [_ingest(row) for row in page.rows], page.total
+
+
+def start_ingest(connection: Connection, ingest_id: int) -> None:
+    """Record that an ingest runs."""
+    repository.get(connection, _INGESTS, ingest_id, "ingest")
+    repository.change(connection, _INGESTS, ingest_id, state="running")
+
+
+def fail_ingest(connection: Connection, ingest_id: int, error: str, now_utc_ns: int) -> None:
+    """Record why an ingest failed."""
+    repository.change(
+        connection, _INGESTS, ingest_id, state="failed", error=error, finished_utc_ns=now_utc_ns
+    )
+
+
+def finish_ingest(connection: Connection, result: IngestResult, now_utc_ns: int) -> None:
+    """Record the result of an ingest that is done."""
+    repository.change(
+        connection,
+        _INGESTS,
+        result.ingest_id,
+        state="done",
+        error=None,
+        vehicle_id=result.vehicle_id,
+        finished_utc_ns=now_utc_ns,
+        accounting=result.model_dump(mode="json"),
+    )
+
+
+def change_result(connection: Connection, result: IngestResult) -> None:
+    """Replace the result of an ingest whose file was read again."""
+    repository.change(connection, _INGESTS, result.ingest_id, accounting=result.model_dump(mode="json"))
+
+
+def results_of_vehicle(connection: Connection, vehicle: int) -> list[tuple[str, int, IngestResult | None]]:
+    """Return hash, octets and result of the ingests that may have packets of a vehicle, ordered by hash."""
+    query = (
+        select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.accounting)
+        .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
+        .where(
+            (_INGESTS.c.vehicle_id == vehicle)
+            | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
+            _INGESTS.c.state == "done",
+        )
+        .order_by(_INGESTS.c.file_sha256)
+    )
+    found = (
+        (sha256, int(octets), _result(accounting)) for sha256, octets, accounting in connection.execute(query)
+    )
+    return [one for one in found if one[2] is None or vehicle in one[2].vehicle_ids]
+
+
+def forget_samples(connection: Connection, vehicle: int, dictionary_version: int) -> None:
+    """Remove what a dictionary version has decoded from the packets of a vehicle."""
+    for table in _TABLES.values():
+        connection.execute(
+            delete(table).where(
+                table.c.vehicle_id == vehicle, table.c.dictionary_version == dictionary_version
+            )
+        )
+    forget_rollups(connection, vehicle, dictionary_version)
+
+
+def packets_between(
+    connection: Connection, vehicle: int, after: int, until: int, limit: int
+) -> tuple[IntArray, list[bytes]]:
+    """Return ids (n,) and octets of the packets with ids above `after`, up to `until`, in the order of their ids."""
+    rows = connection.execute(
+        select(_PACKETS.c.id, _PACKETS.c.octets)
+        .where(_PACKETS.c.vehicle_id == vehicle, _PACKETS.c.id > after, _PACKETS.c.id <= until)
+        .order_by(_PACKETS.c.id)
+        .limit(limit)
+    ).all()
+    return np.array([row[0] for row in rows], dtype=np.int64), [bytes(row[1]) for row in rows]
+
+
+def _ingest(row: Mapping[str, Any]) -> Ingest:
+    return Ingest.of(row, sha256=row["file_sha256"], accounting=_result(row["accounting"]))
+
+
+def _result(accounting: dict[str, Any]) -> IngestResult | None:
+    """Return a stored result; None without one, and for one of an earlier version."""
+    try:
+        return IngestResult.model_validate(accounting)
+    except ValidationError:
+        return None

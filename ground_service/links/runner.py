@@ -21,7 +21,8 @@ from ground_service.clock import mission_now_ns
 from ground_service.errors import PASSING, GroundError, storage_error
 from ground_service.ground import Ground
 from ground_service.ingest.live import PAUSE_S, SEGMENT_OCTETS, Spool, WatchedFolder
-from ground_service.ingest.service import IngestResult, ingest_file
+from ground_service.ingest.model import IngestResult
+from ground_service.ingest.service import ingest_file
 from ground_service.links import core, service
 from ground_service.links.service import DeclaredLink
 from ground_service.links.store import ContactRow, TransmissionRow
@@ -415,8 +416,8 @@ class LinkRunner:
 def _clock_offset_ns(made: IngestResult | None, heard_utc_ns: int | None) -> int | None:
     """Return the last reception time in the records of the station minus the mission time of the reception."""
     reception = None if made is None else made.reception
-    last = None if reception is None else reception.get("last_utc_ns")
-    return None if last is None or heard_utc_ns is None else int(last) - heard_utc_ns
+    last = None if reception is None else reception.last_utc_ns
+    return None if last is None or heard_utc_ns is None else last - heard_utc_ns
 
 
 def _write_transmission(folder: Path, transmission: TransmissionRow, form: str) -> None:

@@ -317,6 +317,22 @@ class Requirements(Section):
     temperature_min_c: float | None = None
 
 
+class Uploads(Section):
+    """Tables that the ground makes and uploads for each observation window.
+
+    With this section, the payload is commanded to standby before a window and to the downlink after it.
+
+    Attributes
+    ----------
+    sigma_position_m, sigma_velocity_m_s
+        Declared accuracy of the uploaded start state, 1 sigma per axis.
+    """
+
+    tables: Annotated[tuple[Literal["orientation", "anchor_ephemeris", "initial_state"], ...], Array] = ()
+    sigma_position_m: Positive | None = None
+    sigma_velocity_m_s: Positive | None = None
+
+
 class Approval(Section):
     """Rules for the approval of telecommands.
 
@@ -494,6 +510,7 @@ class Mission(Section):
     requirements: Requirements = Requirements()
     automation: Automation = Automation()
     approval: Approval = Approval()
+    uploads: Uploads | None = None
     resources: SpacecraftResources = SpacecraftResources()
     links: Annotated[tuple[StationConnection, ...], Array] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None

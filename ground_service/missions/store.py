@@ -108,8 +108,27 @@ def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) 
     The instance of an archive has the description that came with the archive.
     """
     found = {key: mission.link for key, mission in missions_in_force(connection, ccsds_id).items()}
+    for spacecraft, key in _archived(connection, instance).items():
+        if ccsds_id in (None, spacecraft):
+            found[spacecraft] = get_mission(connection, key).link
+    return found
+
+
+def packets_in_force(connection: Connection, ccsds_id: int, instance: str) -> int | None:
+    """Return the id of the revision that declares the packets of a spacecraft in one instance; None without any.
+
+    The instance of an archive has the packets that the description of the archive declares, if it declares any.
+    """
+    key = _archived(connection, instance).get(ccsds_id)
+    if key is not None and get_mission(connection, key).packets is not None:
+        return key
+    return newest_of_spacecraft(connection, ccsds_id)
+
+
+def _archived(connection: Connection, instance: str) -> dict[int, int]:
+    """Return the revisions that came with the archive of an instance, by spacecraft."""
     passes, vehicles = repository.PASSES, repository.VEHICLES
-    archived = (
+    query = (
         select(vehicles.c.ccsds_id, passes.c.mission_id)
         .join(vehicles, vehicles.c.id == passes.c.vehicle_id)
         .where(
@@ -119,10 +138,7 @@ def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) 
         )
         .order_by(passes.c.id)
     )
-    for spacecraft, key in connection.execute(archived):
-        if ccsds_id in (None, spacecraft):
-            found[int(spacecraft)] = get_mission(connection, int(key)).link
-    return found
+    return {int(spacecraft): int(key) for spacecraft, key in connection.execute(query)}
 
 
 def missions_in_force(connection: Connection, ccsds_id: int | None = None) -> dict[int, Mission]:

@@ -6,7 +6,6 @@ with on-board times in the pass (`passes.downlink_accounting`); other passes of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
@@ -16,6 +15,8 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from ground_service.ingest.core import Gap, account_sequence
+from ground_service.ingest.model import ReceivedLink
+from ground_service.ingest.store import results_of_vehicle
 from ground_service.passes import store
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
 from ground_service.passes.model import PassRecord
@@ -108,48 +109,43 @@ class _Ingested:
     sha256: str
     octets: int
     sections: tuple[LinkSection, ...]
-    reception: Mapping[str, Any] | None
+    reception: ReceivedLink | None
 
 
 def _receptions(connection: Connection, span: PassSpan) -> tuple[ReceptionQuality, ...]:
     """Return the link quality of the files of the pass, by station and hash."""
     names = {one.name for one in fields(ReceptionQuality)}
-    found = [one for one in _raw_files(connection, span) if one.reception is not None]
-    found.sort(key=lambda one: (str((one.reception or {})["station"]), one.sha256))
+    found = [(one.reception, one.sha256) for one in _raw_files(connection, span) if one.reception is not None]
     return tuple(
         ReceptionQuality(
-            source=", ".join(sorted({section["source"] for section in reception["sections"]})),
-            **{name: value for name, value in reception.items() if name in names},
+            source=", ".join(sorted({section.source for section in reception.sections})),
+            **reception.model_dump(include=names),
         )
-        for one in found
-        if (reception := one.reception) is not None
+        for reception, _ in sorted(found, key=lambda one: (one[0].station, one[1]))
     )
 
 
 def _raw_files(connection: Connection, span: PassSpan) -> list[_Ingested]:
     """Return the ingested files that may contain data of the pass, each once, ordered by hash."""
     chosen: dict[str, _Ingested] = {}
-    for sha256, octets, accounting in store.ingested_files(connection, span.vehicle):
-        if span.vehicle not in accounting.get("vehicle_ids", (span.vehicle,)):
-            continue
-        first, last = accounting.get("first_ticks"), accounting.get("last_ticks")
+    for sha256, octets, result in results_of_vehicle(connection, span.vehicle):
+        first = last = reception = None
+        if result is not None:
+            first, last, reception = result.first_ticks, result.last_ticks, result.reception
         if first is None or last is None or (first <= span.stop_ticks and last >= span.start_ticks):
-            reception = accounting.get("reception")
-            chosen[sha256] = _Ingested(sha256, int(octets), _sections(reception), reception)
+            chosen[sha256] = _Ingested(sha256, octets, _sections(reception), reception)
     return list(chosen.values())
 
 
-def _sections(reception: Mapping[str, Any] | None) -> tuple[LinkSection, ...]:
+def _sections(reception: ReceivedLink | None) -> tuple[LinkSection, ...]:
     names = {one.name for one in fields(LinkSettings)}
     return tuple(
         LinkSection(
-            section["start"],
-            section["stop"],
-            LinkSettings(
-                **{name: value for name, value in section.items() if name in names and value is not None}
-            ),
+            section.start,
+            section.stop,
+            LinkSettings(**section.model_dump(include=names, exclude_none=True)),
         )
-        for section in (reception or {}).get("sections", ())
+        for section in (() if reception is None else reception.sections)
     )
 
 

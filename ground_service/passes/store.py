@@ -156,22 +156,6 @@ def frame_files(connection: Connection, pass_id: int) -> dict[int, str]:
     return {int(number): sha256 for number, sha256 in rows}
 
 
-def ingested_files(connection: Connection, vehicle: int) -> list[tuple[str, int, dict[str, Any]]]:
-    """Return hash, octets and accounting of the ingests that may have data of a vehicle, ordered by hash."""
-    ingests, stored = repository.INGESTS, repository.FILES
-    query = (
-        select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
-        .join(stored, stored.c.sha256 == ingests.c.file_sha256)
-        .where(
-            (ingests.c.vehicle_id == vehicle)
-            | ingests.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
-            ingests.c.state == "done",
-        )
-        .order_by(ingests.c.file_sha256)
-    )
-    return [(sha256, int(octets), accounting) for sha256, octets, accounting in connection.execute(query)]
-
-
 def archive_state(connection: Connection) -> Hashable:
     """Return a value that differs after new packets, ingests, decodings or correlations.
 

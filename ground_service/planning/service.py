@@ -45,6 +45,7 @@ from ground_service.planning.model import (
     WindowRecord,
     WindowSearch,
 )
+from ground_service.planning.preparation import MARGIN_NS, Activity, TicksOf, prepare_window
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
@@ -302,6 +303,9 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
             (stop, ("stop_observation", 0.0, 0.0)),
         )
         approval = commanding.Approval(window.edited_by, window.decided_by)
+        further = _preparation(
+            ground, connection, window, lambda utc_ns: ticks_of_utc_ns(utc_ns, correlations)
+        )
         ids = [
             commanding.add_released(
                 connection,
@@ -313,13 +317,17 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
                 approval=approval,
             )
         ]
-        for utc_ns, (function, first, second) in activities:
+        named: list[Activity] = [
+            (utc_ns, "perform_function", {"function_id": function, "argument_1": first, "argument_2": second})
+            for utc_ns, (function, first, second) in activities
+        ]
+        for utc_ns, command, arguments in sorted([*further, *named], key=lambda one: one[0]):
             ids.append(
                 commanding.add_scheduled(
                     connection,
                     window.vehicle_id,
-                    "perform_function",
-                    {"function_id": function, "argument_1": first, "argument_2": second},
+                    command,
+                    arguments,
                     release_ticks=ticks_of_utc_ns(utc_ns, correlations),
                     actor=actor,
                     timeout_s=timeout_s,
@@ -330,6 +338,38 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         commands.limit_sending(connection, ids, start)
         _note(connection, actor, "uplink", window_id, window.state, {"telecommands": ids})
         return ids
+
+
+def _preparation(
+    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: TicksOf
+) -> list[Activity]:
+    """Return the activities that prepare a window, where its mission description asks for uploads."""
+    mission = None if window.mission_id is None else missions.get_mission(connection, window.mission_id)
+    if mission is None or mission.uploads is None:
+        return []
+    start, stop = window.start.utc_ns, window.stop.utc_ns
+    found = ephemerides.covering_ephemerides(connection, start - MARGIN_NS, stop + MARGIN_NS)
+    whole = [
+        one for one in found if one.start.utc_ns <= start - MARGIN_NS and stop + MARGIN_NS <= one.stop.utc_ns
+    ]
+    orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
+    activities, state = prepare_window(
+        mission.uploads,
+        _load(ground, whole[0]) if whole else None,
+        orientation,
+        start,
+        stop,
+        ticks_of,
+        8 * window.id,
+    )
+    if state is not None:
+        x, y, z = state.position_icrf_m.tolist()
+        u, v, w = state.velocity_icrf_m_s.tolist()
+        uploaded = model.UploadedState(
+            utc=UtcTime(state.utc_ns), position_icrf_m=(x, y, z), velocity_icrf_m_s=(u, v, w)
+        )
+        store.note_uploads(connection, window.id, model.WindowUploads(start_state=uploaded))
+    return activities
 
 
 def get_window(ground: Ground, window_id: int) -> Window:

@@ -57,12 +57,6 @@ def mission_of_definition(connection: Connection, definition: int) -> int:
     return int(repository.get(connection, _DEFINITIONS, definition, "packet definition")["mission_id"])
 
 
-def lock_vehicle(connection: Connection, vehicle: int) -> None:
-    """Wait until packets of a vehicle that other transactions are storing are stored, and keep others out."""
-    table = repository.VEHICLES
-    connection.execute(select(table.c.id).where(table.c.id == vehicle).with_for_update())
-
-
 def decoding(connection: Connection, vehicle: int, definition: int) -> Decoding | None:
     """Return the progress of a definition, None if it has not begun."""
     row = repository.find(connection, _DECODINGS, vehicle_id=vehicle, definition_id=definition)
@@ -133,21 +127,14 @@ def note_read(connection: Connection, vehicle: int) -> None:
     )
 
 
-def undecoded(connection: Connection, spacecraft: int, digest: str) -> list[int]:
-    """Return the vehicles of a spacecraft that are not, or not only, decoded with a definition."""
-    vehicles = repository.VEHICLES
-    found = []
-    for vehicle in connection.execute(
-        select(vehicles.c.id).where(vehicles.c.ccsds_id == spacecraft)
-    ).scalars():
-        rows = connection.execute(
-            select(_DEFINITIONS.c.digest, _DECODINGS.c.complete, _DECODINGS.c.read_again_to)
-            .join(_DEFINITIONS, _DEFINITIONS.c.id == _DECODINGS.c.definition_id)
-            .where(_DECODINGS.c.vehicle_id == vehicle)
-        ).all()
-        if [tuple(row) for row in rows] != ([(digest, 1, None)] if digest else []):
-            found.append(int(vehicle))
-    return found
+def is_decoded(connection: Connection, vehicle: int, digest: str) -> bool:
+    """Return whether a vehicle is decoded with a definition (empty: with none), and only with it."""
+    rows = connection.execute(
+        select(_DEFINITIONS.c.digest, _DECODINGS.c.complete, _DECODINGS.c.read_again_to)
+        .join(_DEFINITIONS, _DEFINITIONS.c.id == _DECODINGS.c.definition_id)
+        .where(_DECODINGS.c.vehicle_id == vehicle)
+    )
+    return [tuple(row) for row in rows] == ([(digest, 1, None)] if digest else [])
 
 
 def forget_others(connection: Connection, vehicle: int, definition: int | None) -> None:

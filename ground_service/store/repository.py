@@ -1,6 +1,7 @@
-"""Reading and writing of everything but packets: one function per question, plain rows out.
+"""Tables and generic queries, for store modules only.
 
-Every function takes the connection of the caller's transaction. Rows come back as dictionaries of column values.
+Every function takes the connection of the caller's transaction. Rows are dictionaries of column values, which a store
+turns into the entities of its capability.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import JSON, Connection, Float, LargeBinary, String, Table, collate, insert, select, text
+from sqlalchemy import JSON, Connection, Float, LargeBinary, String, collate, insert, select, text
+from sqlalchemy import Table as Table
 
 from ground_service.store import models
 

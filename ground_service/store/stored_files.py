@@ -31,3 +31,8 @@ def register_file(connection: Connection, stored: StoredFile, kind: str, name: s
 def file_names(connection: Connection) -> list[str]:
     """Return the SHA-256 of all files, ascending."""
     return sorted(connection.execute(select(repository.FILES.c.sha256)).scalars())
+
+
+def recorded_name(connection: Connection, sha256: str) -> str:
+    """Return the name of a file of the archive."""
+    return str(repository.get(connection, repository.FILES, sha256, "file")["name"])

@@ -97,6 +97,11 @@ def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
         return int(again["id"])
 
 
+def change_vehicle(connection: Connection, vehicle: int, **columns: int | None) -> None:
+    """Change columns of a vehicle, whose row the caller has locked."""
+    repository.change(connection, repository.VEHICLES, vehicle, **columns)
+
+
 def decoded_version(connection: Connection, vehicle: int, newest: int) -> int:
     """The dictionary version to read a vehicle in: the newest that all of its packets are decoded with."""
     found = connection.execute(

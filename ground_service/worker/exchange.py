@@ -14,12 +14,12 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from sqlalchemy import ColumnDefault, Connection, MetaData, Table, func, insert, select
+from sqlalchemy import Connection
 
 from ground_service.errors import (
     Conflict,
@@ -30,11 +30,11 @@ from ground_service.errors import (
     storage_error,
 )
 from ground_service.ground import Ground
-from ground_service.ingest.redecode import redecode_all
-from ground_service.store import audit, repository, rows
+from ground_service.ingest.service import decode_all_again
+from ground_service.store import audit, rows
 from ground_service.store.database import Database, schema_revisions
 from ground_service.store.files import FileArchive, read_blocks, replace_durably
-from ground_service.store.models import SAMPLE_TABLES
+from ground_service.worker import exchange_store as store
 from lunar.timescales import format_utc
 
 FORMAT, VERSION = "linna-export", 1
@@ -45,19 +45,6 @@ BLOCK_OCTETS = 1 << 20
 EARLIER_REVISION = "0011"
 """Last schema revision before version 1.0; its tables can be exported."""
 
-DERIVED = frozenset(
-    {"rollups", "parameter_samples", "stream_edges", *(one.__tablename__ for one in SAMPLE_TABLES)}
-)
-"""Tables of an earlier revision that are not imported, because they are derived from the packets."""
-
-EARLIER_VALUES: dict[tuple[str, str], Any] = {
-    ("users", "state"): "active",
-    ("tokens", "hint"): "",
-    ("regressions", "missions"): [],
-}
-"""Values of columns missing in an earlier revision, if neither NULL nor the default of the column is correct."""
-
-EARLIER_COPIES = {("windows", "edited_by"): "created_by"}
 """Columns missing in an earlier revision, and the column of the same row with their value."""
 
 Say = Callable[[str], None]
@@ -141,7 +128,7 @@ def export_database(
             zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
         ):
             tables = {}
-            for table in _tables_of(connection, earlier=found != head):
+            for table in store.exported_tables(connection, earlier=found != head):
                 tell(table.name)
                 tables[table.name] = _write_table(archive, connection, table)
             tell("files")
@@ -167,15 +154,7 @@ def export_database(
     return manifest
 
 
-def _tables_of(connection: Connection, *, earlier: bool) -> list[Table]:
-    if not earlier:
-        return rows.copied_tables()
-    metadata = MetaData()
-    metadata.reflect(bind=connection)
-    return [table for table in metadata.sorted_tables if table.name != "alembic_version"]
-
-
-def _write_table(archive: zipfile.ZipFile, connection: Connection, table: Table) -> ExportedTable:
+def _write_table(archive: zipfile.ZipFile, connection: Connection, table: rows.Table) -> ExportedTable:
     with archive.open(_entry(f"tables/{table.name}.jsonl"), "w", force_zip64=True) as stream:
         digest = rows.lines_digest(_written(stream, rows.table_lines(connection, table)))
     return ExportedTable(
@@ -193,7 +172,7 @@ def _write_files(
     archive: zipfile.ZipFile, connection: Connection, files: FileArchive, *, with_files: bool
 ) -> ExportedFiles:
     count = octets = 0
-    for sha256, size in connection.exec_driver_sql("SELECT sha256, octets FROM files ORDER BY sha256").all():
+    for sha256, size in store.file_sizes(connection):
         count, octets = count + 1, octets + int(size)
         if not with_files:
             continue
@@ -268,7 +247,7 @@ def import_database(ground: Ground, path: Path, *, say: Say | None = None) -> Im
     decoded = 0
     if earlier:
         tell("packets decoded again")
-        decoded = redecode_all(ground)
+        decoded = decode_all_again(ground)
     return ImportResult(
         revision=manifest.revision, rows=stored, files=len(names), left_out=left_out, decoded=decoded
     )
@@ -352,120 +331,15 @@ def _store_rows(
     ground: Ground, path: Path, archive: zipfile.ZipFile, manifest: ExportManifest, *, earlier: bool
 ) -> tuple[dict[str, int], dict[str, int]]:
     """Insert the rows of every table in one transaction; return the numbers of inserted and omitted rows."""
-    stored: dict[str, int] = {}
-    taken = {table.name for table in rows.copied_tables()} - (DERIVED if earlier else frozenset())
+    columns = {name: exported.columns for name, exported in manifest.tables.items()}
     with ground.database.writing() as connection:
-        for table in rows.copied_tables():
-            exported = manifest.tables.get(table.name)
-            if exported is None or table.name not in taken:
-                continue
-            parsed = _parsed(path, table, exported, _lines(path, archive, table.name))
-            if earlier:
-                parsed = _upgraded(path, table, exported, parsed)
-            if earlier and table.name == "audit":
-                stored["audit"] = _store_chain(connection, parsed)
-            else:
-                stored[table.name] = rows.insert_rows(connection, table, _in_blocks(parsed))
-        if earlier:
-            _count_telecommands(connection)
-        rows.advance_sequences(connection)
+        stored = store.insert_tables(
+            connection, str(path), columns, lambda name: _lines(path, archive, name), earlier=earlier
+        )
+    taken = store.imported_tables(earlier=earlier)
     left_out = {
         name: exported.rows
         for name, exported in manifest.tables.items()
         if name not in taken and exported.rows
     }
     return stored, left_out
-
-
-def _parsed(
-    path: Path, table: Table, exported: ExportedTable, lines: Iterable[bytes]
-) -> Iterator[dict[str, Any]]:
-    columns = [table.c[name] if name in table.c else _Unknown(name) for name in exported.columns]
-    for number, line in enumerate(lines, start=1):
-        try:
-            yield rows.parse_line(columns, line)
-        except (ValueError, TypeError) as error:
-            raise InvalidInput(
-                str(path), f"table {table.name}, row {number}", "a row of this table", str(error)[:80]
-            ) from None
-
-
-class _Unknown:
-    """Column that this version does not have."""
-
-    def __init__(self, name: str) -> None:
-        from sqlalchemy import JSON
-
-        self.name, self.type = name, JSON()
-
-
-def _upgraded(
-    path: Path, table: Table, exported: ExportedTable, parsed: Iterable[dict[str, Any]]
-) -> Iterator[dict[str, Any]]:
-    """Yield the rows of an earlier revision with the columns of this one."""
-    added: dict[str, Any] = {}
-    copies = {new: old for (name, new), old in EARLIER_COPIES.items() if name == table.name}
-    for column in table.columns:
-        if (
-            column.name in exported.columns
-            or column.name in copies
-            or (table.name == "audit" and column.name.endswith("sha256"))
-        ):
-            continue
-        if (table.name, column.name) in EARLIER_VALUES:
-            added[column.name] = EARLIER_VALUES[table.name, column.name]
-        elif isinstance(column.default, ColumnDefault) and column.default.is_scalar:
-            added[column.name] = column.default.arg
-        elif column.nullable:
-            added[column.name] = None
-        else:
-            raise InvalidInput(str(path), f"table {table.name}", f"the column {column.name}", "none")
-    again = table.name == "vehicles"
-    for row in parsed:
-        kept = {name: value for name, value in row.items() if name in table.c}
-        if again:  # nothing is decoded yet
-            kept |= dict.fromkeys(("decoded_version", "redecoding_version", "redecoded_to", "redecode_until"))
-        yield {**kept, **added, **{new: row[old] for new, old in copies.items()}}
-
-
-def _store_chain(connection: Connection, parsed: Iterable[Mapping[str, Any]]) -> int:
-    """Add the audit entries of an earlier revision to a hash chain, in order and with new numbers."""
-    count = 0
-    for row in parsed:
-        audit.add_note(
-            connection,
-            audit.Note(
-                int(row["utc_ns"]),
-                str(row["actor"]),
-                str(row["action"]),
-                str(row["target"]),
-                row["detail"] or {},
-            ),
-        )
-        count += 1
-        if count % rows.BLOCK_ROWS == 0:
-            audit.append_pending(connection)
-    audit.append_pending(connection)
-    return count
-
-
-def _count_telecommands(connection: Connection) -> None:
-    """Continue the telecommand sequence counts of an earlier revision, which were row counts."""
-    table, counters = repository.TELECOMMANDS, repository.COMMAND_COUNTERS
-    given = connection.execute(
-        select(table.c.vehicle_id, func.count())
-        .where(table.c.sequence_count.is_not(None))
-        .group_by(table.c.vehicle_id)
-    ).all()
-    for vehicle, count in given:
-        connection.execute(insert(counters).values(vehicle_id=vehicle, telecommands=count))
-
-
-def _in_blocks(parsed: Iterable[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
-    block: list[dict[str, Any]] = []
-    for row in parsed:
-        block.append(row)
-        if len(block) == rows.BLOCK_ROWS:
-            yield block
-            block = []
-    yield block

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import Connection, Table, and_, func, insert, select, text
+from sqlalchemy import Connection
 
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground, open_ground
@@ -25,9 +25,10 @@ from ground_service.ingest.packets import DIGEST_OCTETS, batch_of_cut
 from ground_service.ingest.parameters import decode_declared
 from ground_service.ingest.service import Place, ingest_stored
 from ground_service.ingest.store import store_batch
-from ground_service.store import audit, repository, row_digests
+from ground_service.store import audit, row_digests
 from ground_service.store.files import FileArchive, StoredFile, read_blocks
-from ground_service.store.vehicles import FLOWN, vehicle_id
+from ground_service.store.vehicles import FLOWN, all_vehicles, vehicle_id
+from ground_service.worker import integrity_store as store
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.packets import PRIMARY_HEADER_LENGTH
@@ -108,7 +109,8 @@ def verify(
         good = _check_files(connection, ground.files, found)
         tell("raw files ingested again" if deep else "packets decoded again")
         with _scratch(ground) as scratch:
-            _copy_missions(connection, scratch)
+            with scratch.database.writing() as writing:
+                store.copy_missions(connection, writing)
             if deep:
                 _ingest_again(connection, ground, scratch, good, found)
             else:
@@ -136,18 +138,15 @@ def _check_schema(connection: Connection, found: _Findings) -> None:
         found.damage("schema", name, "expected this trigger of the audit table, found none")
     for name in row_digests.missing_triggers(connection):
         found.damage("schema", name, "expected the trigger of row digests, found none")
-    if connection.dialect.name != "sqlite":
-        return
-    for (line,) in connection.execute(text("PRAGMA integrity_check")):
-        if line != "ok":
-            found.damage("schema", "linna.db", str(line))
-    for row in connection.execute(text("PRAGMA foreign_key_check")):
-        found.damage(str(row[0]), row[1], f"expected the row of {row[2]} that it names, found none")
+    for line in store.database_faults(connection):
+        found.damage("schema", "linna.db", line)
+    for table, key, parent in store.dangling_references(connection):
+        found.damage(table, key, f"expected the row of {parent} that it names, found none")
 
 
 def _check_rows(connection: Connection, found: _Findings) -> None:
     for table in row_digests.guarded_tables():
-        found.count(table.name, int(connection.execute(select(func.count()).select_from(table)).scalar_one()))
+        found.count(table.name, store.count_rows(connection, table))
         for stray in row_digests.stray_rows(connection, table):
             found.damage(stray.table, stray.key, stray.reason)
     for stray in row_digests.unknown_digests(connection):
@@ -169,10 +168,9 @@ def _check_audit(connection: Connection, expected: audit.Head | None, found: _Fi
 def _check_files(connection: Connection, files: FileArchive, found: _Findings) -> set[str]:
     """Check every file against its row; return the hashes of undamaged files."""
     good, known = set(), set()
-    table = repository.FILES
-    for sha256, octets in connection.execute(select(table.c.sha256, table.c.octets).order_by(table.c.sha256)):
+    for sha256, octets in store.files(connection):
         known.add(sha256)
-        found.count("octets of files", int(octets))
+        found.count("octets of files", octets)
         path = files.path(sha256)
         if not path.is_file():
             found.damage("files", sha256, "expected the file, found nothing")
@@ -211,26 +209,17 @@ def _scratch(ground: Ground) -> Iterator[Ground]:
         yield scratch
 
 
-def _copy_missions(connection: Connection, scratch: Ground) -> None:
-    """Copy the mission descriptions: they declare packets, and whether these end with a checksum."""
-    missions = connection.execute(select(repository.MISSIONS)).mappings().all()
-    if missions:
-        with scratch.database.writing() as writing:
-            writing.execute(insert(repository.MISSIONS), [dict(row) for row in missions])
-
-
 def _decode_declared_again(scratch: Ground, found: _Findings) -> None:
     """Decode the declared packets of every vehicle of the scratch archive with the newest mission description."""
-    vehicles = repository.VEHICLES
     with scratch.database.reading() as made:
-        rows = made.execute(select(vehicles.c.id, vehicles.c.ccsds_id)).all()
-    for vehicle, spacecraft in rows:
+        vehicles = all_vehicles(made)
+    for vehicle in vehicles:
         try:
-            decode_declared(scratch, int(vehicle))
+            decode_declared(scratch, vehicle.id)
         except (GroundError, TmtcError) as error:
             found.damage(
                 "missions",
-                f"spacecraft {spacecraft}",
+                f"spacecraft {vehicle.ccsds_id}",
                 f"expected a usable mission description, found: {error}",
             )
 
@@ -239,114 +228,73 @@ def _ingest_again(
     connection: Connection, ground: Ground, scratch: Ground, good: set[str], found: _Findings
 ) -> None:
     """Ingest every raw file into the scratch archive, as in its first ingest."""
-    ingests, vehicles, files, pieces = (
-        repository.INGESTS,
-        repository.VEHICLES,
-        repository.FILES,
-        repository.PIECES,
-    )
-    query = (
-        select(
-            ingests.c.id,
-            ingests.c.file_sha256,
-            ingests.c.state,
-            vehicles.c.ccsds_id,
-            vehicles.c.instance,
-            files.c.name,
-            files.c.octets,
-            pieces.c.scope,
-            pieces.c.spacecraft_id,
-            pieces.c.stream,
-            pieces.c.position,
-            pieces.c.station,
-            pieces.c.link,
-        )
-        .outerjoin(pieces, pieces.c.ingest_id == ingests.c.id)
-        .outerjoin(vehicles, vehicles.c.id == ingests.c.vehicle_id)
-        .outerjoin(files, files.c.sha256 == ingests.c.file_sha256)
-        .order_by(ingests.c.id)
-    )
     seen = set()
-    for row in connection.execute(query).mappings().all():
+    for one in store.recorded_ingests(connection):
         ground.check_stopping()
-        place = Place(row["stream"], row["position"]) if row["stream"] else None
-        reception = (row["station"] or "", row["link"])
-        key = (row["file_sha256"], row["ccsds_id"], row["instance"], row["spacecraft_id"], place, reception)
-        if row["state"] not in INGESTED:
+        place = Place(one.stream, one.position) if one.stream and one.position is not None else None
+        key = (one.sha256, one.ccsds_id, one.instance, one.spacecraft_id, place, one.station or "", one.link)
+        if one.state not in INGESTED:
             found.skip("unfinished ingests")
             continue
-        if key in seen or row["file_sha256"] not in good:
+        if key in seen or one.sha256 not in good:
             continue
         seen.add(key)
         found.count("raw files ingested again")
-        source = ground.files.path(row["file_sha256"])
-        linked = scratch.files.path(row["file_sha256"])
+        source = ground.files.path(one.sha256)
+        linked = scratch.files.path(one.sha256)
         linked.parent.mkdir(parents=True, exist_ok=True)
         if not linked.exists():
             linked.symlink_to(source)
-        stored = StoredFile(row["file_sha256"], int(row["octets"]), linked)
         try:
-            _ingest_one(scratch, stored, row, place)
+            _ingest_one(scratch, StoredFile(one.sha256, one.octets, linked), one, place)
         except (GroundError, TmtcError) as error:
-            if row["state"] == "done":
-                found.damage("ingests", row["id"], f"expected a file that can be ingested, found: {error}")
+            if one.state == "done":
+                found.damage("ingests", one.id, f"expected a file that can be ingested, found: {error}")
 
 
-def _ingest_one(scratch: Ground, stored: StoredFile, row: Any, place: Place | None) -> None:
-    instance = row["scope"] or row["instance"] or FLOWN
-    spacecraft = row["spacecraft_id"]
-    if row["scope"] is None and row["ccsds_id"] is not None:
+def _ingest_one(scratch: Ground, stored: StoredFile, one: store.RecordedIngest, place: Place | None) -> None:
+    instance = one.scope or one.instance or FLOWN
+    spacecraft = one.spacecraft_id
+    if one.scope is None and one.ccsds_id is not None:
         # an ingest older than the record of pieces: the statements of its sender are not known
         try:
-            ingest_stored(scratch, stored, name=str(row["name"]), instance=instance)
+            ingest_stored(scratch, stored, name=one.name, instance=instance)
             return
         except GroundError:
-            spacecraft = int(row["ccsds_id"])  # bare packets carry no spacecraft id
+            spacecraft = one.ccsds_id  # bare packets carry no spacecraft id
     ingest_stored(
         scratch,
         stored,
-        name=str(row["name"]),
+        name=one.name,
         spacecraft_id=spacecraft,
         instance=instance,
         place=place,
-        station=row["station"] or "",
-        link=row["link"],
+        station=one.station or "",
+        link=one.link,
     )
 
 
 def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> None:
     """Store the packets of this archive in the scratch archive, as in their first ingest."""
-    table = repository.PACKETS
-    for row in connection.execute(select(repository.VEHICLES)).mappings().all():
-        vehicle, last = int(row["id"]), 0
+    for vehicle in all_vehicles(connection):
         try:
             with scratch.database.writing() as writing:
-                copy = vehicle_id(writing, row["ccsds_id"], row["instance"])
+                copy = vehicle_id(writing, vehicle.ccsds_id, vehicle.instance)
         except InvalidInput as error:
-            found.damage("vehicles", vehicle, str(error))
+            found.damage("vehicles", vehicle.id, str(error))
             continue
-        while True:
-            block = connection.execute(
-                select(table.c.id, table.c.digest, table.c.octets)
-                .where(table.c.vehicle_id == vehicle, table.c.id > last)
-                .order_by(table.c.id)
-                .limit(BLOCK_PACKETS)
-            ).all()
-            if not block:
-                break
-            last = int(block[-1][0])
-            whole = [bytes(octets) for key, digest, octets in block if _whole(key, digest, octets, found)]
+        for block in store.packet_blocks(connection, vehicle.id, BLOCK_PACKETS):
+            whole = [octets for key, digest, octets in block if _whole(key, digest, octets, found)]
             buffer = b"".join(whole)
             cut = whole_packets(np.array([len(octets) for octets in whole], dtype=np.int64))
-            batch = batch_of_cut(buffer, cut, DICTIONARY, int(row["ccsds_id"]))
+            batch = batch_of_cut(buffer, cut, DICTIONARY, vehicle.ccsds_id)
             with scratch.database.writing() as writing:
                 store_batch(writing, copy, batch)
 
 
 def _whole(key: int, digest: bytes, octets: bytes, found: _Findings) -> bool:
     """Return whether a stored packet matches its digest and the length in its header."""
-    octets = bytes(octets)
-    if hashlib.blake2b(octets, digest_size=DIGEST_OCTETS).digest() != bytes(digest):
+    if hashlib.blake2b(octets, digest_size=DIGEST_OCTETS).digest() != digest:
         found.damage("packets", key, "expected octets that match its digest, found other octets")
         return False
     if len(octets) <= PRIMARY_HEADER_LENGTH or len(octets) != PRIMARY_HEADER_LENGTH + 1 + int.from_bytes(
@@ -359,48 +307,31 @@ def _whole(key: int, digest: bytes, octets: bytes, found: _Findings) -> bool:
 
 def _compare(connection: Connection, made: Connection, found: _Findings) -> None:
     """Compare packets and values with those of the scratch archive."""
-    vehicles = repository.VEHICLES
-    known = {}
-    for row in connection.execute(select(vehicles)).mappings().all():
-        copy = repository.find(made, vehicles, ccsds_id=row["ccsds_id"], instance=row["instance"])
-        known[int(row["id"])] = int(copy["id"]) if copy is not None else 0
-        _compare_rows(
-            "packets", _packets(connection, int(row["id"])), _packets(made, known[int(row["id"])]), found
-        )
-        _compare_parameters(connection, made, int(row["id"]), known[int(row["id"])], found)
-        if row["decoded_version"] not in (None, DICTIONARY.version):
+    copies = {(one.ccsds_id, one.instance): one.id for one in all_vehicles(made)}
+    vehicles = all_vehicles(connection)
+    for vehicle in vehicles:
+        copy = copies.get((vehicle.ccsds_id, vehicle.instance), 0)
+        _compare_rows("packets", store.packets(connection, vehicle.id), store.packets(made, copy), found)
+        _compare_parameters(connection, made, vehicle.id, copy, found)
+        if vehicle.decoded_version not in (None, DICTIONARY.version):
             found.skip("vehicles not yet decoded with this dictionary")
             continue
-        for name, table in repository.SAMPLES.items():
-            _check_packets_of(connection, name, table, int(row["id"]), found)
+        for name, table in store.SAMPLES.items():
+            _check_packets_of(connection, table, vehicle.id, found)
             _compare_rows(
-                name,
-                _values(connection, table, int(row["id"])),
-                _values(made, table, known[int(row["id"])]),
-                found,
+                name, store.values(connection, table, vehicle.id), store.values(made, table, copy), found
             )
-    derived = (repository.PACKETS, repository.PARAMETER_SAMPLES, *repository.SAMPLES.values())
-    for name, table in ((one.name, one) for one in derived):
-        for vehicle, count in connection.execute(
-            select(table.c.vehicle_id, func.count())
-            .where(table.c.vehicle_id.not_in(list(known)))
-            .group_by(table.c.vehicle_id)
-        ):
-            found.damage(name, f"vehicle {vehicle}", f"expected no rows of an unknown vehicle, found {count}")
-        if "dictionary_version" not in table.c:
-            continue
-        other = connection.execute(
-            select(table.c.dictionary_version, func.count())
-            .where(table.c.dictionary_version != DICTIONARY.version)
-            .group_by(table.c.dictionary_version)
-        )
-        for version, count in other:
+    for table in store.DERIVED:
+        name = table.name
+        for unknown, count in store.rows_of_others(connection, table, [one.id for one in vehicles]):
+            found.damage(name, f"vehicle {unknown}", f"expected no rows of an unknown vehicle, found {count}")
+        for version, count in store.rows_of_other_versions(connection, table):
             if version > DICTIONARY.version:
                 found.damage(
                     name, f"dictionary version {version}", f"expected no newer version, found {count} rows"
                 )
             else:
-                found.skip(f"values decoded with dictionary version {version}", int(count))
+                found.skip(f"values decoded with dictionary version {version}", count)
 
 
 def _compare_parameters(
@@ -411,16 +342,11 @@ def _compare_parameters(
     The scratch archive decodes with the newest mission description only. Its definitions have other numbers, so
     definitions are compared by digest.
     """
-    table, name = repository.PARAMETER_SAMPLES, repository.PARAMETER_SAMPLES.name
-    _check_packets_of(connection, name, table, vehicle, found)
-    digests, decoded_to = _definition_digests(connection), _decoded_to(connection, vehicle)
-    made_digests, newest = _definition_digests(made), _decoded_to(made, copy)
-    counted = connection.execute(
-        select(table.c.definition_id, func.count())
-        .where(table.c.vehicle_id == vehicle)
-        .group_by(table.c.definition_id)
-    )
-    counts = {int(definition): int(count) for definition, count in counted}
+    name = store.PARAMETER_SAMPLES.name
+    _check_packets_of(connection, store.PARAMETER_SAMPLES, vehicle, found)
+    digests, decoded_to = store.definition_digests(connection), store.decoded_to(connection, vehicle)
+    made_digests, newest = store.definition_digests(made), store.decoded_to(made, copy)
+    counts = store.values_by_definition(connection, vehicle)
     numbers = {digest: definition for definition, digest in digests.items()}
     compared = {numbers.get(made_digests[definition], 0): definition for definition in newest}
     for definition, count in counts.items():
@@ -437,106 +363,28 @@ def _compare_parameters(
     for stored, definition in compared.items():
         pending: set[bytes] | None = set()
         if stored in decoded_to:
-            pending = _pending_packets(connection, vehicle, decoded_to[stored])
+            pending = store.pending_packets(connection, vehicle, decoded_to[stored])
         elif stored not in counts:  # not begun
             pending = None
         _compare_rows(
             name,
-            _parameter_values(connection, vehicle, stored),
-            _parameter_values(made, copy, definition),
+            store.parameter_values(connection, vehicle, stored),
+            store.parameter_values(made, copy, definition),
             found,
             pending=pending,
         )
 
 
-def _definition_digests(connection: Connection) -> dict[int, str]:
-    table = repository.PACKET_DEFINITIONS
-    return {int(key): str(digest) for key, digest in connection.execute(select(table.c.id, table.c.digest))}
-
-
-def _decoded_to(connection: Connection, vehicle: int) -> dict[int, int]:
-    """Return the last decoded packet of a vehicle by definition."""
-    table = repository.PACKET_DECODINGS
-    query = select(table.c.definition_id, table.c.decoded_to).where(table.c.vehicle_id == vehicle)
-    return {int(definition): int(last) for definition, last in connection.execute(query)}
-
-
-def _pending_packets(connection: Connection, vehicle: int, decoded_to: int) -> set[bytes]:
-    """Return the digests of packets that are stored but not yet decoded."""
-    table = repository.PACKETS
-    query = select(table.c.digest).where(table.c.vehicle_id == vehicle, table.c.id > decoded_to)
-    return {bytes(digest) for digest in connection.execute(query).scalars()}
-
-
-def _check_packets_of(
-    connection: Connection, name: str, table: Table, vehicle: int, found: _Findings
-) -> None:
+def _check_packets_of(connection: Connection, table: store.Table, vehicle: int, found: _Findings) -> None:
     """Report packets referenced by values that are missing or have another number."""
-    packets = repository.PACKETS
-    missing = connection.execute(
-        select(table.c.packet_id, func.count())
-        .outerjoin(packets, and_(packets.c.id == table.c.packet_id, packets.c.vehicle_id == vehicle))
-        .where(table.c.vehicle_id == vehicle, packets.c.id.is_(None))
-        .group_by(table.c.packet_id)
-        .order_by(table.c.packet_id)
-    )
-    for packet, count in missing:
-        found.damage("packets", packet, f"expected the packet of {count} rows of {name}, found none")
-
-
-Keyed = Iterator[tuple[tuple[Any, ...], tuple[Any, ...]]]
-
-
-def _packets(connection: Connection, vehicle: int) -> Keyed:
-    table = repository.PACKETS
-    names = ("apid", "ticks", "sequence_count", "digest")
-    query = (
-        select(*(table.c[name] for name in names), table.c.octets)
-        .where(table.c.vehicle_id == vehicle)
-        .order_by(*(table.c[name] for name in names))
-    )
-    return _keyed(connection, query, len(names))
-
-
-def _values(connection: Connection, table: Table, vehicle: int) -> Keyed:
-    packets = repository.PACKETS
-    kept = [column for column in table.columns if column.name not in ("vehicle_id", "packet_id", "ticks")]
-    query = (
-        select(table.c.ticks, packets.c.digest, *kept)
-        .outerjoin(
-            packets, and_(packets.c.id == table.c.packet_id, packets.c.vehicle_id == table.c.vehicle_id)
-        )
-        .where(table.c.vehicle_id == vehicle, table.c.dictionary_version == DICTIONARY.version)
-        .order_by(table.c.ticks, func.coalesce(packets.c.digest, b""))
-    )
-    return _keyed(connection, query, 2)
-
-
-def _parameter_values(connection: Connection, vehicle: int, definition: int) -> Keyed:
-    table, packets = repository.PARAMETER_SAMPLES, repository.PACKETS
-    query = (
-        select(table.c.ticks, packets.c.digest, table.c.container, table.c["values"])
-        .outerjoin(
-            packets, and_(packets.c.id == table.c.packet_id, packets.c.vehicle_id == table.c.vehicle_id)
-        )
-        .where(table.c.vehicle_id == vehicle, table.c.definition_id == definition)
-        .order_by(table.c.ticks, func.coalesce(packets.c.digest, b""), table.c.container)
-    )
-    return _keyed(connection, query, 3)
-
-
-def _keyed(connection: Connection, query: Any, key_columns: int) -> Keyed:
-    rows: Iterable[Any] = connection.execution_options(yield_per=BLOCK_PACKETS).execute(query)
-    for row in rows:
-        values = tuple(bytes(value) if isinstance(value, memoryview) else value for value in row)
-        key = tuple(b"" if value is None else value for value in values[:key_columns])
-        yield key, values[key_columns:]
+    for packet, count in store.missing_packets(connection, table, vehicle):
+        found.damage("packets", packet, f"expected the packet of {count} rows of {table.name}, found none")
 
 
 def _compare_rows(
     kind: str,
-    stored: Keyed,
-    expected: Keyed,
+    stored: store.Keyed,
+    expected: store.Keyed,
     found: _Findings,
     *,
     pending: Collection[bytes] | None = (),

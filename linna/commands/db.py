@@ -229,10 +229,10 @@ def run_tidy(arguments: argparse.Namespace) -> int:
 
 
 def run_redecode(arguments: argparse.Namespace) -> int:
-    from ground_service.ingest.redecode import redecode_all
+    from ground_service.ingest.service import decode_all_again
 
     with open_service(arguments) as ground:
-        rows = redecode_all(ground)
+        rows = decode_all_again(ground)
     emit(arguments, {"rows": rows}, text=f"{rows} rows")
     return 0
 

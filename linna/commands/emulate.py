@@ -107,6 +107,9 @@ def _add_continuous(parser: argparse.ArgumentParser) -> None:
     endless.add_argument("--state", type=Path, metavar="FILE", help="state to go on from, kept up to date")
     endless.add_argument("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
     endless.add_argument(
+        "--craters", type=Path, metavar="FILE", help="crater catalogue with rim heights, on board from launch"
+    )
+    endless.add_argument(
         "--operations", type=Path, metavar="FILE", help="TOML appended to the mission description"
     )
 
@@ -227,6 +230,7 @@ def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
     from linna.data import data_folder
     from linna.errors import UsageError
+    from lunar.catalogue import load_catalogue
     from payload_emulator.session.continuous import ContinuousSession
     from payload_emulator.session.mission import operations_mission_text
 
@@ -253,7 +257,10 @@ def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
         checkpoint_file=arguments.state,
         clock_file=arguments.clock_file,
         keeps=arguments.keep_unacknowledged,
-        mission=lambda world, ports: operations_mission_text(world, data, arguments.host, ports, further),
+        catalogue=load_catalogue(arguments.craters) if arguments.craters else None,
+        mission=lambda world, ports: operations_mission_text(
+            world, data, arguments.host, ports, further, arguments.keep_unacknowledged
+        ),
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: session.stopping.set())

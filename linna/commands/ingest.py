@@ -99,7 +99,8 @@ def run(arguments: argparse.Namespace) -> int:
                 "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending", "frames_bad",
                 "symbols_corrected",
             )  # fmt: skip
-            figures = {name: made.accounting[name] for name in kept}
+            assert made.accounting is not None
+            figures = made.accounting.model_dump(include=set(kept))
             return {"file": str(path), "ingest_id": made.id, **figures}
 
         def ingest_live(path: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`linna mission write | check | add | list | show`: mission descriptions."""
+"""`linna mission write | check | add | list | show | run`: mission descriptions, and simulated missions."""
 
 from __future__ import annotations
 
@@ -29,9 +29,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     showing = actions.add_parser("show", help="show a revision")
     showing.add_argument("revision", metavar="REVISION", help="the hash or its first eight digits")
     showing.set_defaults(handler=show)
+    running = actions.add_parser("run", help="run payload, stations, ground service and automation for days")
+    running.add_argument("scenario", metavar="SCENARIO", help="scenario file or name")
+    running.add_argument("--days", type=float, required=True, metavar="D", help="simulated days")
+    running.add_argument(
+        "--speed", default="max", metavar="X|max", help="simulated seconds per second (default: max)"
+    )
+    running.add_argument(
+        "--observe-hours-a-day", type=float, default=0.4, metavar="H", help="observation a day (default: 0.4)"
+    )
+    running.add_argument(
+        "--window-min", type=float, default=12.0, metavar="M", help="window (default: 12 min)"
+    )
+    running.add_argument(
+        "--folder", type=Path, metavar="DIR", help="folder of the run (default: run-SCENARIO)"
+    )
+    running.set_defaults(handler=run_mission)
     for action in (adding, listing, showing):
         add_operator_options(action)
-    for action in (writing, checking, adding, listing, showing):
+    for action in (writing, checking, adding, listing, showing, running):
         add_json_flag(action)
 
 
@@ -98,3 +114,40 @@ def _described(figures: Mapping[str, Any]) -> str:
     if unknown:
         lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
     return "\n".join(lines)
+
+
+def run_mission(arguments: argparse.Namespace) -> int:
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from linna.output import log
+    from payload_emulator.session.scenario import load_scenario
+    from studies.mission_run import run
+
+    try:
+        rate = 0.0 if arguments.speed == "max" else float(arguments.speed)
+    except ValueError:
+        rate = -1.0
+    if rate < 0.0 or (rate == 0.0 and arguments.speed != "max"):
+        raise UsageError(f"--speed: expected a number above 0 or max, found {arguments.speed!r}")
+    if not (arguments.days > 0.0 and arguments.observe_hours_a_day > 0.0 and arguments.window_min >= 1.0):
+        raise UsageError(
+            "--days, --observe-hours-a-day, --window-min: expected numbers above 0 and windows of a minute or more"
+        )
+    scenario = load_scenario(arguments.scenario)
+    terms = run.RunTerms(
+        arguments.days,
+        rate,
+        max(1, round(60.0 * arguments.observe_hours_a_day / arguments.window_min)),
+        60.0 * arguments.window_min,
+    )
+    folder = arguments.folder or Path(f"run-{scenario.name}")
+    figures = run.run_mission(scenario, data_folder(), folder, terms, log)
+    windows = figures["windows"]
+    text = (
+        f"{figures['days']:g} days in {figures['wall_s']:.0f} s: {windows['requested']} windows requested, "
+        f"{windows['flown']} flown, {windows['processed']} processed, {windows['failed']} failed; "
+        f"{figures['packets_lost']} packets lost, {figures['reports']} reports, "
+        f"{figures['interventions']} interventions\n{folder / 'report.html'}"
+    )
+    emit(arguments, figures, text=text)
+    return 0 if windows["processed"] == windows["flown"] and not figures["packets_lost"] else 1

@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
 from lunar.third_bodies import sun_position_icrf_m
@@ -159,6 +160,8 @@ class ContinuousSession:
         Where the mission time is written for the ground (`LINNA_CLOCK_FILE`).
     keeps
         Whether the stations keep records until they are acknowledged.
+    catalogue
+        Craters of the anchoring catalogue that is loaded at launch; None: none.
     mission
         From the ports in use (station: telemetry, telecommand) to the text of the mission description.
     """
@@ -176,6 +179,7 @@ class ContinuousSession:
     checkpoint_file: Path | None = None
     clock_file: Path | None = None
     keeps: bool = False
+    catalogue: CraterCatalogue | None = None
     mission: Callable[[World, dict[str, tuple[int, int]]], str] = lambda world, ports: ""
     stopping: threading.Event = field(default_factory=threading.Event)
     account: Account = field(default_factory=Account)
@@ -207,7 +211,7 @@ class ContinuousSession:
         scenario = self.scenario
         self._transmitter = Transmitter(SPACECRAFT_ID, LinkSettings(coding=scenario.link.coding))
         self.world = open_world(scenario, self.data, CHUNK_S)
-        self._loaded = launch_payload(scenario, self.world.camera, self.data)
+        self._loaded = launch_payload(scenario, self.world.camera, self.data, self.catalogue)
         self.utc_ns = scenario.epoch_utc_ns
         self._planned_until_ns = self.utc_ns
         checkpoint = load_checkpoint(self.checkpoint_file, scenario) if self.checkpoint_file else None
@@ -255,6 +259,10 @@ class ContinuousSession:
         self._turn()
         while not self.stopping.is_set():
             if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
+                self._held = self.holds
+                self._say({**self._contact_message(), "kind": "finished"})
+                while self._held and not self.stopping.is_set():
+                    self._serve(selector, _POLL_S)
                 return
             self._plan_ahead()
             due_ns = self._next_turn_ns()
@@ -543,7 +551,7 @@ class ContinuousSession:
         elif words == ["quit"]:
             self.stopping.set()
         elif words == ["state"]:
-            self._say({"kind": "state", **self._contact_message(), "paused": self.paused or self._held})
+            self._say({**self._contact_message(), "kind": "state", "paused": self.paused or self._held})
         elif len(words) == 2 and words[0] == "rate" and _number(words[1]) is not None:
             self.rate = _number(words[1]) or 0.0
         elif len(words) == 2 and words[0] == "until":

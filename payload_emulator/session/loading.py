@@ -139,8 +139,10 @@ def load_payload(
     return _loaded(build, tables, described, flight_orientation)
 
 
-def launch_payload(scenario: Scenario, camera: PinholeCamera, data: DataFolder) -> LoadedPayload:
-    """Flight software as launched: model, parameters and gravity field; all other tables are uploaded in flight.
+def launch_payload(
+    scenario: Scenario, camera: PinholeCamera, data: DataFolder, catalogue: CraterCatalogue | None = None
+) -> LoadedPayload:
+    """Flight software as launched: model, parameters, gravity field and catalogue; other tables are uploaded in flight.
 
     Raises
     ------
@@ -148,7 +150,9 @@ def launch_payload(scenario: Scenario, camera: PinholeCamera, data: DataFolder) 
         The detector model is missing or no network of this project.
     """
     build = _build(scenario, camera, data)
-    return _loaded(build, FlightTables(gravity=_gravity_octets(build.field)), {}, IauOrientation())
+    craters = b"" if catalogue is None else _catalogue_octets(scenario, catalogue)
+    tables = FlightTables(gravity=_gravity_octets(build.field), catalogue=craters)
+    return _loaded(build, tables, {}, IauOrientation())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,6 +46,9 @@ DETECTOR_RECIPE = SHIPPED / "detector-dataset.toml"
 SEEN_SPLITS = ("train", "val")
 """Splits whose terrain counts as seen; the validation split was used to choose thresholds."""
 
+SILENCE_S = 1_800.0
+"""Mission time without telemetry after which a contact has ended: at maximum speed minutes pass between two reads."""
+
 _TRACK_STEP_S = 60.0
 
 SPACECRAFT_NAME = "SelenITA"
@@ -128,7 +131,12 @@ def mission_text(world: World, data: DataFolder) -> str:
 
 
 def operations_mission_text(
-    world: World, data: DataFolder, host: str, ports: Mapping[str, tuple[int, int]], further: str = ""
+    world: World,
+    data: DataFolder,
+    host: str,
+    ports: Mapping[str, tuple[int, int]],
+    further: str = "",
+    acknowledge: bool = False,
 ) -> str:
     """Return the mission description of a spacecraft in continuous operation.
 
@@ -138,6 +146,8 @@ def operations_mission_text(
         Telemetry and telecommand port of each station on `host`.
     further
         TOML appended to the text: automation, approval and resources.
+    acknowledge
+        Whether the stations keep telemetry until the ground acknowledges it.
     """
     scenario, link = world.scenario, world.scenario.link
     step_ns = round(_TRACK_STEP_S * NS)
@@ -146,6 +156,13 @@ def operations_mission_text(
     low_deg, high_deg = scenario.window.latitude_band_deg
     band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
     lines = [mission_text(replace(world, frame_utc_ns=band), data).rstrip()]
+    lines += [
+        "",
+        "[uploads]",
+        f"tables = {_toml(_uploaded_tables(scenario))}",
+        f"sigma_position_m = {max(scenario.navigation.initial_position_error_m, 1.0)!r}",
+        f"sigma_velocity_m_s = {max(scenario.navigation.initial_velocity_error_m_s, 1e-3)!r}",
+    ]
     for name in link.stations:
         latitude_deg, longitude_deg, height_m = STATIONS[name]
         own = [one for one in map(parse_outage, link.outages) if one.station == name]
@@ -175,9 +192,19 @@ def operations_mission_text(
             "uplink": f"{host}:{telecommand}",
             "format": "cltu",
             "send": "automatic",
+            "acknowledge": acknowledge,
+            "silence_s": SILENCE_S,
         }
         lines += ["", "[[links]]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
     return "\n".join(lines) + "\n" + further
+
+
+def _uploaded_tables(scenario: Scenario) -> list[str]:
+    """Tables that the estimators of a scenario need for each window."""
+    estimators = scenario.navigation.estimators
+    anchored = ["orientation"] if "anchored" in estimators else []
+    odometry = ["anchor_ephemeris"] if set(estimators) - {"anchored"} else []
+    return [*anchored, *odometry, *(["initial_state"] if anchored else [])]
 
 
 def save_mission(folder: Path, world: World, data: DataFolder) -> None:

@@ -104,6 +104,7 @@ class Ground:
             if message["kind"] == "contact":
                 self.contacts.append(message)
                 self.act(self, message)
+            if message["kind"] in ("contact", "finished"):
                 self._console.sendall(b"run\n")
 
     def send(self, *packets: bytes) -> None:

@@ -1,6 +1,8 @@
 """Packets that a mission description defines: received, decoded, read as series, exported, decoded again."""
 
+import hashlib
 import json
+import shutil
 import struct
 import warnings
 from itertools import pairwise
@@ -14,13 +16,16 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest import parameters as decoding
-from ground_service.ingest.service import Place, ingest_file, undecoded_vehicles
+from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
+from ground_service.missions import store as missions
 from ground_service.missions.definitions import read_mission_file
 from ground_service.missions.model import mission_faults
 from ground_service.missions.service import add_mission, check_mission_file
+from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
+from ground_service.passes.archive_import import import_archive
 from ground_service.passes.parameters import export_packets, pass_parameters
-from ground_service.passes.service import define_pass, parameter_series, trend_series
+from ground_service.passes.service import define_pass, get_pass, parameter_series, trend_series
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
@@ -28,6 +33,7 @@ from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc
 from tests.tmtc import foreign
+from tmtc.crc import crc16
 from tmtc.downlink import decode, encode_cadus
 
 with warnings.catch_warnings():
@@ -72,6 +78,11 @@ def bus_packets(count: int, seed: int = 1) -> list[bytes]:
         if k % 4 == 0:
             packets.append(at(foreign.event(rng, k // 4), k + 0.5))
     return packets
+
+
+def longer(packet: bytes) -> bytes:
+    """The packet with a length that includes a checksum of two octets."""
+    return packet[:4] + (int.from_bytes(packet[4:6], "big") + 2).to_bytes(2, "big") + packet[6:]
 
 
 def downlink(folder: Path, packets: list[bytes], name: str = "bus.cadu") -> Path:
@@ -310,6 +321,85 @@ def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet
     decoding.decode_declared(either, result.vehicle_id)
     found = verify(either, deep=True)
     assert (found.damaged, found.unchecked, found.checked["parameter_samples"]) == ([], {}, 13)
+
+
+def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED) -> Path:
+    """The synthetic archive with other packets in its downlink, and a mission description that declares them."""
+    archive: Path = shutil.copytree(made.folder, folder / "archive")
+    written = {
+        "downlink.cadu": encode_cadus(packets, spacecraft_id=76),
+        "mission.toml": read_mission_file(mission(folder / "described", text)),
+    }
+    manifest = json.loads((archive / "manifest.json").read_text())
+    for name, octets in written.items():
+        (archive / name).write_bytes(octets)
+        manifest["files"][name] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+    (archive / "manifest.json").write_text(json.dumps(manifest))
+    return archive
+
+
+RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
+
+
+def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_spacecraft_is_not(
+    either: Ground, tmp_path: Path, synthetic_pass: Any
+) -> None:
+    bus = bus_packets(40)
+    folder = archived(synthetic_pass, tmp_path, [*payload_packets(synthetic_pass), *bus])
+    live = define(either)
+    ingest_file(either, downlink(tmp_path, payload_packets(synthetic_pass)))
+    pass_id = import_archive(either, folder)
+    instance = get_pass(either, pass_id).instance
+    found = trend_series(either, 76, instance, "VOLTAGE", 1000)
+    expected = [packet["VOLTAGE"] for packet in interpreted(bus[:1], tmp_path)]
+    assert found.samples == 40 and found.buckets.mean.tolist()[:1] == expected
+    assert pass_parameters(either, pass_id).outcomes == {"100": {"decoded": 40}, "101": {"decoded": 10}}
+    rows = json.loads(export_packets(either, pass_id, "Housekeeping", "json"))
+    assert (
+        len(rows)
+        == {one.packet: one.packets for one in pass_parameters(either, pass_id).packets}["Housekeeping"]
+    )
+    assert pass_parameters(either, live).packets == ()
+    with either.database.reading() as connection:
+        assert packets_in_force(connection, 76, "flight") is None
+    # a description that a person adds holds for the spacecraft, and not for the archive
+    add_mission(either, read_mission_file(mission(tmp_path / "later", document=RENAMED)))
+    ingest_file(either, downlink(tmp_path, bus, "live.cadu"))
+    assert trend_series(either, 76, "flight", "BATTERY", 1000).samples == 40
+    assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 40
+    with pytest.raises(NotFound):
+        trend_series(either, 76, instance, "BATTERY", 1000)
+    assert undecoded_vehicles(either, 76) == []
+    for deep in (False, True):
+        checked = verify(either, deep=deep)
+        assert (checked.damaged, checked.unchecked) == ([], {})
+
+
+def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_redecoding(
+    either: Ground, tmp_path: Path, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked = DEFINED.replace("'none'", "'crc16'")
+    packets = [packet + crc16(packet).to_bytes(2, "big") for packet in map(longer, bus_packets(20))]
+    folder = archived(synthetic_pass, tmp_path, packets, checked)
+    with monkeypatch.context() as patched:  # as it was when the packets of archives were not decoded
+        patched.setattr(missions, "packets_in_force", lambda *_given: None)
+        pass_id = import_archive(either, folder)
+    instance = get_pass(either, pass_id).instance
+    with pytest.raises(NotFound):
+        trend_series(either, 76, instance, "VOLTAGE", 1000)
+    assert len(undecoded_vehicles(either, 76)) == 1
+    assert decode_all_again(either) >= 25
+    assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
+    assert undecoded_vehicles(either, 76) == []
+
+
+def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_the_spacecraft(
+    either: Ground, tmp_path: Path, synthetic_pass: Any
+) -> None:
+    enter(either, tmp_path / "m")
+    pass_id = import_archive(either, archived(synthetic_pass, tmp_path, bus_packets(20), ""))
+    instance = get_pass(either, pass_id).instance
+    assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
 
 
 def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:

@@ -25,7 +25,8 @@ from benchmarks.downlink import (
 from ground_service.access.audit_log import list_entries
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.service import IngestResult, ingest_file
+from ground_service.ingest.model import IngestResult
+from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.missions.store import links_in_force
 from ground_service.passes.archive_import import import_archive
@@ -71,8 +72,8 @@ def ingest(ground: Ground, folder: Path, octets: bytes, **options: Any) -> Inges
 
 def section(result: IngestResult) -> dict[str, Any]:
     assert result.reception is not None
-    (one,) = result.reception["sections"]
-    return dict(one)
+    (one,) = result.reception.sections
+    return one.model_dump()
 
 
 def stored(ground: Ground, spacecraft: int = SPACECRAFT) -> set[bytes]:
@@ -183,30 +184,30 @@ def test_records_of_a_station_give_reception_times_and_their_octets_are_accounte
     assert quality is not None
     n = len(rows)
     assert result.packets == len(packets_of(can_be_read(rows, LinkSettings()), telemetry(60), LinkSettings()))
-    assert (quality["first_utc_ns"], quality["last_utc_ns"]) == (START, START + (n - 1) * NS)
-    assert (quality["octets_frames"], quality["octets_records"], quality["octets_other"]) == (
+    assert (quality.first_utc_ns, quality.last_utc_ns) == (START, START + (n - 1) * NS)
+    assert (quality.octets_frames, quality.octets_records, quality.octets_other) == (
         n * 1279,
         n * 20,
         0,
     )
-    assert (quality["frames"], quality["lock_losses"], quality["station"]) == (n, 0, "madrid")
+    assert (quality.frames, quality.lock_losses, quality.station) == (n, 0, "madrid")
 
 
 def test_the_bit_error_rate_is_estimated_from_the_corrected_bits(ground: Ground, tmp_path: Path) -> None:
     quality = ingest(ground, tmp_path, with_bit_errors(cadus(SHORT), 2e-3, 3).tobytes()).reception
-    assert quality is not None and quality["codewords_lost"] == 0
+    assert quality is not None and quality.codewords_lost == 0
     # of 4e6 bits 8,200 are wrong: one standard deviation is 1.1 %
-    assert quality["bit_error_rate"] == pytest.approx(2e-3, rel=0.05)
-    assert quality["symbols_corrected"] > 7_000
+    assert quality.bit_error_rate == pytest.approx(2e-3, rel=0.05)
+    assert quality.symbols_corrected > 7_000
 
 
 def test_lost_bits_and_inverted_frames_are_lock_losses(ground: Ground, tmp_path: Path) -> None:
     bits = np.unpackbits(cadus(30).reshape(-1))
     rows = np.packbits(np.delete(bits, [9 * 8 * 1279 + 4000]))
     quality = ingest(ground, tmp_path, rows.tobytes()).reception
-    assert quality is not None and quality["lock_losses"] == 1 and quality["frames_inverted"] == 0
+    assert quality is not None and quality.lock_losses == 1 and quality.frames_inverted == 0
     quality = ingest(ground, tmp_path, (255 - cadus(30)).tobytes()).reception
-    assert quality is not None and quality["frames_inverted"] == len(cadus(30))
+    assert quality is not None and quality.frames_inverted == len(cadus(30))
 
 
 def test_packets_without_error_control_are_read_if_the_mission_says_so(

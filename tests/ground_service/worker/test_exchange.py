@@ -15,8 +15,10 @@ from ground_service.access.service import add_user, authenticate, token_sha256, 
 from ground_service.commanding.service import get_command, release_command
 from ground_service.errors import Conflict, DatabaseTooNew, DatabaseTooOld, FileDamaged, InvalidInput
 from ground_service.ground import Ground, open_ground
+from ground_service.ingest.listing import get_ingest
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.service import ingest_file
+from ground_service.ingest.store import results_of_vehicle
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store import repository
@@ -249,6 +251,9 @@ def test_a_database_before_version_1_is_carried_over(earlier: Path, tmp_path: Pa
             row = repository.get(connection, repository.VEHICLES, 3, "vehicle")
             window = repository.get(connection, repository.WINDOWS, 1, "window")
         assert row["decoded_version"] is not None
+        assert get_ingest(ground, 4).accounting is None  # the earlier one states too little
+        with ground.database.reading() as connection:
+            assert [result for _, _, result in results_of_vehicle(connection, 3)] == [None]
         assert (window["edited_by"], window["decided_by"]) == ("bob", None)
         release_command(ground, 3, actor="eve")
         assert get_command(ground, 3).record.sequence_count == 2  # two had counts: the next is the third

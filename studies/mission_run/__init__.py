@@ -1,0 +1,1 @@
+"""A mission over simulated days: payload, stations, ground service and automation together."""

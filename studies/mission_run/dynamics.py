@@ -1,0 +1,68 @@
+"""Flight dynamics of a mission run, outside of spacecraft and ground: reference ephemerides and the crater catalogue.
+
+Each day's orbit determination has errors of its own; the burns that it knows of are those that were planned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from lunar.catalogue import save_catalogue
+from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.datafolder import DataFolder
+from lunar.oem import save_oem
+from payload_emulator.session.continuous import CHUNK_S
+from payload_emulator.session.scenario import Scenario
+from payload_emulator.session.world import World, flown_on, open_world, sample_truth, with_reference_error
+
+DAY_NS = 86_400 * NS
+BEFORE_NS = 6 * 3600 * NS
+AHEAD_NS = 54 * 3600 * NS
+CATALOGUE_MARGIN_DEG = 5.0
+"""Half the field of view of the camera at 60 km altitude, beyond the latitudes of the windows."""
+
+
+@dataclass(slots=True)
+class FlightDynamics:
+    """The orbit of a scenario as far as it has been asked for."""
+
+    world: World
+
+    @classmethod
+    def of(cls, scenario: Scenario, data: DataFolder) -> FlightDynamics:
+        """Return the flight dynamics of a scenario from its epoch on."""
+        return cls(open_world(scenario, data, CHUNK_S))
+
+    def save_reference(self, now_utc_ns: int, path: Path) -> Path:
+        """Write the orbit determination of a day: from some hours ago to two days ahead."""
+        scenario = self.world.scenario
+        start = max(now_utc_ns - BEFORE_NS, scenario.epoch_utc_ns)
+        stop = now_utc_ns + AHEAD_NS
+        while self.world.truth.stop_utc_ns < stop + 600 * NS:
+            truth, burns = flown_on(self.world, CHUNK_S)
+            self.world = replace(self.world, truth=truth, burns=(*self.world.burns, *burns))
+        flown = sample_truth(self.world.truth, np.array([start, stop], dtype=np.int64))
+        day = (now_utc_ns - scenario.epoch_utc_ns) // DAY_NS
+        save_oem(with_reference_error(flown, scenario.reference, scenario.seed + 1_000 * (1 + day)), path)
+        return path
+
+    def save_craters(self, latitude_limit_deg: float, path: Path) -> int:
+        """Write the craters around the latitudes of the windows with their rim heights; their number."""
+        world, navigation = self.world, self.world.scenario.navigation
+        listed = world.terrain.catalogue
+        limit_rad = np.radians(latitude_limit_deg + CATALOGUE_MARGIN_DEG)
+        chosen = np.flatnonzero(
+            (np.abs(listed.latitude_rad) < limit_rad)
+            & (listed.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km)
+            & (listed.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km)
+        )
+        if world.scenario.camera.images == "reduced" and "anchored" not in navigation.estimators:
+            # Nobody asks for the heights of rims: measuring them means making the ground.
+            catalogue = listed.select(chosen)
+        else:
+            catalogue = world.terrain.measured(chosen)
+        save_catalogue(catalogue, path)
+        return len(catalogue)

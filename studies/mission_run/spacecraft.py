@@ -1,0 +1,105 @@
+"""The spacecraft of a mission run: `linna emulate --continuous` as a process, and its console."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from payload_emulator.errors import LinkError
+
+START_S = 180.0
+STOP_S = 60.0
+ANSWER_S = 600.0
+"""Longest wait for the spacecraft: the time to the next contact with windows in between, at maximum speed."""
+
+
+def free_ports(count: int) -> list[int]:
+    """Return ports that are free now."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [one.getsockname()[1] for one in sockets]
+
+
+@dataclass(frozen=True, slots=True)
+class SpacecraftFiles:
+    """Files of a spacecraft under the folder of a run."""
+
+    scenario: Path
+    state: Path
+    clock: Path
+    craters: Path
+    operations: Path
+    log: Path
+
+
+class SpacecraftProcess:
+    """The emulated spacecraft and its stations in a process; `messages` of its console in order."""
+
+    def __init__(self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float) -> None:
+        console, mission, *station_ports = free_ports(2 + 2 * len(stations))
+        self.mission_port = mission
+        words = ["emulate", files.scenario, "--continuous", "--days", days, "--rate", rate, "--hold-contacts"]
+        words += ["--console-port", console, "--mission-port", mission, "--state", files.state]
+        words += ["--clock-file", files.clock, "--operations", files.operations, "--craters", files.craters]
+        words += ["--keep-unacknowledged", "--json"]
+        for k, name in enumerate(stations):
+            words += ["--station-port", f"{name}:{station_ports[2 * k]}:{station_ports[2 * k + 1]}"]
+        command = [sys.executable, "-m", "linna", *map(str, words)]
+        with files.log.open("ab") as log:
+            # A group of its own: Ctrl-C reaches the runner, which stops the spacecraft in order.
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        self._log = files.log
+        self._console = self._connected(console)
+        self._lines = self._console.makefile("r")
+
+    def messages(self) -> Iterator[dict[str, Any]]:
+        """Return what the console says, until the spacecraft ends."""
+        try:
+            for line in self._lines:
+                yield json.loads(line)
+        except (OSError, ValueError) as error:
+            raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
+
+    def order(self, word: str) -> None:
+        """Send a word to the console."""
+        self._console.sendall(word.encode() + b"\n")
+
+    def mission_text(self) -> bytes:
+        """Return the mission description that the spacecraft's operator hands over."""
+        octets = b""
+        with socket.create_connection(("127.0.0.1", self.mission_port), timeout=ANSWER_S) as connection:
+            while block := connection.recv(65_536):
+                octets += block
+        return octets
+
+    def stop(self) -> None:
+        """Stop the spacecraft with its state kept."""
+        if self.process.poll() is None:
+            with contextlib.suppress(OSError):
+                self.order("quit")
+            try:
+                self.process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self._console.close()
+
+    def _connected(self, port: int) -> socket.socket:
+        until = time.monotonic() + START_S
+        while True:
+            try:
+                return socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S)
+            except OSError:
+                if self.process.poll() is not None or time.monotonic() > until:
+                    self.process.kill()
+                    tail = self._log.read_text(errors="replace")[-400:].strip().replace("\n", " | ")
+                    raise LinkError(f"spacecraft: expected it to start, found: {tail}") from None
+                time.sleep(0.1)
