@@ -45,6 +45,9 @@ class Token(Entity):
     expires: UtcTime | None = Field(description="null: never")
     revoked: UtcTime | None
     used: UtcTime | None = Field(description="Last use, to the hour; null: never used")
+    parent_id: int | None = Field(
+        default=None, description="Token that a browser session was started with; null: no session"
+    )
 
 
 class TokenRecord(Entity):
@@ -57,6 +60,7 @@ class TokenRecord(Entity):
     expires_utc_ns: int | None
     revoked_utc_ns: int | None
     used_utc_ns: int | None
+    parent_id: int | None
     name: str
     role: Role
     state: Literal["active", "disabled"] = Field(description="State of the user")
@@ -78,6 +82,21 @@ class StoredAnswer(Entity):
 
     request: str
     answer: dict[str, Any] | None
+
+
+class Session(Entity):
+    """The caller of a request: its user, role and end of validity."""
+
+    name: str = Field(examples=["ann"])
+    role: Role
+    expires: UtcTime | None = Field(description="null: unlimited")
+    browser: bool = Field(description="Whether the request used the cookie of a browser session")
+
+
+class NewSession(Given):
+    """Token to start a browser session with."""
+
+    token: str = Field(min_length=1, max_length=200)
 
 
 class UserWithToken(Entity):

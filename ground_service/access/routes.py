@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Path, Query, Response
+from fastapi import Path, Query, Request, Response
 
 from ground_service.access import audit_log
 from ground_service.access import service as users
@@ -12,14 +12,16 @@ from ground_service.access.model import (
     USER_NAME,
     AuditEntry,
     AuditHead,
+    NewSession,
     NewToken,
     NewUser,
+    Session,
     Token,
     User,
     UserChange,
     UserWithToken,
 )
-from ground_service.access.security import Admin, Operator
+from ground_service.access.security import SESSION_COOKIE, Admin, Operator, Viewer
 from ground_service.errors import InvalidInput
 from ground_service.http.common import GroundOf, PagingOf, RowId
 from ground_service.http.model import PageOf
@@ -30,6 +32,41 @@ access = operations("access")
 
 UserName = Annotated[str, Path(pattern=USER_NAME)]
 Words = Annotated[str | None, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+@access.post("/session", responses=problems(401))
+def start_session(request: Request, response: Response, ground: GroundOf, given: NewSession) -> Session:
+    """Start a browser session with a token; the response sets its cookie."""
+    secret, session = users.start_session(ground, given.token)
+    response.set_cookie(
+        SESSION_COOKIE,
+        secret,
+        max_age=users.SESSION_NS // 1_000_000_000,
+        httponly=True,
+        samesite="strict",
+        secure=request.url.scheme == "https",
+    )
+    return session
+
+
+@access.get("/session")
+def get_session(request: Request, ground: GroundOf, caller: Viewer) -> Session:
+    """Show the user of this request, the role, and the end of the validity."""
+    return users.session_of(ground, caller, browser=_by_cookie(request))
+
+
+@access.delete("/session", status_code=204, response_class=Response)
+def end_session(request: Request, ground: GroundOf, caller: Viewer) -> Response:
+    """End the browser session of this request; tokens in headers are not revoked."""
+    if _by_cookie(request):
+        users.end_session(ground, caller)
+    response = Response(status_code=204)
+    response.delete_cookie(SESSION_COOKIE, httponly=True, samesite="strict")
+    return response
+
+
+def _by_cookie(request: Request) -> bool:
+    return "authorization" not in request.headers and SESSION_COOKIE in request.cookies
 
 
 @access.get("/users")

@@ -14,23 +14,27 @@ from ground_service.errors import Forbidden, NotAuthorised
 from ground_service.http.limits import VERIFIED_CALLER
 from ground_service.http.uploads import Upload, UploadPool
 
+SESSION_COOKIE = "linna_session"
+"""Cookie of a browser session. Requests that change data with it must show their origin (`http.origins`)."""
+
 _bearer = HTTPBearer(auto_error=False, description="Token issued by 'linna user add'")
 
 
 def caller_of(
     request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Caller:
-    """Return the owner of the token of a request, or the local user of a service without users."""
+    """Return the owner of the token or session cookie of a request; the local user of a service without users."""
     local: Caller | None = getattr(request.app.state, "local_caller", None)
     if local is not None:
         return local
     ground = request.app.state.ground
-    if given is None:
+    token = given.credentials if given is not None else request.cookies.get(SESSION_COOKIE)
+    if token is None:
         if request.app.state.open_without_users and not has_users(ground):
             request.state.caller = LOCAL_CALLER.name
             return LOCAL_CALLER
         raise NotAuthorised("expected a bearer token in the Authorization header, found none")
-    caller = authenticate(ground, given.credentials)
+    caller = authenticate(ground, token)
     request.state.caller = caller.name
     setattr(request.state, VERIFIED_CALLER, caller.name)
     return caller

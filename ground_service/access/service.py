@@ -17,10 +17,11 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.access import store
-from ground_service.access.model import DAYS_LIMIT, Token, TokenRecord, User, UserRecord
+from ground_service.access.model import DAYS_LIMIT, Role, Session, Token, TokenRecord, User, UserRecord
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, StoreError
 from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
 from ground_service.store import audit as audit_log
 
 ROLES = ("viewer", "operator", "admin")
@@ -30,6 +31,9 @@ STATES = ("active", "disabled")
 
 TOKEN_OCTETS = 32
 TOKEN_MINIMUM = 24
+SESSION_NS = 12 * 3_600_000_000_000
+"""Longest duration of a browser session: one shift."""
+
 HINT_LENGTH = 12
 """Number of characters of a token that are stored to identify it; 37 random characters remain secret."""
 
@@ -47,7 +51,7 @@ class Caller:
     """Authenticated caller with role and token."""
 
     name: str
-    role: str
+    role: Role
     token_id: int | None = None
 
     def may(self, role: str) -> bool:
@@ -254,6 +258,52 @@ def authenticate(ground: Ground, token: str) -> Caller:
     return Caller(found.name, found.role, found.id)
 
 
+def start_session(ground: Ground, token: str) -> tuple[str, Session]:
+    """Start a browser session with a token; return the secret of its cookie, and whose session it is.
+
+    A session ends after `SESSION_NS`, with the validity of the token, or with its revocation.
+
+    Raises
+    ------
+    NotAuthorised
+        If the token is not valid.
+    """
+    caller = authenticate(ground, token)
+    now = utc_now_ns()
+    with ground.database.writing() as connection:
+        parent = store.get_token(connection, caller.token_id or 0)
+        expires = now + SESSION_NS
+        if parent.expires_utc_ns is not None:
+            expires = min(expires, parent.expires_utc_ns)
+        user = store.get_user(connection, caller.name)
+        key, secret = _add_token(
+            connection, user, now, expires - now, parent_id=parent.parent_id or parent.id
+        )
+        audit(
+            connection, caller.name, "start session", caller.name, {"token_id": key, "parent_id": parent.id}
+        )
+    return secret, Session(name=caller.name, role=user.role, expires=UtcTime(expires), browser=True)
+
+
+def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
+    """Return who a caller is, and until when."""
+    expires = None
+    if caller.token_id is not None:
+        with ground.database.reading() as connection:
+            expires = store.get_token(connection, caller.token_id).expires_utc_ns
+    until = None if expires is None else UtcTime(expires)
+    return Session(name=caller.name, role=caller.role, expires=until, browser=browser)
+
+
+def end_session(ground: Ground, caller: Caller) -> None:
+    """End the browser session of a caller; a second call changes nothing."""
+    if caller.token_id is None:
+        return
+    with ground.database.writing() as connection:
+        if store.revoke_token(connection, caller.token_id, utc_now_ns()):
+            audit(connection, caller.name, "end session", caller.name, {"token_id": caller.token_id})
+
+
 def token_valid(ground: Ground, token: str) -> bool:
     """Return whether a token is valid now; one indexed query, for connections that outlive their opening request."""
     found = _find_token(ground, token)
@@ -312,7 +362,11 @@ def _note_use(ground: Ground, token_id: int, now: int) -> None:
 
 
 def _add_token(
-    connection: Connection, user: UserRecord, now: int, lifetime_ns: int | None
+    connection: Connection,
+    user: UserRecord,
+    now: int,
+    lifetime_ns: int | None,
+    parent_id: int | None = None,
 ) -> tuple[int, str]:
     token = "linna_" + secrets.token_urlsafe(TOKEN_OCTETS)
     expires = None if lifetime_ns is None else now + lifetime_ns
@@ -323,5 +377,6 @@ def _add_token(
         hint=token[:HINT_LENGTH],
         now_utc_ns=now,
         expires_utc_ns=expires,
+        parent_id=parent_id,
     )
     return key, token

@@ -83,8 +83,9 @@ def add_token(
     hint: str,
     now_utc_ns: int,
     expires_utc_ns: int | None,
+    parent_id: int | None = None,
 ) -> int:
-    """Add a token; return its id."""
+    """Add a token, or with `parent_id` that of a browser session; return its id."""
     return int(
         repository.add(
             connection,
@@ -94,6 +95,7 @@ def add_token(
             hint=hint,
             created_utc_ns=now_utc_ns,
             expires_utc_ns=expires_utc_ns,
+            parent_id=parent_id,
         )
     )
 
@@ -125,15 +127,17 @@ def list_tokens(connection: Connection, user: UserRecord | None) -> list[TokenRe
 
 
 def revoke_token(connection: Connection, token_id: int, now_utc_ns: int) -> bool:
-    """Revoke a token; return False if it was revoked before."""
+    """Revoke a token and end the browser sessions started with it; return False if it was revoked before."""
+    sessions = update(TOKENS).where(TOKENS.c.parent_id == token_id, TOKENS.c.revoked_utc_ns.is_(None))
+    connection.execute(sessions.values(revoked_utc_ns=now_utc_ns))
     return change_if(connection, TOKENS, token_id, {"revoked_utc_ns": None}, revoked_utc_ns=now_utc_ns)
 
 
 def revoke_tokens(
     connection: Connection, user: UserRecord, now_utc_ns: int, *, kept: int | None = None
 ) -> int:
-    """Revoke the tokens of a user, except one; return their number."""
-    others = [] if kept is None else [TOKENS.c.id != kept]
+    """Revoke the tokens of a user, except one and the sessions started with it; return their number."""
+    others = [] if kept is None else [TOKENS.c.id != kept, func.coalesce(TOKENS.c.parent_id, 0) != kept]
     query = update(TOKENS).where(TOKENS.c.user_id == user.id, TOKENS.c.revoked_utc_ns.is_(None), *others)
     return int(connection.execute(query.values(revoked_utc_ns=now_utc_ns)).rowcount)
 

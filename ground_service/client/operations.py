@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
-from ground_service.access.model import AuditEntry, AuditHead, Token, User, UserWithToken
+from ground_service.access.model import AuditEntry, AuditHead, Session, Token, User, UserWithToken
 from ground_service.alarms.model import Alarm, AlarmDetail
 from ground_service.automation.model import AutomationAction, RuleInForce
 from ground_service.client.connection import Body, Connection, Listing, new_key
@@ -17,7 +17,7 @@ from ground_service.client.problems import JobFailed
 from ground_service.commanding.model import Telecommand, UplinkState
 from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.model import PassFigures, Report, ReportOverview
+from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
 from ground_service.exports.model import ExportFormatInfo, FormatName
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
@@ -135,9 +135,13 @@ class Client(Connection):
 
     # Passes
 
-    def list_passes(self) -> Listing[PassSummary]:
-        """List passes, newest first."""
-        return self._list(PassSummary, "/passes")
+    def list_passes(
+        self, *, search: str | None = None, spacecraft_id: int | None = None, instance: str | None = None
+    ) -> Listing[PassSummary]:
+        """List the passes that match, newest first; `search` is a part of the name."""
+        return self._list(
+            PassSummary, "/passes", search=search, spacecraft_id=spacecraft_id, instance=instance
+        )
 
     def define_pass(self, definition: Fields, *, key: str | None = None) -> PassDetail:
         """Define an interval of a spacecraft's time as a pass."""
@@ -229,6 +233,10 @@ class Client(Connection):
         return self._all(Trend, f"/spacecraft/{spacecraft_id}/trends", instance=instance)
 
     # Reports
+
+    def list_newest_reports(self, pass_ids: Sequence[int]) -> list[ReportSummary]:
+        """List verdict and main figures of the newest report of each of these passes that has one."""
+        return self._all(ReportSummary, "/reports", pass_id=[str(one) for one in pass_ids])
 
     def list_reports(self, pass_id: int) -> Listing[Report]:
         """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
@@ -598,7 +606,19 @@ class Client(Connection):
             time.sleep(pause)
             pause = min(2.0 * pause, LONGEST_WAIT_S)
 
-    # Users, tokens and the audit log
+    # Users, tokens, sessions and the audit log
+
+    def start_session(self, token: str) -> Session:
+        """Start a browser session; its cookie is that of this client from now on."""
+        return self._post(Session, "/session", {"token": token})
+
+    def get_session(self) -> Session:
+        """Return the user, role and end of validity of this client."""
+        return self._get(Session, "/session")
+
+    def end_session(self) -> None:
+        """End the browser session of this client."""
+        self._octets("DELETE", "/session")
 
     def list_users(self) -> Listing[User]:
         """List all users."""

@@ -55,6 +55,21 @@ class Report(Entity):
     changes: list[ChangedFigure] | None
 
 
+class ReportSummary(Entity):
+    """Verdict and main figures of a report; null: not known."""
+
+    id: str
+    pass_id: int
+    created: UtcTime
+    verdict: str
+    verdict_level: str = Field(examples=["good"])
+    evidence_level: str
+    estimator: str | None = Field(description="Estimator of the error", examples=["anchored"])
+    median_error_m: float | None
+    recall: float | None
+    frames: int | None
+
+
 class StoredReport(Entity):
     """A stored report: see `store.models.Report`; times are UTC, ns."""
 

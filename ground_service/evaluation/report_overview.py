@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ground_service.evaluation import report_store
-from ground_service.evaluation.model import Report, ReportOverview, StoredReport
+from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary, StoredReport
 from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
 from ground_service.passes.core import downsample
 from ground_service.passes.store import get_pass
 from ground_service.store.files import FileArchive
+
+PREFERRED_ESTIMATORS = ("anchored", "spherical", "paper")
+"""Order in which the estimator of the main figures is chosen."""
 
 _TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", "headline", "not_available")
 
@@ -38,6 +42,30 @@ def get_report(ground: Ground, report_id: str) -> StoredReport:
     """Return a report."""
     with ground.database.reading() as connection:
         return report_store.get_report(connection, report_id)
+
+
+def newest_reports(ground: Ground, pass_ids: Sequence[int]) -> list[ReportSummary]:
+    """Return verdict and main figures of the newest report of each of these passes that has one."""
+    with ground.database.reading() as connection:
+        return [_summary(one) for one in report_store.newest_reports(connection, pass_ids)]
+
+
+def _summary(report: StoredReport) -> ReportSummary:
+    figures = PassFigures.model_validate(report.summary)
+    names = [name for name in PREFERRED_ESTIMATORS if name in figures.navigation]
+    estimator = names[0] if names else None
+    return ReportSummary(
+        id=report.id,
+        pass_id=report.pass_id,
+        created=UtcTime(report.created_utc_ns),
+        verdict=figures.verdict,
+        verdict_level=figures.verdict_level,
+        evidence_level=figures.evidence_level,
+        estimator=estimator,
+        median_error_m=None if estimator is None else figures.navigation[estimator].median_3d_m,
+        recall=figures.detector.recall,
+        frames=figures.frames,
+    )
 
 
 def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Report], int]:

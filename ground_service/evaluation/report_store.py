@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sqlalchemy import Connection, func, select
 
 from ground_service.evaluation.model import Report, StoredReport
@@ -32,6 +34,18 @@ def newest_report(connection: Connection, pass_id: int, *, other_than: str = "")
     query = select(_REPORTS).where(_REPORTS.c.pass_id == pass_id, _REPORTS.c.id != other_than)
     found = connection.execute(query.order_by(_REPORTS.c.created_utc_ns.desc()).limit(1)).mappings().first()
     return None if found is None else StoredReport.of(found)
+
+
+def newest_reports(connection: Connection, pass_ids: Sequence[int]) -> list[StoredReport]:
+    """Return the newest report of each of these passes that has one, by pass."""
+    number = (
+        func.row_number()
+        .over(partition_by=_REPORTS.c.pass_id, order_by=(_REPORTS.c.created_utc_ns.desc(), _REPORTS.c.id))
+        .label("number")
+    )
+    ranked = select(_REPORTS, number).where(_REPORTS.c.pass_id.in_(pass_ids)).subquery()
+    query = select(ranked).where(ranked.c.number == 1).order_by(ranked.c.pass_id)
+    return [StoredReport.of(row) for row in connection.execute(query).mappings()]
 
 
 def list_reports(

@@ -9,7 +9,7 @@ from fastapi import Query, Request, Response
 from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
 from ground_service.evaluation import report_overview, service
-from ground_service.evaluation.model import PassFigures, Report, ReportOverview
+from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
 from ground_service.http.common import (
     API_PREFIX,
     GroundOf,
@@ -92,6 +92,16 @@ def preferred_kind(accept: str) -> str:
         if kind is not None and value > weight:
             best, weight = kind, value
     return best
+
+
+@evaluation.get("/reports")
+def list_newest_reports(
+    ground: GroundOf,
+    _: Viewer,
+    pass_id: Annotated[list[int], Query(min_length=1, max_length=200, description="Passes; can be repeated")],
+) -> PageOf[ReportSummary]:
+    """List verdict and main figures of the newest report of each of these passes that has one."""
+    return PageOf.all_of(report_overview.newest_reports(ground, pass_id))
 
 
 @evaluation.get("/passes/{pass_id}/reports")

@@ -226,6 +226,7 @@ def _token(scope: Scope) -> str:
     token = headers.get("authorization", "")
     if not token and scope["type"] == "websocket":
         token = headers.get("sec-websocket-protocol", "")
+    token = token or headers.get("cookie", "")
     return hashlib.sha256(token.encode()).hexdigest() if token else ""
 
 

@@ -44,13 +44,13 @@ class PassSummary(Entity):
     name: str = Field(examples=["selenita pass 1"])
     start: UtcTime
     stop: UtcTime
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
 
 
 class PassDetail(PassSummary):
     """A pass."""
 
-    spacecraft_id: int = Field(examples=[76])
-    instance: str = Field(examples=["flight"])
     archive_sha256: str | None
     mission: str | None = Field(examples=["selenita"])
     mission_revision: str | None = Field(description="Revision of the mission description in force")

@@ -86,9 +86,25 @@ async def upload_archive(
 
 
 @passes.get("/passes")
-def list_passes(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[PassSummary]:
+def list_passes(
+    ground: GroundOf,
+    _: Viewer,
+    paging: PagingOf,
+    search: Annotated[
+        str | None, Query(min_length=1, max_length=200, description="Part of the name, in any case")
+    ] = None,
+    spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
+    instance: Instance | None = None,
+) -> PageOf[PassSummary]:
     """List the passes, newest first."""
-    items, total = service.list_passes(ground, limit=paging.limit, offset=paging.offset)
+    items, total = service.list_passes(
+        ground,
+        search=search,
+        spacecraft_id=spacecraft_id,
+        instance=instance,
+        limit=paging.limit,
+        offset=paging.offset,
+    )
     return paging.page(items, total)
 
 

@@ -54,10 +54,25 @@ TREND_DAYS = 30
 TREND_POINTS = 60
 
 
-def list_passes(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[PassSummary], int]:
-    """Return a page of the passes, newest first, and the total number."""
+def list_passes(
+    ground: Ground,
+    *,
+    search: str | None = None,
+    spacecraft_id: int | None = None,
+    instance: str | None = None,
+    limit: int = 100,
+    offset: int = 0,
+) -> tuple[list[PassSummary], int]:
+    """Return a page of the passes that match, newest first, and their number; `search` is a part of the name."""
     with ground.database.reading() as connection:
-        return store.list_passes(connection, limit=limit, offset=offset)
+        return store.list_passes(
+            connection,
+            search=search,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            limit=limit,
+            offset=offset,
+        )
 
 
 def get_pass(ground: Ground, pass_id: int) -> PassDetail:

@@ -67,10 +67,29 @@ def pass_detail(connection: Connection, pass_id: int) -> PassDetail:
     )
 
 
-def list_passes(connection: Connection, *, limit: int, offset: int) -> tuple[list[PassSummary], int]:
-    """Return a page of the passes, newest first, and the total number."""
-    page = repository.page(connection, _PASSES, limit=limit, offset=offset)
-    return [PassSummary.of(row) for row in page.rows], page.total
+def list_passes(
+    connection: Connection,
+    *,
+    search: str | None,
+    spacecraft_id: int | None,
+    instance: str | None,
+    limit: int,
+    offset: int,
+) -> tuple[list[PassSummary], int]:
+    """Return a page of the passes that match, newest first, and their number; `search` is a part of the name."""
+    vehicles = repository.VEHICLES
+    query = select(_PASSES, vehicles.c.ccsds_id.label("spacecraft_id"), vehicles.c.instance).join(
+        vehicles, vehicles.c.id == _PASSES.c.vehicle_id
+    )
+    if search is not None:
+        query = query.where(func.lower(_PASSES.c.name).contains(search.lower(), autoescape=True))
+    if spacecraft_id is not None:
+        query = query.where(vehicles.c.ccsds_id == spacecraft_id)
+    if instance is not None:
+        query = query.where(vehicles.c.instance == instance)
+    total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
+    query = query.order_by(_PASSES.c.created_utc_ns.desc(), _PASSES.c.id.desc()).limit(limit).offset(offset)
+    return [PassSummary.of(row) for row in connection.execute(query).mappings()], int(total)
 
 
 def passes_of_vehicle(connection: Connection, vehicle: int, *, reported: bool) -> list[PassRecord]:

@@ -588,7 +588,8 @@ class User(Base):
 class Token(Base):
     """Bearer token of a user; only its hash is stored.
 
-    `hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour.
+    `hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour. The token of a browser
+    session has the token that it was started with in `parent_id`, and is valid only while that one is.
     """
 
     __tablename__ = "tokens"
@@ -600,6 +601,7 @@ class Token(Base):
     expires_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     revoked_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     used_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    parent_id: Mapped[int | None] = mapped_column(ForeignKey("tokens.id"))
 
 
 class AuditEntry(Base):

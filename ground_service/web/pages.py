@@ -6,17 +6,25 @@ Nothing here needs a token: pages hold no data but the telemetry dictionary, whi
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
+from fastapi.responses import RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
+from ground_service.access.security import caller_of
 from ground_service.commanding.approval import DEFAULT_POLICY
-from ground_service.errors import NotFound
+from ground_service.errors import NotAuthorised, NotFound
+from ground_service.evaluation.report_overview import get_report
+from ground_service.ground import Ground
+from ground_service.http.common import Key
 from ground_service.passes.series import PARAMETERS, STATE_VALUES
+from ground_service.regression.service import report_of
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Field, PacketDefinition
@@ -96,6 +104,42 @@ def static_file(path: str, v: str = "") -> Response:
     headers = {"Cache-Control": "public, max-age=31536000, immutable" if v else "no-cache"}
     media = next(media for ending, media in _MEDIA.items() if path.endswith(ending))
     return Response(body, media_type=media, headers=headers)
+
+
+REPORT_POLICY = (
+    "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; font-src data:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+"""Policy of reports, which contain their styles and figures and run no script."""
+
+
+@pages.get("/reports/{report_id}")
+def report_page(request: Request, report_id: Key) -> Response:
+    """A report of a pass as a page with an address of its own."""
+    return _document(request, lambda ground: ground.files.get(_html_file(ground, report_id)))
+
+
+@pages.get("/regressions/{regression_id}")
+def regression_page(request: Request, regression_id: Key) -> Response:
+    """The report of a regression as a page with an address of its own."""
+    return _document(request, lambda ground: report_of(ground, regression_id))
+
+
+def _html_file(ground: Ground, report_id: str) -> str:
+    sha256 = get_report(ground, report_id).html_sha256
+    if sha256 is None:
+        raise NotFound(f"report {report_id} as", "html")
+    return sha256
+
+
+def _document(request: Request, read: Callable[[Ground], bytes]) -> Response:
+    """Return a document to a signed-in browser; others are sent to the sign-in dialog and back."""
+    try:
+        caller_of(request, None)
+    except NotAuthorised:
+        return RedirectResponse(f"/?next={quote(request.url.path)}", status_code=303)
+    headers = {"Content-Security-Policy": REPORT_POLICY}
+    return Response(read(request.app.state.ground), media_type="text/html; charset=utf-8", headers=headers)
 
 
 @pages.get("/moon.jpg")

@@ -19,6 +19,7 @@ from typing import Any
 from fastapi import WebSocket, WebSocketDisconnect
 from starlette.concurrency import run_in_threadpool
 
+from ground_service.access.security import SESSION_COOKIE
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.errors import GroundError, NotAuthorised
 from ground_service.events import last_number, read_events
@@ -229,12 +230,14 @@ async def until_gone(socket: WebSocket) -> None:
 
 
 def token_of(socket: WebSocket) -> str | None:
-    """Return the token of the Authorization header or of the sub-protocol ``bearer``; None without one."""
+    """Return the token of the Authorization header, the sub-protocol ``bearer`` or the session cookie; else None."""
     protocols = [value.strip() for value in socket.headers.get("sec-websocket-protocol", "").split(",")]
     scheme, _, token = socket.headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return token.strip()
-    return protocols[1] if len(protocols) == 2 and protocols[0] == "bearer" else None
+    if len(protocols) == 2 and protocols[0] == "bearer":
+        return protocols[1]
+    return socket.cookies.get(SESSION_COOKIE)
 
 
 def text_of(item: LoggedEvent) -> str:

@@ -21,14 +21,14 @@ with warnings.catch_warnings():
     from fastapi.testclient import TestClient
 
 VERBS = {
-    "acknowledge", "add", "approve", "change", "define", "delete", "enter", "evaluate", "export", "get", "import",
-    "keep", "list", "refuse", "reject", "release", "request", "revoke", "run", "search", "send", "shelve", "start",
+    "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export", "get",
+    "import", "keep", "list", "refuse", "reject", "release", "request", "revoke", "run", "search", "send", "shelve", "start",
     "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
-    "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable",
+    "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "End",
     "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Queue", "Refuse", "Register", "Reject", "Release",
-    "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Suppress", "Take",
+    "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
     "access", "alarms", "automation", "ephemerides", "exports", "jobs", "links", "missions", "passes", "planning",

@@ -644,6 +644,8 @@ def upgrade() -> None:
         sa.Column("expires_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("revoked_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("used_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("parent_id", sa.Integer(), nullable=True),
+        sa.ForeignKeyConstraint(["parent_id"], ["tokens.id"], name=op.f("fk_tokens_parent_id_tokens")),
         sa.ForeignKeyConstraint(["user_id"], ["users.id"], name=op.f("fk_tokens_user_id_users")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_tokens")),
         sa.UniqueConstraint("token_sha256", name=op.f("uq_tokens_token_sha256")),

@@ -40,7 +40,7 @@ const change = (path, id, body) => acting(async () => {
 });
 
 function actions(alarm) {
-  const button = (label, listener) => element("button", { type: "button", onclick: listener, "aria-label": `${label} alarm ${alarm.id}` }, label);
+  const button = (label, listener) => element("button", { type: "button", onclick: listener, "data-needs": label === "History" ? null : "operator", "aria-label": `${label} alarm ${alarm.id}` }, label);
   const until = (hours) => new Date(Date.now() + hours * HOUR_MS).toISOString();
   return element(
     "span",

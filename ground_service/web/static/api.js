@@ -1,13 +1,5 @@
-// The API with the caller's token; one problem document becomes one Error with a readable message.
+// The API with the session cookie of the browser; one problem document becomes one Error with a readable message.
 const PREFIX = "/api/v1";
-const TOKEN = "linna-token";
-
-export const token = () => sessionStorage.getItem(TOKEN);
-
-export function setToken(value) {
-  if (value) sessionStorage.setItem(TOKEN, value);
-  else sessionStorage.removeItem(TOKEN);
-}
 
 export class Problem extends Error {
   constructor(status, document) {
@@ -19,7 +11,6 @@ export class Problem extends Error {
 
 export async function request(path, { method = "GET", json, body, headers = {} } = {}) {
   const sent = { ...headers };
-  if (token()) sent.Authorization = `Bearer ${token()}`;
   if (json !== undefined) sent["Content-Type"] = "application/json";
   const answer = await fetch(path.startsWith("/") ? path : `${PREFIX}/${path}`, {
     method,
@@ -66,7 +57,7 @@ export function follow(onMessage, onState = () => {}) {
   function open() {
     const after = last === null ? "" : `?after=${last}`;
     const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${PREFIX}/live${after}`;
-    socket = token() ? new WebSocket(url, ["bearer", token()]) : new WebSocket(url);
+    socket = new WebSocket(url);
     socket.onopen = () => {
       wait = 1000;
       onState(true);

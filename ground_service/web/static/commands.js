@@ -81,8 +81,37 @@ function deeds(command) {
   return element(
     "span",
     { class: "actions" },
-    element("button", { type: "button", onclick: act(command, "release") }, "Release"),
-    element("button", { type: "button", onclick: act(command, "reject", { reason: "rejected on the page" }) }, "Reject"),
+    element("button", { type: "button", "data-needs": "operator", onclick: act(command, "release") }, "Release"),
+    element("button", { type: "button", "data-needs": "operator", onclick: act(command, "reject", { reason: "rejected on the page" }) }, "Reject"),
+  );
+}
+
+async function loadLinks() {
+  const { items } = await get("links");
+  const sending = (row) =>
+    acting(async () => {
+      await send("POST", `links/${encodeURIComponent(row.name)}/send`);
+      notice(`Link ${row.name} sends what is released.`);
+      await loadLinks();
+    });
+  show(
+    "links",
+    table(
+      "Links",
+      [
+        ["Link", (row) => row.name],
+        ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
+        ["Station", (row) => row.station ?? "not stated"],
+        ["State", (row) => stateMark(row.state)],
+        ["Reason", (row) => row.reason ?? ""],
+        ["Last reception", (row) => (row.heard ? timeText(row.heard) : "none")],
+        ["Sends", (row) => (row.send === "automatic" ? "in each contact" : "on request")],
+        ["Waiting", (row) => String(row.unsent), "num"],
+        ["", (row) => element("button", { type: "button", "data-needs": "operator", disabled: row.unsent === 0, onclick: sending(row) }, "Send now")],
+      ],
+      items,
+      "No mission description in force declares a link. Without one, linna command uplink writes the octets to a file.",
+    ),
   );
 }
 
@@ -97,7 +126,9 @@ const load = pager(async (limit, offset) => {
         ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
         ["Arguments", (row) => Object.entries(row.arguments).map(([key, value]) => `${words(key)} ${plain(value)}`).join(", ")],
         ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
+        ["Decided", (row) => (row.decided_by ? `${timeText(row.decided)} by ${row.decided_by}` : "")],
         ["State", (row) => stateMark(row.state)],
+        ["Sent", (row) => (row.sent ? timeText(row.sent) : "")],
         ["Verification", lights],
         ["", deeds],
       ],
@@ -131,6 +162,7 @@ byId("enter").addEventListener(
 let pending = null;
 watch(() => {
   clearTimeout(pending);
-  pending = setTimeout(() => load().catch(trouble), 300);
+  pending = setTimeout(() => Promise.all([load(), loadLinks()]).catch(trouble), 300);
 });
+loadLinks().catch((error) => error.status === 401 || trouble(error));
 load().catch((error) => error.status === 401 || trouble(error));

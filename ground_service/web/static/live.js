@@ -1,7 +1,6 @@
 // A payload flown live: what its camera sees, what it finds, where it believes to be.
 import { chart, solutionStyle } from "./charts.js";
 import { dot, legendItem, moonMap, track } from "./moon.js";
-import { token } from "./api.js";
 import { byId, element, figure, notice, show, timeText } from "./page.js";
 
 const KEPT = 600;
@@ -21,7 +20,7 @@ let shownSince = performance.now();
 
 function connect() {
   const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/payload`;
-  socket = token() ? new WebSocket(url, ["bearer", token()]) : new WebSocket(url);
+  socket = new WebSocket(url);
   let ready = true; // until a refusal says why
   socket.onopen = () => say("connecting");
   socket.onmessage = (event) => {

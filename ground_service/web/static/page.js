@@ -1,5 +1,5 @@
 // What every page shares: elements, tables, notices, sign-in, clock.
-import { follow, get, setToken, token } from "./api.js";
+import { follow, get, send } from "./api.js";
 
 export const dictionary = JSON.parse(document.getElementById("dictionary").textContent);
 
@@ -143,18 +143,37 @@ window.addEventListener("linna-sign-in", () => {
   if (!dialog.open) dialog.showModal();
 });
 dialog.querySelector("[data-close]").addEventListener("click", () => dialog.close("cancel"));
-dialog.addEventListener("close", () => {
+dialog.addEventListener("close", async () => {
   if (dialog.returnValue !== "sign-in") return;
-  setToken(byId("token").value.trim());
-  location.reload();
+  const given = byId("token").value.trim();
+  byId("token").value = "";
+  try {
+    await send("POST", "session", { token: given });
+    const next = new URLSearchParams(location.search).get("next") ?? "";
+    // Only pages of this service: a path, and not the address of another host.
+    if (/^\/(?![/\\])/.test(next)) location.assign(next);
+    else location.reload();
+  } catch (error) {
+    trouble(error);
+  }
 });
-byId("caller").textContent = token() ? "Sign out" : "Sign in";
-byId("caller").addEventListener("click", () => {
-  if (!token()) {
+
+// Who is signed in: adapts the page to the role and returns the session.
+async function signedIn() {
+  const session = await get("session");
+  byId("user").textContent = session.browser ? `${session.name}, ${session.role}` : "";
+  byId("caller").textContent = session.browser ? "Sign out" : "Sign in";
+  byId("caller").hidden = session.name === "local";
+  byId("caller").dataset.signedIn = session.browser;
+  document.body.dataset.role = session.role;
+  return session;
+}
+byId("caller").addEventListener("click", async () => {
+  if (byId("caller").dataset.signedIn !== "true") {
     dialog.showModal();
     return;
   }
-  setToken("");
+  await send("DELETE", "session");
   location.reload();
 });
 
@@ -170,7 +189,7 @@ const watchers = [];
 export const watch = (onMessage) => watchers.push(onMessage);
 
 // Only after a first answer: a socket that is refused tells nothing, an answer tells that a token is needed.
-get("passes", { limit: 1 })
+signedIn()
   .then(() =>
     follow(
       (message) => watchers.forEach((onMessage) => onMessage(message)),

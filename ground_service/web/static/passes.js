@@ -1,25 +1,47 @@
 import { get, send } from "./api.js";
-import { acting, byId, element, lengthText, notice, pager, seconds, show, table, timeText, trouble } from "./page.js";
+import { acting, byId, element, figure, lengthText, notice, pager, seconds, show, table, timeText, trouble } from "./page.js";
+
+const address = new URLSearchParams(location.search);
+byId("search").value = address.get("search") ?? "";
 
 const load = pager(async (limit, offset) => {
-  const page = await get("passes", { limit, offset });
+  const page = await get("passes", { limit, offset, search: byId("search").value || null });
+  const ids = page.items.map((one) => one.id);
+  const found = ids.length ? (await get("reports", { pass_id: ids })).items : [];
+  const report = Object.fromEntries(found.map((one) => [one.pass_id, one]));
   show(
     "passes",
     table(
       "Passes",
       [
         ["Pass", (row) => element("a", { href: `/passes/${row.id}` }, row.name)],
+        ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
         ["Start", (row) => timeText(row.start)],
-        ["Stop", (row) => timeText(row.stop)],
         ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"],
+        ["Verdict", (row) => verdict(report[row.id])],
+        ["Median error, m", (row) => figure(report[row.id]?.median_error_m), "num"],
+        ["Recall", (row) => figure(report[row.id]?.recall), "num"],
+        ["Evidence", (row) => (report[row.id] ? `level ${report[row.id].evidence_level || "not stated"}` : "")],
+        ["Report", (row) => (report[row.id] ? element("a", { href: `/reports/${report[row.id].id}`, target: "_blank" }, "open") : "none")],
       ],
       page.items,
-      "No pass yet.",
+      byId("search").value ? "No pass matches." : "No pass yet.",
     ),
   );
   return page;
 });
 
+// The whole verdict is a sentence: the list shows its level, and the sentence when pointed at.
+const verdict = (report) => (report ? element("span", { class: `state ${report.verdict_level}`, title: report.verdict }, report.verdict_level || "none") : "");
+
+byId("find").addEventListener(
+  "submit",
+  acting(async () => {
+    address.set("search", byId("search").value);
+    history.replaceState(null, "", `?${address}`);
+    await load.first();
+  }),
+);
 byId("define").addEventListener(
   "submit",
   acting(async () => {

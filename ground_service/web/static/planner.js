@@ -170,7 +170,7 @@ function choose(id) {
   showChosen();
 }
 
-const deed = (name, task, kind) => element("button", { type: "button", class: kind, onclick: acting(async () => { await task(); await load(); }) }, name);
+const deed = (name, task, kind) => element("button", { type: "button", class: kind, "data-needs": "operator", onclick: acting(async () => { await task(); await load(); }) }, name);
 
 function showChosen() {
   const row = windows.find((one) => one.id === chosen);
@@ -262,7 +262,7 @@ async function search() {
         ["Craters a frame", (row) => (row.craters_per_frame ? `${figure(row.craters_per_frame.min)} to ${figure(row.craters_per_frame.max)}` : "–"), "num"],
         ["Battery left", (row) => `${Math.round(100 * row.battery_minimum)} %`, "num"],
         ["Data down by", (row) => (row.downlinked_by ? timeText(row.downlinked_by) : "not within the span")],
-        ["", (row) => element("button", { type: "button", onclick: acting(() => plan(row)) }, "Plan")],
+        ["", (row) => element("button", { type: "button", "data-needs": "operator", onclick: acting(() => plan(row)) }, "Plan")],
       ],
       candidates,
       "No span fulfils all constraints.",

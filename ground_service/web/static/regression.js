@@ -11,11 +11,6 @@ async function upload(path, file) {
   return answer.json();
 }
 
-async function openReport(id) {
-  const answer = await request(`regressions/${id}/report`);
-  window.open(URL.createObjectURL(await answer.blob()), "_blank", "noopener");
-}
-
 const verdictMark = (verdict) => stateMark({ pass: "passed", fail: "failed" }[verdict] ?? verdict);
 const OUTCOMES = ["fail", "inconclusive", "pass"];
 
@@ -77,7 +72,7 @@ async function loadRegressions() {
         ["Baseline", (row) => String(row.baseline ?? "").slice(0, 12)],
         ["Verdict", (row) => (row.verdict ? verdictMark(row.verdict.verdict) : stateMark(row.job.state))],
         ["Outcome", outcomeOf],
-        ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates"), element("button", { type: "button", onclick: acting(() => openReport(verdict.id)) }, "Report")) : "")],
+        ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates"), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report")) : "")],
       ],
       rows,
       "No regression has been run.",

@@ -128,6 +128,25 @@ def test_a_telephone_scrolls_wide_tables_rather_than_break_words(page):
     assert cell.locator("a").bounding_box()["height"] < 30.0  # one line
 
 
+def test_passes_are_searched_and_show_their_verdict(page):
+    job = page.request.post("/api/v1/passes/1/reports").json()["id"]
+    deadline = time.monotonic() + 60
+    while page.request.get(f"/api/v1/jobs/{job}").json()["state"] != "done":
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    settled(page, "/passes?search=SYNTHETIC")
+    row = page.locator("#passes tbody tr").first
+    expect(row).to_contain_text("76")
+    expect(row.locator(".state")).not_to_be_empty()
+    expect(row.get_by_role("link", name="open")).to_have_attribute(
+        "href", re.compile("/reports/[0-9a-f]{32}")
+    )
+    page.get_by_label("Search").fill("no such pass")
+    page.get_by_role("button", name="Search").click()
+    expect(page.locator("#passes")).to_contain_text("No pass matches.")
+    expect(page).to_have_url(re.compile("search=no"))
+
+
 def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     settled(page, "/passes")
     page.get_by_role("link", name="synthetic pass").click()
@@ -140,8 +159,15 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     expect(page.locator("#verdict .verdict")).not_to_be_empty(timeout=60_000)
     expect(page.locator("#verdict")).to_contain_text("Median position error")
     with page.expect_popup() as opened:
-        page.get_by_role("button", name="Open HTML").click()
-    expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
+        page.get_by_role("link", name="Open report").click()
+    report = opened.value
+    expect(report.get_by_role("heading", level=1)).to_be_visible()
+    assert re.search(r"/reports/[0-9a-f]{32}$", report.url)
+    # With its styles and figures: not the defaults of the browser, and no black shapes.
+    assert report.evaluate("getComputedStyle(document.body).marginTop") == "0px"
+    assert report.evaluate("document.styleSheets.length") >= 1
+    line = report.locator("svg path[style*='fill: none']").first
+    assert line.evaluate("node => getComputedStyle(node).fill") == "none"
 
 
 def test_an_alarm_is_acknowledged_on_its_page_and_keeps_its_history(page):
@@ -386,5 +412,5 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
     page.locator("#regressions").get_by_role("button", name="Gates").nth(1).click()
     expect(page.locator("#regressions table").nth(1)).to_contain_text("recall")
     with page.expect_popup() as opened:
-        page.locator("#regressions").get_by_role("button", name="Report").first.click()
+        page.locator("#regressions").get_by_role("link", name="Report").first.click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()

@@ -45,8 +45,11 @@ def test_a_viewer_sees_and_may_not_command(stranger, guarded):
     sign_in(stranger, guarded[1])
     expect(stranger.locator("#feed-light")).to_have_class("light on")
     expect(stranger.locator("#caller")).to_have_text("Sign out")
-    stranger.get_by_role("button", name="Queue").click()
-    expect(stranger.locator("#notices .bad")).to_contain_text("operator")
+    expect(stranger.locator("#user")).to_have_text("ada, viewer")
+    expect(stranger.get_by_role("button", name="Queue")).to_be_hidden()
+    other = stranger.context.new_page()  # one sign-in for all tabs
+    other.goto("/alarms")
+    expect(other.locator("#user")).to_have_text("ada, viewer")
     stranger.locator("#caller").click()
     expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
 
@@ -56,6 +59,22 @@ def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
     sign_in(stranger, guarded[1])
     expect(stranger.locator("#state")).to_have_text("connected")
     console.heard.clear()
-    stranger.get_by_role("button", name="Pause").click()
+    expect(stranger.get_by_role("button", name="Pause")).to_be_hidden()
+    stranger.locator("#pause").dispatch_event("click")  # a viewer who does not use the page
     expect(stranger.locator("#state")).to_contain_text("operator")
     assert console.heard == []
+
+
+def test_a_page_that_needs_a_sign_in_opens_after_it(stranger, guarded):
+    stranger.goto("/reports/" + "0" * 32)
+    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    sign_in(stranger, guarded[1])
+    stranger.wait_for_url("**/reports/" + "0" * 32)
+    expect(stranger.locator("body")).to_contain_text("not found")
+
+
+def test_after_sign_in_no_other_host_is_opened(stranger, guarded):
+    stranger.goto("/?next=//example.org/")
+    sign_in(stranger, guarded[1])
+    expect(stranger.locator("#user")).to_have_text("ada, viewer")
+    assert stranger.url.startswith(guarded[0])

@@ -1,0 +1,89 @@
+"""Browser sessions: a cookie instead of a token, ended by sign-out, time and revocation of the token."""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ground_service.access import service as users
+from ground_service.access.security import SESSION_COOKIE
+from ground_service.app import create_app
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+OWN = {"Origin": "http://testserver"}
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def token(client: TestClient) -> str:
+    return users.add_user(client.app.state.ground, "ann", "operator")
+
+
+def start(client: TestClient, token: str) -> None:
+    answer = client.post("/api/v1/session", json={"token": token}, headers=OWN)
+    assert answer.status_code == 200, answer.text
+
+
+def test_a_session_needs_no_token_in_requests(client: TestClient, token: str) -> None:
+    answer = client.post("/api/v1/session", json={"token": token}, headers=OWN)
+    cookie = answer.headers["set-cookie"].lower()
+    assert "httponly" in cookie and "samesite=strict" in cookie and "max-age=43200" in cookie
+    assert token not in cookie
+    found = client.get("/api/v1/session").json()
+    assert (found["name"], found["role"], found["browser"]) == ("ann", "operator", True)
+    assert client.get("/api/v1/passes").status_code == 200
+
+
+def test_a_wrong_token_starts_no_session(client: TestClient, token: str) -> None:
+    answer = client.post("/api/v1/session", json={"token": token + "x"}, headers=OWN)
+    assert answer.status_code == 401 and "set-cookie" not in answer.headers
+
+
+def test_sign_out_ends_the_session_and_not_the_token(client: TestClient, token: str) -> None:
+    start(client, token)
+    secret = client.cookies[SESSION_COOKIE]
+    assert client.delete("/api/v1/session", headers=OWN).status_code == 204
+    client.cookies.set(SESSION_COOKIE, secret)  # a copy of the cookie
+    assert client.get("/api/v1/session").status_code == 401
+    client.cookies.clear()
+    bearer = {"Authorization": f"Bearer {token}"}
+    assert client.get("/api/v1/session", headers=bearer).json()["browser"] is False
+    assert client.delete("/api/v1/session", headers=bearer).status_code == 204
+    assert client.get("/api/v1/session", headers=bearer).status_code == 200
+
+
+def test_revocation_of_the_token_ends_its_sessions(client: TestClient, token: str) -> None:
+    ground = client.app.state.ground
+    start(client, token)
+    (parent,) = [one for one in users.list_tokens(ground, "ann") if one.parent_id is None]
+    (session,) = [one for one in users.list_tokens(ground, "ann") if one.parent_id is not None]
+    assert session.parent_id == parent.id
+    users.revoke_token(ground, parent.id)
+    assert client.get("/api/v1/session").status_code == 401
+
+
+def test_a_session_ends_with_the_validity_of_its_token(client: TestClient) -> None:
+    ground = client.app.state.ground
+    token = users.add_user(ground, "bob", "viewer", days_valid=0.1)
+    start(client, token)
+    expires = {one.expires for one in users.list_tokens(ground, "bob")}
+    assert len(expires) == 1
+
+
+def test_a_change_with_the_cookie_from_another_origin_is_refused(client: TestClient, token: str) -> None:
+    start(client, token)
+    for headers in ({}, {"Origin": "https://example.org"}, {"Sec-Fetch-Site": "cross-site"}):
+        answer = client.post("/api/v1/windows", json={}, headers=headers)
+        assert answer.status_code == 403, headers
+    assert client.post("/api/v1/windows", json={}, headers=OWN).status_code == 422
