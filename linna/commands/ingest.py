@@ -65,20 +65,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.client.problems import InvalidRequest, JobFailed, Unavailable, Unreachable
     from ground_service.errors import InvalidInput, StoreError
-    from linna.errors import UsageError
 
-    if arguments.spacecraft_id is not None and not 0 <= arguments.spacecraft_id <= 1023:
-        raise UsageError(f"--spacecraft-id: expected 0 to 1023, found {arguments.spacecraft_id}")
-    if sum((bool(arguments.files), arguments.tcp is not None, arguments.watch is not None)) != 1:
-        raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
-    if arguments.mission is not None and arguments.tcp is None:
-        raise UsageError("--mission: expected --tcp, found none")
-    if arguments.offset is not None and (arguments.stream is None or arguments.offset < 0):
-        raise UsageError(
-            f"--offset: expected octets from the beginning of --stream, found {arguments.offset}"
-        )
-    if arguments.stream is not None and not arguments.files:
-        raise UsageError("--stream: expected the files of the stream, found none")
+    _check(arguments)
     done: list[dict[str, Any]] = []
     offset = arguments.offset or 0
     with ground_client(arguments) as service:
@@ -143,6 +131,23 @@ def run(arguments: argparse.Namespace) -> int:
         text = f"{figures['packets']} packets, {figures['packets_new']} new, in {figures['ingests']} ingests"
         emit(arguments, {**figures, "ingested": done}, text=text)
     return 0
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from linna.errors import UsageError
+
+    if arguments.spacecraft_id is not None and not 0 <= arguments.spacecraft_id <= 1023:
+        raise UsageError(f"--spacecraft-id: expected 0 to 1023, found {arguments.spacecraft_id}")
+    if sum((bool(arguments.files), arguments.tcp is not None, arguments.watch is not None)) != 1:
+        raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
+    if arguments.mission is not None and arguments.tcp is None:
+        raise UsageError("--mission: expected --tcp, found none")
+    if arguments.offset is not None and (arguments.stream is None or arguments.offset < 0):
+        raise UsageError(
+            f"--offset: expected octets from the beginning of --stream, found {arguments.offset}"
+        )
+    if arguments.stream is not None and not arguments.files:
+        raise UsageError("--stream: expected the files of the stream, found none")
 
 
 def _address(option: str, text: str) -> tuple[str, int]:

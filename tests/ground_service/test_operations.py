@@ -22,8 +22,8 @@ with warnings.catch_warnings():
 
 VERBS = {
     "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export", "get",
-    "import", "keep", "list", "refuse", "reject", "release", "request", "revoke", "run", "search", "send", "shelve", "start",
-    "take", "uplink", "upload",
+    "import", "keep", "list", "refuse", "reject", "release", "request", "revoke", "run", "search", "send", "shelve",
+    "start", "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
     "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "End",
