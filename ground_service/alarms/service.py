@@ -34,6 +34,9 @@ TELEMETRY = "telemetry"
 BATCH = 2000
 """Packets that are examined in one transaction."""
 
+QUIET = 200
+"""Packets without any alarm that are examined again with later ones, which saves a transaction for each piece."""
+
 DAY_NS = 86_400_000_000_000
 
 
@@ -42,6 +45,13 @@ def examine_packets(ground: Ground, vehicle: int) -> int:
     examined = 0
     while True:
         ground.check_stopping()
+        with ground.database.reading() as connection:
+            packets = parameters.packets_after(
+                connection, vehicle, store.position(connection, vehicle), core.WATCHED_APIDS, BATCH
+            )
+            quiet = len(packets.ids) < QUIET and not store.has_open_alarms(connection, vehicle)
+        if not packets.ids or (quiet and not core.conditions_in(b"".join(packets.octets))):
+            return examined
         with ground.database.writing() as connection:
             # Ids of packets that other transactions are storing may be smaller than those already visible.
             lock_vehicle(connection, vehicle)

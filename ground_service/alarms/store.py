@@ -79,6 +79,12 @@ def open_alarms(connection: Connection, vehicle: int) -> list[AlarmRow]:
     return [_row(row) for row in rows]
 
 
+def has_open_alarms(connection: Connection, vehicle: int) -> bool:
+    """Return whether a vehicle has alarms that are not cleared."""
+    query = select(_ALARMS.c.id).where(_ALARMS.c.vehicle_id == vehicle, _ALARMS.c.open == OPEN).limit(1)
+    return connection.execute(query).first() is not None
+
+
 def last_cleared(connection: Connection, vehicle: int, source: str, name: str) -> AlarmRow | None:
     """Return the cleared alarm of a cause with the latest on-board time."""
     query = (

@@ -23,7 +23,7 @@ from ground_service.http.common import (
     upload_body,
 )
 from ground_service.http.model import PageOf
-from ground_service.http.requests import operations
+from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
@@ -239,7 +239,7 @@ def list_spacecraft(ground: GroundOf, _: Viewer) -> PageOf[SpacecraftInstance]:
     return PageOf.all_of(newest.list_spacecraft(ground))
 
 
-@passes.get("/parameters")
+@passes.get("/parameters", responses=problems(404))
 def list_live_parameters(
     ground: GroundOf,
     _: Viewer,
