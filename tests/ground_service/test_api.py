@@ -348,6 +348,9 @@ MATRIX = [
     ("POST", "/automation/actions/1/refuse", "operator"),
     ("GET", "/exports/formats", "viewer"),
     ("POST", "/exports", "viewer"),
+    ("GET", "/session", "viewer"),
+    ("DELETE", "/session", "viewer"),
+    ("GET", "/reports", "viewer"),
     ("GET", "/alarms", "viewer"),
     ("GET", "/alarms/1", "viewer"),
     ("POST", "/alarms/1/acknowledge", "operator"),
@@ -390,7 +393,7 @@ def test_the_matrix_above_names_every_operation(client: TestClient) -> None:
     document = client.get(f"{V1}/openapi.json").json()
     described = {
         (m.upper(), p.removeprefix(V1)) for p, operations in document["paths"].items() for m in operations
-    }
+    } - {("POST", "/session")}  # whose token is in the body
 
     def template(path: str) -> tuple[str, ...]:
         parts = path.split("/")
