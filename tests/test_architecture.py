@@ -193,7 +193,7 @@ def test_only_stores_contain_sql() -> None:
         "import sqlalchemy",
         "from sqlalchemy.dialects import sqlite",
         "def late():\n    from ground_service.store import repository",
-        "from ground_service.store.models import Window",
+        "from ground_service.store.models import WINDOWS",
         "def late(connection):\n    connection.exec_driver_sql('SELECT 1')",
     ],
 )

@@ -52,7 +52,7 @@ from ground_service.missions.service import add_mission
 from ground_service.passes.service import define_pass
 from ground_service.planning.service import WindowEntry, add_window
 from ground_service.store.audit import GUARD_NAMES
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 from ground_service.worker.integrity import Verification, verify
 from lunar.timescales import parse_utc
 from tests.tmtc import foreign
@@ -100,7 +100,7 @@ def fill(ground: Ground, folder: Path, packets: int) -> None:
     )
     release_command(ground, command, actor="bob")
     with ground.database.writing() as connection:
-        for table in Base.metadata.sorted_tables:
+        for table in METADATA.sorted_tables:
             if connection.execute(select(*table.primary_key.columns).limit(1)).first() is None:
                 connection.execute(insert(table), [_invented(connection, table)])
 
@@ -197,7 +197,7 @@ def _plain_value(column: Any) -> Any:
 
 def harms(engine: Engine, home: Path, only: Sequence[str] = ()) -> Iterator[Harm]:
     """Yield all damages: to each column and row of each table, and to files."""
-    for table in Base.metadata.sorted_tables:
+    for table in METADATA.sorted_tables:
         if only and table.name not in only:
             continue
         with engine.connect() as connection:

@@ -9,7 +9,7 @@ from alembic import context
 from sqlalchemy import Connection
 
 from ground_service.store.database import install_triggers
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 
 
 def run() -> None:
@@ -29,7 +29,7 @@ def run() -> None:
 def _migrate(connection: Connection) -> None:
     context.configure(
         connection=connection,
-        target_metadata=Base.metadata,
+        target_metadata=METADATA,
         render_as_batch=True,
         transaction_per_migration=False,
     )

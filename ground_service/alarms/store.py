@@ -17,10 +17,9 @@ from ground_service.store import models, states
 from ground_service.store.repository import VEHICLES, add_new
 from ground_service.store.states import StateMachine
 
-_TABLES = models.Base.metadata.tables
-_ALARMS = _TABLES[models.AlarmRecord.__tablename__]
-_CHANGES = _TABLES[models.AlarmChangeRecord.__tablename__]
-_POSITIONS = _TABLES[models.AlarmPosition.__tablename__]
+_ALARMS = models.ALARMS
+_CHANGES = models.ALARM_CHANGES
+_POSITIONS = models.ALARM_POSITIONS
 
 OPEN = 1
 """Value of the column `open` of an alarm that is not cleared, NULL for others: one open alarm for each cause."""

@@ -71,7 +71,7 @@ class ReportSummary(Entity):
 
 
 class StoredReport(Entity):
-    """A stored report: see `store.models.Report`; times are UTC, ns."""
+    """A stored report: see `store.models.REPORTS`; times are UTC, ns."""
 
     id: str
     pass_id: int

@@ -38,7 +38,7 @@ _WITHIN = select(STREAM_EDGES.c.id).where(
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """File of a downlink and its position in a stream; see `models.Piece`."""
+    """File of a downlink and its position in a stream; see `models.PIECES`."""
 
     ingest_id: int
     scope: str

@@ -15,7 +15,7 @@ from ground_service.ingest.model import Ingest, IngestResult
 from ground_service.store import repository
 from ground_service.store.bulk import insert_columns
 from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
-from ground_service.store.models import NO_TICKS, SAMPLE_TABLES, Packet, Vehicle
+from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
 from ground_service.store.rollups import add_to_rollups, forget_rollups
 from lunar.arrays import IntArray
 
@@ -23,8 +23,8 @@ RANGE_GAP_TICKS = 600 << 16
 """Stored packets are looked up by ranges of on-board time; a silence of ten minutes splits a range, so that a batch
 with one stray packet of another year does not read the years between."""
 
-_TABLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
-_PACKETS: Any = Packet.__table__
+_TABLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
+_PACKETS: Any = PACKETS
 _INGESTS = repository.INGESTS
 _FILES = repository.FILES
 
@@ -60,7 +60,9 @@ class Batch(Protocol):
 
 
 _KEEP_VEHICLE = (
-    select(Vehicle.id).where(Vehicle.id == bindparam("vehicle_id")).with_for_update(read=True, key_share=True)
+    select(VEHICLES.c.id)
+    .where(VEHICLES.c.id == bindparam("vehicle_id"))
+    .with_for_update(read=True, key_share=True)
 )
 
 _INSERT_POSTGRESQL = """

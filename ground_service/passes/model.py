@@ -21,7 +21,7 @@ def _known(value: Any) -> Any:
 
 
 class PassRecord(Entity):
-    """A stored pass: see `store.models.Pass`; times are UTC, ns."""
+    """A stored pass: see `store.models.PASSES`; times are UTC, ns."""
 
     id: int
     vehicle_id: int

@@ -20,7 +20,7 @@ from typing import Any
 from sqlalchemy import Connection, func, insert, select, text, update
 
 from ground_service.errors import AuditBroken
-from ground_service.store.models import AuditEntry, AuditHead, Base
+from ground_service.store.models import AUDIT, AUDIT_HEAD, METADATA
 
 GENESIS = "0" * 64
 """Previous hash of the first entry."""
@@ -31,8 +31,8 @@ PENDING = "linna_audit"
 BLOCK_ROWS = 1000
 HEAD_ID = 1
 
-_ENTRIES = Base.metadata.tables[AuditEntry.__tablename__]
-_HEAD = Base.metadata.tables[AuditHead.__tablename__]
+_ENTRIES = METADATA.tables[AUDIT.name]
+_HEAD = METADATA.tables[AUDIT_HEAD.name]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,15 +16,15 @@ from typing import Any
 from sqlalchemy import Connection, func, insert, select, text, update
 
 from ground_service.clock import utc_now_ns
-from ground_service.store.models import Base, EventPosition, LoggedEventRow
+from ground_service.store.models import EVENT_LOG, EVENT_POSITIONS
 
 PENDING = "linna_events"
 """Execution option of a write transaction: the list of events to insert at its end."""
 
 LOCK = 7602
 
-_EVENTS = Base.metadata.tables[LoggedEventRow.__tablename__]
-_POSITIONS = Base.metadata.tables[EventPosition.__tablename__]
+_EVENTS = EVENT_LOG
+_POSITIONS = EVENT_POSITIONS
 
 Notify = Callable[[frozenset[str]], None]
 """Function that is called with the kinds of the events of a committed transaction."""

@@ -17,6 +17,7 @@ from typing import Any
 from sqlalchemy import (
     JSON,
     BigInteger,
+    Column,
     Double,
     Float,
     ForeignKey,
@@ -26,10 +27,10 @@ from sqlalchemy import (
     MetaData,
     SmallInteger,
     String,
+    Table,
     Text,
     UniqueConstraint,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 NO_TICKS = -1
 """On-board time of a packet that carries none."""
@@ -38,925 +39,970 @@ BigKey = BigInteger().with_variant(Integer, "sqlite")
 Flag = SmallInteger
 
 
-class Base(DeclarativeBase):
-    """Base of all tables, with names for every constraint so that migrations can find them."""
+CLUSTERED: dict[str, Any] = {"sqlite_with_rowid": False}
+"""Options of a table whose rows are stored in the order of the primary key."""
 
-    metadata = MetaData(
-        naming_convention={
-            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
-            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
-            "pk": "pk_%(table_name)s",
-        }
-    )
-
-
-class File(Base):
-    """A file of the archive, stored once under the SHA-256 of its octets."""
-
-    __tablename__ = "files"
-    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
-    kind: Mapped[str] = mapped_column(String(32))
-    name: Mapped[str] = mapped_column(Text)
-    octets: Mapped[int] = mapped_column(BigInteger)
-    received_utc_ns: Mapped[int] = mapped_column(BigInteger)
+METADATA = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+"""All tables, with names for every constraint so that migrations can find them."""
 
 
-class Vehicle(Base):
-    """A spacecraft in one instance: a domain of time, boots and sequence counts.
-
-    `decoded_version` is the dictionary version that has decoded all of its packets, the one to read; NULL before the
-    first. While a newer one decodes them again, `redecoded_to` is the last packet that it has done and `redecode_until`
-    the last that it has to do.
-    """
-
-    __tablename__ = "vehicles"
-    __table_args__ = (UniqueConstraint("ccsds_id", "instance"),)
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    ccsds_id: Mapped[int] = mapped_column(Integer)
-    instance: Mapped[str] = mapped_column(String(96))
-    decoded_version: Mapped[int | None] = mapped_column(SmallInteger)
-    redecoding_version: Mapped[int | None] = mapped_column(SmallInteger)
-    redecoded_to: Mapped[int | None] = mapped_column(BigInteger)
-    redecode_until: Mapped[int | None] = mapped_column(BigInteger)
+def key(name: str, *arguments: Any, **options: Any) -> Column[Any]:
+    """Return a column of the primary key."""
+    return Column(name, *arguments, primary_key=True, **options)
 
 
-class Ingest(Base):
-    """One run of the ingest over one file: what was in it and what of it was new."""
-
-    __tablename__ = "ingests"
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    vehicle_id: Mapped[int | None] = mapped_column(ForeignKey("vehicles.id"), index=True)
-    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), index=True)
-    state: Mapped[str] = mapped_column(String(16))
-    error: Mapped[str | None] = mapped_column(Text)
-    dictionary_version: Mapped[int] = mapped_column(Integer)
-    received_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    finished_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    accounting: Mapped[dict[str, Any]] = mapped_column(JSON)
+def column(name: str, *arguments: Any, **options: Any) -> Column[Any]:
+    """Return a column without NULL."""
+    return Column(name, *arguments, nullable=False, **options)
 
 
-class Packet(Base):
-    """A space packet, immutable, once per vehicle by content."""
-
-    __tablename__ = "packets"
-    __table_args__ = (UniqueConstraint("vehicle_id", "apid", "ticks", "sequence_count", "digest"),)
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(Integer)
-    apid: Mapped[int] = mapped_column(SmallInteger)
-    sequence_count: Mapped[int] = mapped_column(SmallInteger)
-    ticks: Mapped[int] = mapped_column(BigInteger)
-    digest: Mapped[bytes] = mapped_column(LargeBinary(16))
-    octets: Mapped[bytes] = mapped_column(LargeBinary)
+def optional(name: str, *arguments: Any, **options: Any) -> Column[Any]:
+    """Return a column that may be NULL."""
+    return Column(name, *arguments, **options)
 
 
-class Piece(Base):
-    """Ingested file of a downlink, and its position in its stream.
-
-    Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` selects the frames of
-    one spacecraft; NULL: those of every spacecraft. `stream` and `position` (octets from its start) are stated by the
-    sender. Otherwise, `stream` is empty and `position` is the number of the ingest, so that successive ingests are
-    adjacent. `station` (empty: not stated) and `link` (text of the settings, NULL: not stated) are those of the sender.
-    `links_tried` is the number of known links of the scope that could not read it; NULL if one could.
-    `packets_stored` counts the new packets that the ingest added to the archive, `packets_joined` those of them that
-    were joined with other pieces, and `samples_stored` their samples, over all attempts of the ingest.
-    """
-
-    __tablename__ = "pieces"
-    __table_args__ = (
-        Index("ix_pieces_place", "scope", "stream", "position"),
-        Index("ix_pieces_unread", "scope", "links_tried"),
-    )
-    ingest_id: Mapped[int] = mapped_column(ForeignKey("ingests.id"), primary_key=True, autoincrement=False)
-    scope: Mapped[str] = mapped_column(String(128))
-    spacecraft_id: Mapped[int | None] = mapped_column(Integer)
-    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), index=True)
-    octets: Mapped[int] = mapped_column(BigInteger)
-    stream: Mapped[str] = mapped_column(String(200))
-    position: Mapped[int] = mapped_column(BigInteger)
-    links_tried: Mapped[int | None] = mapped_column(Integer)
-    station: Mapped[str] = mapped_column(String(64))
-    link: Mapped[str | None] = mapped_column(String(200))
-    packets_stored: Mapped[int] = mapped_column(BigInteger, default=0)
-    packets_joined: Mapped[int] = mapped_column(BigInteger, default=0)
-    samples_stored: Mapped[int] = mapped_column(BigInteger, default=0)
+FILES = Table(
+    "files",
+    METADATA,
+    key("sha256", String(64)),
+    column("kind", String(32)),
+    column("name", Text),
+    column("octets", BigInteger),
+    column("received_utc_ns", BigInteger),
+)
+"""A file of the archive, stored once under the SHA-256 of its octets."""
 
 
-class GoodLink(Base):
-    """Link settings under which a spacecraft was received by a station; the newest row is used first."""
+VEHICLES = Table(
+    "vehicles",
+    METADATA,
+    key("id", Integer),
+    column("ccsds_id", Integer),
+    column("instance", String(96)),
+    optional("decoded_version", SmallInteger),
+    optional("redecoding_version", SmallInteger),
+    optional("redecoded_to", BigInteger),
+    optional("redecode_until", BigInteger),
+    UniqueConstraint("ccsds_id", "instance"),
+)
+"""A spacecraft in one instance: a domain of time, boots and sequence counts.
 
-    __tablename__ = "good_links"
-    __table_args__ = (Index("ix_good_links_newest", "vehicle_id", "station", "id"),)
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    station: Mapped[str] = mapped_column(String(64))
-    settings: Mapped[dict[str, Any]] = mapped_column(JSON)
-    ingest_id: Mapped[int] = mapped_column(ForeignKey("ingests.id"))
-    since_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class KnownLink(Base):
-    """Link found for the downlinks of a scope; `settings` NULL: bare packets."""
-
-    __tablename__ = "known_links"
-    __table_args__ = (UniqueConstraint("scope", "digest"),)
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    scope: Mapped[str] = mapped_column(String(128))
-    digest: Mapped[str] = mapped_column(String(16))
-    settings: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+`decoded_version` is the dictionary version that has decoded all of its packets, the one to read; NULL before the
+first. While a newer one decodes them again, `redecoded_to` is the last packet that it has done and `redecode_until`
+the last that it has to do.
+"""
 
 
-class StreamEdge(Base):
-    """Octets of a CADU or packet that was cut, stored until the adjacent octets are received.
-
-    `domain` names the edges that may be joined: those of the raw octets of one link, or of one virtual channel. `role`,
-    `count`, `next_count` and `fit` are those of `link.edges.Edge`, -1 if unknown; the `count` of an opener is its
-    `next_count`. `open` is 0 when the octets have been used; they are then deleted. `start` is their position in
-    `file_sha256`, NULL for octets of a channel.
-    """
-
-    __tablename__ = "stream_edges"
-    __table_args__ = (
-        UniqueConstraint("domain", "identity"),
-        Index("ix_stream_edges_fit", "domain", "role", "open", "fit", "count"),
-        Index("ix_stream_edges_count", "domain", "role", "open", "count"),
-        Index("ix_stream_edges_next", "domain", "role", "open", "next_count"),
-        Index("ix_stream_edges_newest", "domain", "role", "open", "id"),
-        Index("ix_stream_edges_file", "file_sha256", "open"),
-    )
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    domain: Mapped[str] = mapped_column(String(200))
-    identity: Mapped[bytes] = mapped_column(LargeBinary(16))
-    role: Mapped[int] = mapped_column(SmallInteger)
-    open: Mapped[int] = mapped_column(SmallInteger)
-    count: Mapped[int] = mapped_column(SmallInteger)
-    next_count: Mapped[int] = mapped_column(SmallInteger)
-    fit: Mapped[int] = mapped_column(Integer)
-    file_sha256: Mapped[str | None] = mapped_column(String(64))
-    start: Mapped[int | None] = mapped_column(BigInteger)
-    length: Mapped[int] = mapped_column(Integer)
-    octets: Mapped[bytes] = mapped_column(LargeBinary)
+INGESTS = Table(
+    "ingests",
+    METADATA,
+    key("id", BigKey),
+    optional("vehicle_id", ForeignKey("vehicles.id"), index=True),
+    column("file_sha256", ForeignKey("files.sha256"), index=True),
+    column("state", String(16)),
+    optional("error", Text),
+    column("dictionary_version", Integer),
+    column("received_utc_ns", BigInteger),
+    optional("finished_utc_ns", BigInteger),
+    column("accounting", JSON),
+)
+"""One run of the ingest over one file: what was in it and what of it was new."""
 
 
-class Sample:
-    """Columns that every decoded sample has.
+PACKETS = Table(
+    "packets",
+    METADATA,
+    key("id", BigKey),
+    column("vehicle_id", Integer),
+    column("apid", SmallInteger),
+    column("sequence_count", SmallInteger),
+    column("ticks", BigInteger),
+    column("digest", LargeBinary(16)),
+    column("octets", LargeBinary),
+    UniqueConstraint("vehicle_id", "apid", "ticks", "sequence_count", "digest"),
+)
+"""A space packet, immutable, once per vehicle by content."""
+
+
+PIECES = Table(
+    "pieces",
+    METADATA,
+    key("ingest_id", ForeignKey("ingests.id"), autoincrement=False),
+    column("scope", String(128)),
+    optional("spacecraft_id", Integer),
+    column("file_sha256", ForeignKey("files.sha256"), index=True),
+    column("octets", BigInteger),
+    column("stream", String(200)),
+    column("position", BigInteger),
+    optional("links_tried", Integer),
+    column("station", String(64)),
+    optional("link", String(200)),
+    column("packets_stored", BigInteger, default=0),
+    column("packets_joined", BigInteger, default=0),
+    column("samples_stored", BigInteger, default=0),
+    Index("ix_pieces_place", "scope", "stream", "position"),
+    Index("ix_pieces_unread", "scope", "links_tried"),
+)
+"""Ingested file of a downlink, and its position in its stream.
+
+Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` selects the frames of
+one spacecraft; NULL: those of every spacecraft. `stream` and `position` (octets from its start) are stated by the
+sender. Otherwise, `stream` is empty and `position` is the number of the ingest, so that successive ingests are
+adjacent. `station` (empty: not stated) and `link` (text of the settings, NULL: not stated) are those of the sender.
+`links_tried` is the number of known links of the scope that could not read it; NULL if one could.
+`packets_stored` counts the new packets that the ingest added to the archive, `packets_joined` those of them that
+were joined with other pieces, and `samples_stored` their samples, over all attempts of the ingest.
+"""
+
+
+GOOD_LINKS = Table(
+    "good_links",
+    METADATA,
+    key("id", Integer),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("station", String(64)),
+    column("settings", JSON),
+    column("ingest_id", ForeignKey("ingests.id")),
+    column("since_utc_ns", BigInteger),
+    Index("ix_good_links_newest", "vehicle_id", "station", "id"),
+)
+"""Link settings under which a spacecraft was received by a station; the newest row is used first."""
+
+
+KNOWN_LINKS = Table(
+    "known_links",
+    METADATA,
+    key("id", Integer),
+    column("scope", String(128)),
+    column("digest", String(16)),
+    optional("settings", JSON),
+    UniqueConstraint("scope", "digest"),
+)
+"""Link found for the downlinks of a scope; `settings` NULL: bare packets."""
+
+
+STREAM_EDGES = Table(
+    "stream_edges",
+    METADATA,
+    key("id", BigKey),
+    column("domain", String(200)),
+    column("identity", LargeBinary(16)),
+    column("role", SmallInteger),
+    column("open", SmallInteger),
+    column("count", SmallInteger),
+    column("next_count", SmallInteger),
+    column("fit", Integer),
+    optional("file_sha256", String(64)),
+    optional("start", BigInteger),
+    column("length", Integer),
+    column("octets", LargeBinary),
+    UniqueConstraint("domain", "identity"),
+    Index("ix_stream_edges_fit", "domain", "role", "open", "fit", "count"),
+    Index("ix_stream_edges_count", "domain", "role", "open", "count"),
+    Index("ix_stream_edges_next", "domain", "role", "open", "next_count"),
+    Index("ix_stream_edges_newest", "domain", "role", "open", "id"),
+    Index("ix_stream_edges_file", "file_sha256", "open"),
+)
+"""Octets of a CADU or packet that was cut, stored until the adjacent octets are received.
+
+`domain` names the edges that may be joined: those of the raw octets of one link, or of one virtual channel. `role`,
+`count`, `next_count` and `fit` are those of `link.edges.Edge`, -1 if unknown; the `count` of an opener is its
+`next_count`. `open` is 0 when the octets have been used; they are then deleted. `start` is their position in
+`file_sha256`, NULL for octets of a channel.
+"""
+
+
+def samples(name: str, *columns: Column[Any]) -> Table:
+    """Return a table of decoded samples.
+
 
     Packets and samples carry no foreign keys: they are written in bulk, in one transaction with what they
     point to, and a check per row would cost more than the row.
     """
-
-    vehicle_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False, sort_order=-1)
-    dictionary_version: Mapped[int] = mapped_column(
-        SmallInteger, primary_key=True, autoincrement=False, sort_order=-1
+    return Table(
+        name,
+        METADATA,
+        key("vehicle_id", Integer, autoincrement=False),
+        key("dictionary_version", SmallInteger, autoincrement=False),
+        key("ticks", BigInteger, autoincrement=False),
+        key("packet_id", BigInteger, autoincrement=False),
+        *columns,
+        **CLUSTERED,
     )
-    ticks: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False, sort_order=-1)
-    packet_id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False, sort_order=-1)
 
 
-CLUSTERED = {"sqlite_with_rowid": False}
+HOUSEKEEPING = samples(
+    "housekeeping",
+    column("boot_count", Integer),
+    column("mode", SmallInteger),
+    column("frames_processed", BigInteger),
+    column("frames_bad", BigInteger),
+    column("detections_total", BigInteger),
+    column("packets_sent", BigInteger),
+    column("anchor_reads", BigInteger),
+    column("events_sent", BigInteger),
+    column("telecommands_accepted", Integer),
+    column("telecommands_rejected", Integer),
+    column("last_image_quality", SmallInteger),
+    column("temperature_c", Double),
+    column("bus_voltage_v", Double),
+    column("power_w", Double),
+    column("memory_used_kib", BigInteger),
+    column("queue_depth", Integer),
+    column("storage_used_permille", Integer),
+    column("model_hash", BigInteger),
+    column("parameters_hash", BigInteger),
+    column("catalogue_hash", BigInteger),
+    column("anchor_table_hash", BigInteger),
+    column("clock_status", SmallInteger),
+    column("watchdog_resets", Integer),
+)
+"""Engineering values of a housekeeping report; `ticks` is the packet's time."""
 
 
-class Housekeeping(Sample, Base):
-    """Engineering values of a housekeeping report; `ticks` is the packet's time."""
-
-    __tablename__ = "housekeeping"
-    __table_args__ = CLUSTERED
-    boot_count: Mapped[int] = mapped_column(Integer)
-    mode: Mapped[int] = mapped_column(SmallInteger)
-    frames_processed: Mapped[int] = mapped_column(BigInteger)
-    frames_bad: Mapped[int] = mapped_column(BigInteger)
-    detections_total: Mapped[int] = mapped_column(BigInteger)
-    packets_sent: Mapped[int] = mapped_column(BigInteger)
-    anchor_reads: Mapped[int] = mapped_column(BigInteger)
-    events_sent: Mapped[int] = mapped_column(BigInteger)
-    telecommands_accepted: Mapped[int] = mapped_column(Integer)
-    telecommands_rejected: Mapped[int] = mapped_column(Integer)
-    last_image_quality: Mapped[int] = mapped_column(SmallInteger)
-    temperature_c: Mapped[float] = mapped_column(Double)
-    bus_voltage_v: Mapped[float] = mapped_column(Double)
-    power_w: Mapped[float] = mapped_column(Double)
-    memory_used_kib: Mapped[int] = mapped_column(BigInteger)
-    queue_depth: Mapped[int] = mapped_column(Integer)
-    storage_used_permille: Mapped[int] = mapped_column(Integer)
-    model_hash: Mapped[int] = mapped_column(BigInteger)
-    parameters_hash: Mapped[int] = mapped_column(BigInteger)
-    catalogue_hash: Mapped[int] = mapped_column(BigInteger)
-    anchor_table_hash: Mapped[int] = mapped_column(BigInteger)
-    clock_status: Mapped[int] = mapped_column(SmallInteger)
-    watchdog_resets: Mapped[int] = mapped_column(Integer)
+DETECTIONS = samples(
+    "detections",
+    column("packet_ticks", BigInteger),
+    column("frame_number", BigInteger),
+    column("image_quality", SmallInteger),
+    column("count", SmallInteger),
+    column("items", LargeBinary),
+)
+"""Detections of one image; `ticks` is the image's time, `items` packed as `store.codec.DETECTION_ITEM`."""
 
 
-class DetectionFrame(Sample, Base):
-    """Detections of one image; `ticks` is the image's time, `items` packed as `store.codec.DETECTION_ITEM`."""
-
-    __tablename__ = "detections"
-    __table_args__ = CLUSTERED
-    packet_ticks: Mapped[int] = mapped_column(BigInteger)
-    frame_number: Mapped[int] = mapped_column(BigInteger)
-    image_quality: Mapped[int] = mapped_column(SmallInteger)
-    count: Mapped[int] = mapped_column(SmallInteger)
-    items: Mapped[bytes] = mapped_column(LargeBinary)
-
-
-class NavigationState(Sample, Base):
-    """State of one on-board estimator; `ticks` is the image's time."""
-
-    __tablename__ = "navigation_states"
-    __table_args__ = CLUSTERED
-    packet_ticks: Mapped[int] = mapped_column(BigInteger)
-    frame_number: Mapped[int] = mapped_column(BigInteger)
-    estimator: Mapped[int] = mapped_column(SmallInteger)
-    outcome: Mapped[int] = mapped_column(SmallInteger)
-    latitude_deg: Mapped[float | None] = mapped_column(Double)
-    longitude_deg: Mapped[float | None] = mapped_column(Double)
-    altitude_m: Mapped[float | None] = mapped_column(Double)
-    velocity_x_m_s: Mapped[float | None] = mapped_column(Float)
-    velocity_y_m_s: Mapped[float | None] = mapped_column(Float)
-    velocity_z_m_s: Mapped[float | None] = mapped_column(Float)
-    sigma_r_m: Mapped[float | None] = mapped_column(Float)
-    sigma_t_m: Mapped[float | None] = mapped_column(Float)
-    sigma_n_m: Mapped[float | None] = mapped_column(Float)
-    nis: Mapped[float | None] = mapped_column(Float)
-    matched: Mapped[int] = mapped_column(SmallInteger)
+NAVIGATION_STATES = samples(
+    "navigation_states",
+    column("packet_ticks", BigInteger),
+    column("frame_number", BigInteger),
+    column("estimator", SmallInteger),
+    column("outcome", SmallInteger),
+    optional("latitude_deg", Double),
+    optional("longitude_deg", Double),
+    optional("altitude_m", Double),
+    optional("velocity_x_m_s", Float),
+    optional("velocity_y_m_s", Float),
+    optional("velocity_z_m_s", Float),
+    optional("sigma_r_m", Float),
+    optional("sigma_t_m", Float),
+    optional("sigma_n_m", Float),
+    optional("nis", Float),
+    column("matched", SmallInteger),
+)
+"""State of one on-board estimator; `ticks` is the image's time."""
 
 
-class FrameOutcome(Sample, Base):
-    """What one estimator made of one image; `ticks` is the image's time."""
-
-    __tablename__ = "frame_outcomes"
-    __table_args__ = CLUSTERED
-    packet_ticks: Mapped[int] = mapped_column(BigInteger)
-    frame_number: Mapped[int] = mapped_column(BigInteger)
-    estimator: Mapped[int] = mapped_column(SmallInteger)
-    outcome: Mapped[int] = mapped_column(SmallInteger)
-    reset_trigger: Mapped[int] = mapped_column(SmallInteger)
-    detections: Mapped[int] = mapped_column(SmallInteger)
-    candidate_pairs: Mapped[int] = mapped_column(Integer)
-    pairs: Mapped[int] = mapped_column(SmallInteger)
-    shift_east_m: Mapped[float | None] = mapped_column(Float)
-    shift_north_m: Mapped[float | None] = mapped_column(Float)
-    anchor_reads: Mapped[int] = mapped_column(BigInteger)
-
-
-class Event(Sample, Base):
-    """An event report; `ticks` is the packet's time, `severity` 1 (info) to 4 (high)."""
-
-    __tablename__ = "events"
-    __table_args__ = CLUSTERED
-    severity: Mapped[int] = mapped_column(SmallInteger)
-    event_id: Mapped[int] = mapped_column(Integer)
-    frame_number: Mapped[int] = mapped_column(BigInteger)
-    value_1: Mapped[float | None] = mapped_column(Double)
-    value_2: Mapped[float | None] = mapped_column(Double)
+FRAME_OUTCOMES = samples(
+    "frame_outcomes",
+    column("packet_ticks", BigInteger),
+    column("frame_number", BigInteger),
+    column("estimator", SmallInteger),
+    column("outcome", SmallInteger),
+    column("reset_trigger", SmallInteger),
+    column("detections", SmallInteger),
+    column("candidate_pairs", Integer),
+    column("pairs", SmallInteger),
+    optional("shift_east_m", Float),
+    optional("shift_north_m", Float),
+    column("anchor_reads", BigInteger),
+)
+"""What one estimator made of one image; `ticks` is the image's time."""
 
 
-class TimeReport(Sample, Base):
-    """A time report; `ticks` is the packet's time."""
-
-    __tablename__ = "time_reports"
-    __table_args__ = CLUSTERED
-    reported_ticks: Mapped[int] = mapped_column(BigInteger)
-    rate_exponent: Mapped[int] = mapped_column(SmallInteger)
-
-
-class Verification(Sample, Base):
-    """A telecommand verification report (service 1); `ticks` is the packet's time."""
-
-    __tablename__ = "verifications"
-    __table_args__ = CLUSTERED
-    subtype: Mapped[int] = mapped_column(SmallInteger)
-    request_id: Mapped[int] = mapped_column(BigInteger)
-    step: Mapped[int | None] = mapped_column(SmallInteger)
-    failure_code: Mapped[int | None] = mapped_column(Integer)
+EVENTS = samples(
+    "events",
+    column("severity", SmallInteger),
+    column("event_id", Integer),
+    column("frame_number", BigInteger),
+    optional("value_1", Double),
+    optional("value_2", Double),
+)
+"""An event report; `ticks` is the packet's time, `severity` 1 (info) to 4 (high)."""
 
 
-class FilterState(Sample, Base):
-    """Estimate of the navigation filter with its covariance; `ticks` is the image's time.
-
-    `values` holds the state and its covariance as `store.codec.pack_filter_states` packs them; `innovation_degrees`
-    are those of the NIS of the frame, None if the packet does not contain it (dictionary version 2).
-    """
-
-    __tablename__ = "filter_states"
-    __table_args__ = CLUSTERED
-    packet_ticks: Mapped[int] = mapped_column(BigInteger)
-    frame_number: Mapped[int] = mapped_column(BigInteger)
-    values: Mapped[bytes] = mapped_column(LargeBinary)
-    innovation_degrees: Mapped[int | None] = mapped_column(Integer)
+TIME_REPORTS = samples(
+    "time_reports",
+    column("reported_ticks", BigInteger),
+    column("rate_exponent", SmallInteger),
+)
+"""A time report; `ticks` is the packet's time."""
 
 
-class Identification(Sample, Base):
-    """Which catalogued crater each used detection of an image was taken for; `ticks` is the image's time.
+VERIFICATIONS = samples(
+    "verifications",
+    column("subtype", SmallInteger),
+    column("request_id", BigInteger),
+    optional("step", SmallInteger),
+    optional("failure_code", Integer),
+)
+"""A telecommand verification report (service 1); `ticks` is the packet's time."""
 
-    `items` packs pairs of detection (uint16) and crater (uint32), little-endian.
-    """
 
-    __tablename__ = "identifications"
-    __table_args__ = CLUSTERED
-    packet_ticks: Mapped[int] = mapped_column(BigInteger)
-    frame_number: Mapped[int] = mapped_column(BigInteger)
-    count: Mapped[int] = mapped_column(SmallInteger)
-    items: Mapped[bytes] = mapped_column(LargeBinary)
+FILTER_STATES = samples(
+    "filter_states",
+    column("packet_ticks", BigInteger),
+    column("frame_number", BigInteger),
+    column("values", LargeBinary),
+    optional("innovation_degrees", Integer),
+)
+"""Estimate of the navigation filter with its covariance; `ticks` is the image's time.
+
+`values` holds the state and its covariance as `store.codec.pack_filter_states` packs them; `innovation_degrees`
+are those of the NIS of the frame, None if the packet does not contain it (dictionary version 2).
+"""
+
+
+IDENTIFICATIONS = samples(
+    "identifications",
+    column("packet_ticks", BigInteger),
+    column("frame_number", BigInteger),
+    column("count", SmallInteger),
+    column("items", LargeBinary),
+)
+"""Which catalogued crater each used detection of an image was taken for; `ticks` is the image's time.
+
+`items` packs pairs of detection (uint16) and crater (uint32), little-endian.
+"""
 
 
 SAMPLE_TABLES = (
-    Housekeeping,
-    DetectionFrame,
-    NavigationState,
-    FrameOutcome,
-    Event,
-    TimeReport,
-    Verification,
-    FilterState,
-    Identification,
+    HOUSEKEEPING,
+    DETECTIONS,
+    NAVIGATION_STATES,
+    FRAME_OUTCOMES,
+    EVENTS,
+    TIME_REPORTS,
+    VERIFICATIONS,
+    FILTER_STATES,
+    IDENTIFICATIONS,
 )
 
 
-class PacketDefinition(Base):
-    """Declarations of packets in mission descriptions, identified by their content.
-
-    `mission_id` is a revision that states them.
-    """
-
-    __tablename__ = "packet_definitions"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    digest: Mapped[str] = mapped_column(String(64), unique=True)
-    mission_id: Mapped[int] = mapped_column(ForeignKey("missions.id"))
-
-
-class PacketDecoding(Base):
-    """Decoding of the packets of a vehicle with one definition.
-
-    Packets up to `decoded_to` are decoded. The values can be read when `complete` is 1: until then, those of an
-    earlier definition are read. `counts` contains numbers of packets by APID and outcome. Raw files of ingests up to
-    `read_again_to` have to be read again, because the definition declares packets without a checksum; NULL: none.
-    """
-
-    __tablename__ = "packet_decodings"
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
-    definition_id: Mapped[int] = mapped_column(ForeignKey("packet_definitions.id"), primary_key=True)
-    decoded_to: Mapped[int] = mapped_column(BigInteger)
-    complete: Mapped[int] = mapped_column(Flag)
-    read_again_to: Mapped[int | None] = mapped_column(BigInteger)
-    counts: Mapped[dict[str, Any]] = mapped_column(JSON)
-
-
-class ParameterSample(Base):
-    """Values of a packet decoded with a definition of the mission description.
-
-    `container` is the number of its container in the definition, `values` float64 numbers (little-endian) in the order
-    of `tmtc.xtce_series.packet_layouts`; `ticks` is the time in its secondary header.
-    """
-
-    __tablename__ = "parameter_samples"
-    __table_args__ = CLUSTERED
-    vehicle_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    definition_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    container: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
-    ticks: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    packet_id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    values: Mapped[bytes] = mapped_column(LargeBinary)
-
-
-class Rollup(Base):
-    """Samples of one kind aggregated over a bucket of on-board time; see `store.rollups`."""
-
-    __tablename__ = "rollups"
-    __table_args__ = CLUSTERED
-    vehicle_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    dictionary_version: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
-    kind: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
-    part: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
-    level: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
-    bucket: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    first_ticks: Mapped[int] = mapped_column(BigInteger)
-    last_ticks: Mapped[int] = mapped_column(BigInteger)
-    rows: Mapped[int] = mapped_column(BigInteger)
-    statistics: Mapped[bytes] = mapped_column(LargeBinary)
-
-
-class Correlation(Base):
-    """A straight line from on-board ticks to UTC over one stretch of on-board time.
-
-    ``utc_ns = reference_utc_ns + (ticks - reference_ticks) * nanoseconds per tick * (1 + drift_ppb * 1e-9)``
-    """
-
-    __tablename__ = "correlations"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), index=True)
-    method: Mapped[str] = mapped_column(String(32))
-    boot_count: Mapped[int | None] = mapped_column(Integer)
-    start_ticks: Mapped[int] = mapped_column(BigInteger)
-    stop_ticks: Mapped[int] = mapped_column(BigInteger)
-    reference_ticks: Mapped[int] = mapped_column(BigInteger)
-    reference_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    drift_ppb: Mapped[float] = mapped_column(Double)
-    residual_rms_ns: Mapped[float | None] = mapped_column(Double)
-    residual_max_ns: Mapped[float | None] = mapped_column(Double)
-    points: Mapped[int] = mapped_column(Integer)
-    rejected: Mapped[int] = mapped_column(Integer, default=0)
-    superseded: Mapped[int] = mapped_column(Flag, default=0)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class Reception(Base):
-    """When a station on the Earth received a time report, whether or not the report itself has come in yet.
-
-    The report is the packet of time reports with these `ticks` in its header and this count. `station` is empty where
-    only the Earth is known; of several times at one station the first counts, as later ones are played back.
-    """
-
-    __tablename__ = "receptions"
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
-    ticks: Mapped[int] = mapped_column(BigInteger, primary_key=True)
-    sequence_count: Mapped[int] = mapped_column(SmallInteger, primary_key=True)
-    station: Mapped[str] = mapped_column(String(64), primary_key=True)
-    earth_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class EphemerisRecord(Base):
-    """A reference ephemeris; the later uploaded of equal precedence wins where two cover a time."""
-
-    __tablename__ = "ephemerides"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
-    name: Mapped[str] = mapped_column(Text)
-    object_name: Mapped[str] = mapped_column(Text)
-    frame: Mapped[str] = mapped_column(String(16))
-    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    stop_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    states: Mapped[int] = mapped_column(Integer)
-    precedence: Mapped[int] = mapped_column(Integer, default=0)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class MissionRecord(Base):
-    """Revision of a mission description, identified by the hash of its stated values and never changed."""
-
-    __tablename__ = "missions"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    revision: Mapped[str] = mapped_column(String(64), unique=True)
-    name: Mapped[str] = mapped_column(Text)
-    ccsds_id: Mapped[int | None] = mapped_column(Integer, index=True)
-    text: Mapped[str] = mapped_column(Text)
-    entered_by: Mapped[str] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class Pass(Base):
-    """An observation window of one vehicle: an interval of time that samples belong to by on-board time.
-
-    `mission_id` is the revision of the mission description that was in force, `attitude_sha256` the attitude
-    table; NULL if unknown.
-    """
-
-    __tablename__ = "passes"
-    __table_args__ = (Index("ix_passes_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),)
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    name: Mapped[str] = mapped_column(Text)
-    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    stop_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    archive_digest: Mapped[str | None] = mapped_column(String(64), unique=True)
-    manifest: Mapped[dict[str, Any]] = mapped_column(JSON)
-    ephemeris_id: Mapped[int | None] = mapped_column(ForeignKey("ephemerides.id"))
-    catalogue_sha256: Mapped[str | None] = mapped_column(ForeignKey("files.sha256"))
-    attitude_sha256: Mapped[str | None] = mapped_column(ForeignKey("files.sha256"))
-    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class PassFrame(Base):
-    """An image kept with a pass, for the galleries of its report."""
-
-    __tablename__ = "pass_frames"
-    pass_id: Mapped[int] = mapped_column(ForeignKey("passes.id"), primary_key=True)
-    frame_number: Mapped[int] = mapped_column(BigInteger, primary_key=True)
-    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
-
-
-class Job(Base):
-    """A piece of background work, visible from queued to its end."""
-
-    __tablename__ = "jobs"
-    id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    kind: Mapped[str] = mapped_column(String(32))
-    state: Mapped[str] = mapped_column(String(16), index=True)
-    arguments: Mapped[dict[str, Any]] = mapped_column(JSON)
-    progress: Mapped[float] = mapped_column(Double)
-    attempts: Mapped[int] = mapped_column(Integer)
-    result: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    error: Mapped[str | None] = mapped_column(Text)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    started_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    finished_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-
-
-class Report(Base):
-    """A report made of a pass; its documents are files of the archive.
-
-    `mission_id` is the revision of the mission description that the evaluation used. `event_number` is the event that
-    caused a re-evaluation of the pass, `previous_id` the report before it, and `changes` the changed figures; NULL for
-    a report on request.
-    """
-
-    __tablename__ = "reports"
-    id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    pass_id: Mapped[int] = mapped_column(ForeignKey("passes.id"), index=True)
-    html_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
-    json_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
-    pdf_sha256: Mapped[str | None] = mapped_column(String(64))
-    summary: Mapped[dict[str, Any]] = mapped_column(JSON)
-    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
-    event_number: Mapped[int | None] = mapped_column(BigInteger)
-    previous_id: Mapped[str | None] = mapped_column(String(32))
-    changes: Mapped[list[dict[str, Any]] | None] = mapped_column(JSON)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class User(Base):
-    """User of the service with one role; `state` is active or disabled."""
-
-    __tablename__ = "users"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    name: Mapped[str] = mapped_column(String(64), unique=True)
-    role: Mapped[str] = mapped_column(String(16))
-    state: Mapped[str] = mapped_column(String(16))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class Token(Base):
-    """Bearer token of a user; only its hash is stored.
-
-    `hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour. The token of a browser
-    session has the token that it was started with in `parent_id`, and is valid only while that one is.
-    """
-
-    __tablename__ = "tokens"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    user_id: Mapped[int] = mapped_column(ForeignKey("users.id"), index=True)
-    token_sha256: Mapped[str] = mapped_column(String(64), unique=True)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    hint: Mapped[str] = mapped_column(String(16))
-    expires_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    revoked_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    used_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    parent_id: Mapped[int | None] = mapped_column(ForeignKey("tokens.id"))
-
-
-class AuditEntry(Base):
-    """Action of a user; entries are only appended, numbered from 1 without gaps (see `store.audit`)."""
-
-    __tablename__ = "audit"
-    id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    utc_ns: Mapped[int] = mapped_column(BigInteger, index=True)
-    actor: Mapped[str] = mapped_column(String(64))
-    action: Mapped[str] = mapped_column(String(48))
-    target: Mapped[str] = mapped_column(Text)
-    detail: Mapped[dict[str, Any]] = mapped_column(JSON)
-    previous_sha256: Mapped[str] = mapped_column(String(64))
-    sha256: Mapped[str] = mapped_column(String(64))
-
-
-class AuditHead(Base):
-    """Number and hash of the newest audit entry: one row, locked while entries are appended."""
-
-    __tablename__ = "audit_head"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    number: Mapped[int] = mapped_column(BigInteger)
-    sha256: Mapped[str] = mapped_column(String(64))
-
-
-class RowDigest(Base):
-    """SHA-256 of a row as the program wrote it, kept by triggers (see `store.row_digests`)."""
-
-    __tablename__ = "row_digests"
-    __table_args__ = CLUSTERED
-    table_name: Mapped[str] = mapped_column(String(64), primary_key=True)
-    row_key: Mapped[str] = mapped_column(Text, primary_key=True)
-    sha256: Mapped[str] = mapped_column(String(64))
-
-
-class LoggedEventRow(Base):
-    """Event of the log; `id` is its number, from 1 without gaps."""
-
-    __tablename__ = "event_log"
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    utc_ns: Mapped[int] = mapped_column(BigInteger)
-    kind: Mapped[str] = mapped_column(String(32))
-    payload: Mapped[dict[str, Any]] = mapped_column(JSON)
-
-
-class AlarmRecord(Base):
-    """Alarm of a vehicle (see `alarms.core`); `open` is 1 until the alarm is cleared, then NULL.
-
-    A cause (`source` and `name`) has at most one open alarm. `active`: the newest telemetry has the condition.
-    """
-
-    __tablename__ = "alarms"
-    __table_args__ = (
-        UniqueConstraint("vehicle_id", "source", "name", "open"),
-        Index("ix_alarms_newest", "open", "last_ticks"),
-    )
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    source: Mapped[str] = mapped_column(String(16))
-    name: Mapped[str] = mapped_column(String(64))
-    open: Mapped[int | None] = mapped_column(Flag)
-    severity: Mapped[int] = mapped_column(SmallInteger)
-    state: Mapped[str] = mapped_column(String(16))
-    active: Mapped[int] = mapped_column(Flag)
-    count: Mapped[int] = mapped_column(BigInteger)
-    value: Mapped[float | None] = mapped_column(Double)
-    first_ticks: Mapped[int] = mapped_column(BigInteger)
-    last_ticks: Mapped[int] = mapped_column(BigInteger)
-    raised_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    acknowledged_by: Mapped[str | None] = mapped_column(String(64))
-    acknowledged_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    shelved_by: Mapped[str | None] = mapped_column(String(64))
-    shelved_until_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    cleared_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-
-
-class AlarmChangeRecord(Base):
-    """Change in the life of an alarm."""
-
-    __tablename__ = "alarm_changes"
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    alarm_id: Mapped[int] = mapped_column(ForeignKey("alarms.id"), index=True)
-    utc_ns: Mapped[int] = mapped_column(BigInteger)
-    actor: Mapped[str] = mapped_column(String(64))
-    change: Mapped[str] = mapped_column(String(16))
-    comment: Mapped[str] = mapped_column(Text)
-
-
-class AlarmPosition(Base):
-    """Last packet of a vehicle that has been examined for alarms."""
-
-    __tablename__ = "alarm_positions"
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True, autoincrement=False)
-    packet_id: Mapped[int] = mapped_column(BigInteger)
-
-
-class EventPosition(Base):
-    """Number of the last event that a consumer has handled."""
-
-    __tablename__ = "event_positions"
-    consumer: Mapped[str] = mapped_column(String(32), primary_key=True)
-    number: Mapped[int] = mapped_column(BigInteger)
-
-
-class Answer(Base):
-    """What was answered under an idempotency key; NULL while the work is being done."""
-
-    __tablename__ = "answers"
-    key: Mapped[str] = mapped_column(String(64), primary_key=True)
-    request: Mapped[str] = mapped_column(String(64))
-    answer: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class Telecommand(Base):
-    """A telecommand, from being entered to its end; its octets exist from its release on.
-
-    One that is inside another (an activity of the on-board schedule) names that one in `carrier_id`.
-    """
-
-    __tablename__ = "telecommands"
-    __table_args__ = (Index("ix_telecommands_vehicle_id_request_id", "vehicle_id", "request_id"),)
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    name: Mapped[str] = mapped_column(String(64))
-    arguments: Mapped[dict[str, Any]] = mapped_column(JSON)
-    state: Mapped[str] = mapped_column(String(16), index=True)
-    critical: Mapped[int] = mapped_column(Flag)
-    timeout_s: Mapped[int] = mapped_column(Integer)
-    requested_by: Mapped[str] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    decided_by: Mapped[str | None] = mapped_column(String(64))
-    decided_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    reason: Mapped[str | None] = mapped_column(Text)
-    sequence_count: Mapped[int | None] = mapped_column(SmallInteger)
-    request_id: Mapped[int | None] = mapped_column(BigInteger)
-    octets: Mapped[bytes | None] = mapped_column(LargeBinary)
-    sent_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    sent_after_ticks: Mapped[int | None] = mapped_column(BigInteger)
-    timeout_noted_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    window_id: Mapped[int | None] = mapped_column(Integer, index=True)
-    carrier_id: Mapped[int | None] = mapped_column(BigInteger)
-    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
-    send_before_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-
-
-class LinkRecord(Base):
-    """State of a connection to a ground station; one process at a time owns it.
-
-    `lease_utc_ns` is the end of the lease of the owner, wall time. `heard_utc_ns` is the mission time of the last
-    reception, `considered_utc_ns` the mission time up to which predicted contacts were compared with receptions.
-    """
-
-    __tablename__ = "links"
-    name: Mapped[str] = mapped_column(String(64), primary_key=True)
-    ccsds_id: Mapped[int] = mapped_column(Integer)
-    instance: Mapped[str] = mapped_column(String(96))
-    owner: Mapped[str | None] = mapped_column(String(96))
-    lease_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    state: Mapped[str] = mapped_column(String(16))
-    reason: Mapped[str | None] = mapped_column(Text)
-    octets: Mapped[int] = mapped_column(BigInteger)
-    heard_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    clock_offset_ns: Mapped[int | None] = mapped_column(BigInteger)
-    considered_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    send_requested: Mapped[int] = mapped_column(BigInteger)
-    send_done: Mapped[int] = mapped_column(BigInteger)
-    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class ContactRecord(Base):
-    """Contact over a link: open, ended or missed; times are mission time."""
-
-    __tablename__ = "contacts"
-    __table_args__ = (Index("ix_contacts_link_id", "link", "id"),)
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    link: Mapped[str] = mapped_column(String(64))
-    station: Mapped[str] = mapped_column(String(64))
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    state: Mapped[str] = mapped_column(String(16))
-    reason: Mapped[str | None] = mapped_column(Text)
-    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    stop_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    predicted_start_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    predicted_stop_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    octets: Mapped[int] = mapped_column(BigInteger)
-    telecommands: Mapped[int] = mapped_column(Integer)
-
-
-class Transmission(Base):
-    """Octets of telecommands for one link; `transmitted_utc_ns` (mission time) is NULL until they are on the wire."""
-
-    __tablename__ = "transmissions"
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
-    link: Mapped[str] = mapped_column(String(64), index=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    contact_id: Mapped[int | None] = mapped_column(BigInteger)
-    octets: Mapped[bytes] = mapped_column(LargeBinary)
-    telecommands: Mapped[list[int]] = mapped_column(JSON)
-    attempts: Mapped[int] = mapped_column(Integer)
-    taken_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    transmitted_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-
-
-class CommandCounter(Base):
-    """Number of telecommand sequence counts assigned for a vehicle; locked during commanding."""
-
-    __tablename__ = "command_counters"
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
-    telecommands: Mapped[int] = mapped_column(BigInteger)
-
-
-class Window(Base):
-    """Planned observation window.
-
-    `decision` is the decision of a person (draft, approved, failed). `state` is the progress of the window including
-    telemetry, updated by `planning.progress`. `version` counts changes by persons. `edited_by` added the window
-    or changed it last, `decided_by` made the decision. `closed`: it is processed although telemetry is missing.
-    `uploads` is what its telecommands load on board.
-    """
-
-    __tablename__ = "windows"
-    __table_args__ = (Index("ix_windows_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),)
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    name: Mapped[str] = mapped_column(Text)
-    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    stop_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    cadence_s: Mapped[float] = mapped_column(Double)
-    decision: Mapped[str] = mapped_column(String(16))
-    state: Mapped[str] = mapped_column(String(16))
-    reason: Mapped[str | None] = mapped_column(Text)
-    predecessor_id: Mapped[int | None] = mapped_column(ForeignKey("windows.id"))
-    ephemeris_id: Mapped[int | None] = mapped_column(ForeignKey("ephemerides.id"))
-    pass_id: Mapped[int | None] = mapped_column(ForeignKey("passes.id"))
-    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
-    data_octets: Mapped[int] = mapped_column(BigInteger)
-    predicted: Mapped[dict[str, Any]] = mapped_column(JSON)
-    closed: Mapped[int] = mapped_column(Flag, server_default="0")
-    uploads: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    version: Mapped[int] = mapped_column(Integer)
-    created_by: Mapped[str] = mapped_column(String(64))
-    edited_by: Mapped[str] = mapped_column(String(64))
-    decided_by: Mapped[str | None] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    request_id: Mapped[int | None] = mapped_column(ForeignKey("standing_requests.id"))
-
-
-class StandingRequestRow(Base):
-    """Standing request with its last plan; `plans` counts plans, so that one of several processes stores each."""
-
-    __tablename__ = "standing_requests"
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
-    name: Mapped[str] = mapped_column(Text)
-    state: Mapped[str] = mapped_column(String(16))
-    priority: Mapped[int] = mapped_column(Integer)
-    terms: Mapped[dict[str, Any]] = mapped_column(JSON)
-    plan: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    plans: Mapped[int] = mapped_column(Integer)
-    planned_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
-    anchor_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    version: Mapped[int] = mapped_column(Integer)
-    created_by: Mapped[str] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class AutomationActionRow(Base):
-    """Action of an automation rule that an event caused; one for the same event, rule, place in it and subject.
-
-    `subject` is the pass, vehicle or mission. `mission_id` is the revision in force; NULL without any.
-    """
-
-    __tablename__ = "automation_actions"
-    __table_args__ = (UniqueConstraint("event_number", "rule", "position", "subject"),)
-    id: Mapped[int] = mapped_column(Integer, primary_key=True)
-    event_number: Mapped[int] = mapped_column(BigInteger)
-    trigger: Mapped[str] = mapped_column(String(32))
-    rule: Mapped[str] = mapped_column(String(100))
-    position: Mapped[int] = mapped_column(SmallInteger)
-    action: Mapped[str] = mapped_column(String(32))
-    subject: Mapped[str] = mapped_column(String(32))
-    vehicle_id: Mapped[int | None] = mapped_column(Integer)
-    pass_id: Mapped[int | None] = mapped_column(Integer, index=True)
-    window_id: Mapped[int | None] = mapped_column(Integer)
-    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
-    text: Mapped[str] = mapped_column(Text)
-    state: Mapped[str] = mapped_column(String(16), index=True)
-    result: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    error: Mapped[str | None] = mapped_column(Text)
-    decided_by: Mapped[str | None] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class RegisteredBuild(Base):
-    """A payload build under test; `digest` is the hash of everything that decides what it does."""
-
-    __tablename__ = "builds"
-    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
-    name: Mapped[str] = mapped_column(Text)
-    version: Mapped[str] = mapped_column(Text)
-    description: Mapped[str] = mapped_column(Text)
-    kind: Mapped[str] = mapped_column(String(16))
-    files: Mapped[dict[str, Any]] = mapped_column(JSON)
-    flight_code: Mapped[str | None] = mapped_column(String(64))
-    provenance: Mapped[dict[str, Any]] = mapped_column(JSON)
-    registered_by: Mapped[str] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class RegressionArchive(Base):
-    """A pass archive kept to be flown again; `digest` is the SHA-256 of its manifest."""
-
-    __tablename__ = "regression_archives"
-    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
-    name: Mapped[str] = mapped_column(Text)
-    manifest_sha256: Mapped[str] = mapped_column(String(64))
-    frames: Mapped[int] = mapped_column(Integer)
-    octets: Mapped[int] = mapped_column(BigInteger)
-    pinned: Mapped[int] = mapped_column(Flag)
-    used_utc_ns: Mapped[int] = mapped_column(BigInteger, index=True)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class Replay(Base):
-    """Result of one build on one archive; `id` is the hash of both identities."""
-
-    __tablename__ = "replays"
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    archive_digest: Mapped[str] = mapped_column(String(64), index=True)
-    build_digest: Mapped[str] = mapped_column(String(64), index=True)
-    outcome: Mapped[str] = mapped_column(String(16))
-    detail: Mapped[str] = mapped_column(Text)
-    downlink_sha256: Mapped[str | None] = mapped_column(String(64))
-    performance_sha256: Mapped[str | None] = mapped_column(String(64))
-    wall_s: Mapped[float] = mapped_column(Double)
-    cpu_s: Mapped[float] = mapped_column(Double)
-    peak_rss_mib: Mapped[float] = mapped_column(Double)
-    isolation: Mapped[str] = mapped_column(Text)
-    machine: Mapped[str] = mapped_column(Text)
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
-
-
-class Regression(Base):
-    """A candidate build judged against a baseline over archived passes."""
-
-    __tablename__ = "regressions"
-    id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    baseline_digest: Mapped[str] = mapped_column(String(64))
-    candidate_digest: Mapped[str] = mapped_column(String(64))
-    verdict: Mapped[str] = mapped_column(String(16))
-    result: Mapped[dict[str, Any]] = mapped_column(JSON)
-    missions: Mapped[list[str]] = mapped_column(JSON)
-    html_sha256: Mapped[str | None] = mapped_column(String(64))
-    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+PACKET_DEFINITIONS = Table(
+    "packet_definitions",
+    METADATA,
+    key("id", Integer),
+    column("digest", String(64), unique=True),
+    column("mission_id", ForeignKey("missions.id")),
+)
+"""Declarations of packets in mission descriptions, identified by their content.
+
+`mission_id` is a revision that states them.
+"""
+
+
+PACKET_DECODINGS = Table(
+    "packet_decodings",
+    METADATA,
+    key("vehicle_id", ForeignKey("vehicles.id")),
+    key("definition_id", ForeignKey("packet_definitions.id")),
+    column("decoded_to", BigInteger),
+    column("complete", Flag),
+    optional("read_again_to", BigInteger),
+    column("counts", JSON),
+)
+"""Decoding of the packets of a vehicle with one definition.
+
+Packets up to `decoded_to` are decoded. The values can be read when `complete` is 1: until then, those of an
+earlier definition are read. `counts` contains numbers of packets by APID and outcome. Raw files of ingests up to
+`read_again_to` have to be read again, because the definition declares packets without a checksum; NULL: none.
+"""
+
+
+PARAMETER_SAMPLES = Table(
+    "parameter_samples",
+    METADATA,
+    key("vehicle_id", Integer, autoincrement=False),
+    key("definition_id", Integer, autoincrement=False),
+    key("container", SmallInteger, autoincrement=False),
+    key("ticks", BigInteger, autoincrement=False),
+    key("packet_id", BigInteger, autoincrement=False),
+    column("values", LargeBinary),
+    **CLUSTERED,
+)
+"""Values of a packet decoded with a definition of the mission description.
+
+`container` is the number of its container in the definition, `values` float64 numbers (little-endian) in the order
+of `tmtc.xtce_series.packet_layouts`; `ticks` is the time in its secondary header.
+"""
+
+
+ROLLUPS = Table(
+    "rollups",
+    METADATA,
+    key("vehicle_id", Integer, autoincrement=False),
+    key("dictionary_version", SmallInteger, autoincrement=False),
+    key("kind", SmallInteger, autoincrement=False),
+    key("part", SmallInteger, autoincrement=False),
+    key("level", SmallInteger, autoincrement=False),
+    key("bucket", BigInteger, autoincrement=False),
+    column("first_ticks", BigInteger),
+    column("last_ticks", BigInteger),
+    column("rows", BigInteger),
+    column("statistics", LargeBinary),
+    **CLUSTERED,
+)
+"""Samples of one kind aggregated over a bucket of on-board time; see `store.rollups`."""
+
+
+CORRELATIONS = Table(
+    "correlations",
+    METADATA,
+    key("id", Integer),
+    column("vehicle_id", ForeignKey("vehicles.id"), index=True),
+    column("method", String(32)),
+    optional("boot_count", Integer),
+    column("start_ticks", BigInteger),
+    column("stop_ticks", BigInteger),
+    column("reference_ticks", BigInteger),
+    column("reference_utc_ns", BigInteger),
+    column("drift_ppb", Double),
+    optional("residual_rms_ns", Double),
+    optional("residual_max_ns", Double),
+    column("points", Integer),
+    column("rejected", Integer, default=0),
+    column("superseded", Flag, default=0),
+    column("created_utc_ns", BigInteger),
+)
+"""A straight line from on-board ticks to UTC over one stretch of on-board time.
+
+``utc_ns = reference_utc_ns + (ticks - reference_ticks) * nanoseconds per tick * (1 + drift_ppb * 1e-9)``
+"""
+
+
+RECEPTIONS = Table(
+    "receptions",
+    METADATA,
+    key("vehicle_id", ForeignKey("vehicles.id")),
+    key("ticks", BigInteger),
+    key("sequence_count", SmallInteger),
+    key("station", String(64)),
+    column("earth_utc_ns", BigInteger),
+)
+"""When a station on the Earth received a time report, whether or not the report itself has come in yet.
+
+The report is the packet of time reports with these `ticks` in its header and this count. `station` is empty where
+only the Earth is known; of several times at one station the first counts, as later ones are played back.
+"""
+
+
+EPHEMERIDES = Table(
+    "ephemerides",
+    METADATA,
+    key("id", Integer),
+    column("file_sha256", ForeignKey("files.sha256")),
+    column("name", Text),
+    column("object_name", Text),
+    column("frame", String(16)),
+    column("start_utc_ns", BigInteger),
+    column("stop_utc_ns", BigInteger),
+    column("states", Integer),
+    column("precedence", Integer, default=0),
+    column("created_utc_ns", BigInteger),
+)
+"""A reference ephemeris; the later uploaded of equal precedence wins where two cover a time."""
+
+
+MISSIONS = Table(
+    "missions",
+    METADATA,
+    key("id", Integer),
+    column("revision", String(64), unique=True),
+    column("name", Text),
+    optional("ccsds_id", Integer, index=True),
+    column("text", Text),
+    column("entered_by", String(64)),
+    column("created_utc_ns", BigInteger),
+)
+"""Revision of a mission description, identified by the hash of its stated values and never changed."""
+
+
+PASSES = Table(
+    "passes",
+    METADATA,
+    key("id", Integer),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("name", Text),
+    column("start_utc_ns", BigInteger),
+    column("stop_utc_ns", BigInteger),
+    optional("archive_digest", String(64), unique=True),
+    column("manifest", JSON),
+    optional("ephemeris_id", ForeignKey("ephemerides.id")),
+    optional("catalogue_sha256", ForeignKey("files.sha256")),
+    optional("attitude_sha256", ForeignKey("files.sha256")),
+    optional("mission_id", ForeignKey("missions.id")),
+    column("created_utc_ns", BigInteger),
+    Index("ix_passes_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),
+)
+"""An observation window of one vehicle: an interval of time that samples belong to by on-board time.
+
+`mission_id` is the revision of the mission description that was in force, `attitude_sha256` the attitude
+table; NULL if unknown.
+"""
+
+
+PASS_FRAMES = Table(
+    "pass_frames",
+    METADATA,
+    key("pass_id", ForeignKey("passes.id")),
+    key("frame_number", BigInteger),
+    column("file_sha256", ForeignKey("files.sha256")),
+)
+"""An image kept with a pass, for the galleries of its report."""
+
+
+JOBS = Table(
+    "jobs",
+    METADATA,
+    key("id", String(32)),
+    column("kind", String(32)),
+    column("state", String(16), index=True),
+    column("arguments", JSON),
+    column("progress", Double),
+    column("attempts", Integer),
+    optional("result", JSON),
+    optional("error", Text),
+    column("created_utc_ns", BigInteger),
+    optional("started_utc_ns", BigInteger),
+    optional("finished_utc_ns", BigInteger),
+)
+"""A piece of background work, visible from queued to its end."""
+
+
+REPORTS = Table(
+    "reports",
+    METADATA,
+    key("id", String(32)),
+    column("pass_id", ForeignKey("passes.id"), index=True),
+    column("html_sha256", ForeignKey("files.sha256")),
+    column("json_sha256", ForeignKey("files.sha256")),
+    optional("pdf_sha256", String(64)),
+    column("summary", JSON),
+    optional("mission_id", ForeignKey("missions.id")),
+    optional("event_number", BigInteger),
+    optional("previous_id", String(32)),
+    optional("changes", JSON),
+    column("created_utc_ns", BigInteger),
+)
+"""A report made of a pass; its documents are files of the archive.
+
+`mission_id` is the revision of the mission description that the evaluation used. `event_number` is the event that
+caused a re-evaluation of the pass, `previous_id` the report before it, and `changes` the changed figures; NULL for
+a report on request.
+"""
+
+
+USERS = Table(
+    "users",
+    METADATA,
+    key("id", Integer),
+    column("name", String(64), unique=True),
+    column("role", String(16)),
+    column("state", String(16)),
+    column("created_utc_ns", BigInteger),
+)
+"""User of the service with one role; `state` is active or disabled."""
+
+
+TOKENS = Table(
+    "tokens",
+    METADATA,
+    key("id", Integer),
+    column("user_id", ForeignKey("users.id"), index=True),
+    column("token_sha256", String(64), unique=True),
+    column("created_utc_ns", BigInteger),
+    column("hint", String(16)),
+    optional("expires_utc_ns", BigInteger),
+    optional("revoked_utc_ns", BigInteger),
+    optional("used_utc_ns", BigInteger),
+    optional("parent_id", ForeignKey("tokens.id")),
+)
+"""Bearer token of a user; only its hash is stored.
+
+`hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour. The token of a browser
+session has the token that it was started with in `parent_id`, and is valid only while that one is.
+"""
+
+
+AUDIT = Table(
+    "audit",
+    METADATA,
+    key("id", BigInteger, autoincrement=False),
+    column("utc_ns", BigInteger, index=True),
+    column("actor", String(64)),
+    column("action", String(48)),
+    column("target", Text),
+    column("detail", JSON),
+    column("previous_sha256", String(64)),
+    column("sha256", String(64)),
+)
+"""Action of a user; entries are only appended, numbered from 1 without gaps (see `store.audit`)."""
+
+
+AUDIT_HEAD = Table(
+    "audit_head",
+    METADATA,
+    key("id", Integer, autoincrement=False),
+    column("number", BigInteger),
+    column("sha256", String(64)),
+)
+"""Number and hash of the newest audit entry: one row, locked while entries are appended."""
+
+
+ROW_DIGESTS = Table(
+    "row_digests",
+    METADATA,
+    key("table_name", String(64)),
+    key("row_key", Text),
+    column("sha256", String(64)),
+    **CLUSTERED,
+)
+"""SHA-256 of a row as the program wrote it, kept by triggers (see `store.row_digests`)."""
+
+
+EVENT_LOG = Table(
+    "event_log",
+    METADATA,
+    key("id", BigKey),
+    column("utc_ns", BigInteger),
+    column("kind", String(32)),
+    column("payload", JSON),
+)
+"""Event of the log; `id` is its number, from 1 without gaps."""
+
+
+ALARMS = Table(
+    "alarms",
+    METADATA,
+    key("id", BigKey),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("source", String(16)),
+    column("name", String(64)),
+    optional("open", Flag),
+    column("severity", SmallInteger),
+    column("state", String(16)),
+    column("active", Flag),
+    column("count", BigInteger),
+    optional("value", Double),
+    column("first_ticks", BigInteger),
+    column("last_ticks", BigInteger),
+    column("raised_utc_ns", BigInteger),
+    optional("acknowledged_by", String(64)),
+    optional("acknowledged_utc_ns", BigInteger),
+    optional("shelved_by", String(64)),
+    optional("shelved_until_utc_ns", BigInteger),
+    optional("cleared_utc_ns", BigInteger),
+    UniqueConstraint("vehicle_id", "source", "name", "open"),
+    Index("ix_alarms_newest", "open", "last_ticks"),
+)
+"""Alarm of a vehicle (see `alarms.core`); `open` is 1 until the alarm is cleared, then NULL.
+
+A cause (`source` and `name`) has at most one open alarm. `active`: the newest telemetry has the condition.
+"""
+
+
+ALARM_CHANGES = Table(
+    "alarm_changes",
+    METADATA,
+    key("id", BigKey),
+    column("alarm_id", ForeignKey("alarms.id"), index=True),
+    column("utc_ns", BigInteger),
+    column("actor", String(64)),
+    column("change", String(16)),
+    column("comment", Text),
+)
+"""Change in the life of an alarm."""
+
+
+ALARM_POSITIONS = Table(
+    "alarm_positions",
+    METADATA,
+    key("vehicle_id", ForeignKey("vehicles.id"), autoincrement=False),
+    column("packet_id", BigInteger),
+)
+"""Last packet of a vehicle that has been examined for alarms."""
+
+
+EVENT_POSITIONS = Table(
+    "event_positions",
+    METADATA,
+    key("consumer", String(32)),
+    column("number", BigInteger),
+)
+"""Number of the last event that a consumer has handled."""
+
+
+ANSWERS = Table(
+    "answers",
+    METADATA,
+    key("key", String(64)),
+    column("request", String(64)),
+    optional("answer", JSON),
+    column("created_utc_ns", BigInteger),
+)
+"""What was answered under an idempotency key; NULL while the work is being done."""
+
+
+TELECOMMANDS = Table(
+    "telecommands",
+    METADATA,
+    key("id", BigKey),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("name", String(64)),
+    column("arguments", JSON),
+    column("state", String(16), index=True),
+    column("critical", Flag),
+    column("timeout_s", Integer),
+    column("requested_by", String(64)),
+    column("created_utc_ns", BigInteger),
+    optional("decided_by", String(64)),
+    optional("decided_utc_ns", BigInteger),
+    optional("reason", Text),
+    optional("sequence_count", SmallInteger),
+    optional("request_id", BigInteger),
+    optional("octets", LargeBinary),
+    optional("sent_utc_ns", BigInteger),
+    optional("sent_after_ticks", BigInteger),
+    optional("timeout_noted_utc_ns", BigInteger),
+    optional("window_id", Integer, index=True),
+    optional("carrier_id", BigInteger),
+    optional("mission_id", ForeignKey("missions.id")),
+    optional("send_before_utc_ns", BigInteger),
+    Index("ix_telecommands_vehicle_id_request_id", "vehicle_id", "request_id"),
+)
+"""A telecommand, from being entered to its end; its octets exist from its release on.
+
+One that is inside another (an activity of the on-board schedule) names that one in `carrier_id`.
+"""
+
+
+LINKS = Table(
+    "links",
+    METADATA,
+    key("name", String(64)),
+    column("ccsds_id", Integer),
+    column("instance", String(96)),
+    optional("owner", String(96)),
+    column("lease_utc_ns", BigInteger),
+    column("state", String(16)),
+    optional("reason", Text),
+    column("octets", BigInteger),
+    optional("heard_utc_ns", BigInteger),
+    optional("clock_offset_ns", BigInteger),
+    column("considered_utc_ns", BigInteger),
+    column("send_requested", BigInteger),
+    column("send_done", BigInteger),
+    column("changed_utc_ns", BigInteger),
+)
+"""State of a connection to a ground station; one process at a time owns it.
+
+`lease_utc_ns` is the end of the lease of the owner, wall time. `heard_utc_ns` is the mission time of the last
+reception, `considered_utc_ns` the mission time up to which predicted contacts were compared with receptions.
+"""
+
+
+CONTACTS = Table(
+    "contacts",
+    METADATA,
+    key("id", BigKey),
+    column("link", String(64)),
+    column("station", String(64)),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("state", String(16)),
+    optional("reason", Text),
+    column("start_utc_ns", BigInteger),
+    optional("stop_utc_ns", BigInteger),
+    optional("predicted_start_utc_ns", BigInteger),
+    optional("predicted_stop_utc_ns", BigInteger),
+    column("octets", BigInteger),
+    column("telecommands", Integer),
+    Index("ix_contacts_link_id", "link", "id"),
+)
+"""Contact over a link: open, ended or missed; times are mission time."""
+
+
+TRANSMISSIONS = Table(
+    "transmissions",
+    METADATA,
+    key("id", BigKey),
+    column("link", String(64), index=True),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    optional("contact_id", BigInteger),
+    column("octets", LargeBinary),
+    column("telecommands", JSON),
+    column("attempts", Integer),
+    column("taken_utc_ns", BigInteger),
+    optional("transmitted_utc_ns", BigInteger),
+)
+"""Octets of telecommands for one link; `transmitted_utc_ns` (mission time) is NULL until they are on the wire."""
+
+
+COMMAND_COUNTERS = Table(
+    "command_counters",
+    METADATA,
+    key("vehicle_id", ForeignKey("vehicles.id")),
+    column("telecommands", BigInteger),
+)
+"""Number of telecommand sequence counts assigned for a vehicle; locked during commanding."""
+
+
+WINDOWS = Table(
+    "windows",
+    METADATA,
+    key("id", Integer),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("name", Text),
+    column("start_utc_ns", BigInteger),
+    column("stop_utc_ns", BigInteger),
+    column("cadence_s", Double),
+    column("decision", String(16)),
+    column("state", String(16)),
+    optional("reason", Text),
+    optional("predecessor_id", ForeignKey("windows.id")),
+    optional("ephemeris_id", ForeignKey("ephemerides.id")),
+    optional("pass_id", ForeignKey("passes.id")),
+    optional("mission_id", ForeignKey("missions.id")),
+    column("data_octets", BigInteger),
+    column("predicted", JSON),
+    column("closed", Flag, server_default="0"),
+    optional("uploads", JSON),
+    column("version", Integer),
+    column("created_by", String(64)),
+    column("edited_by", String(64)),
+    optional("decided_by", String(64)),
+    column("created_utc_ns", BigInteger),
+    column("changed_utc_ns", BigInteger),
+    optional("request_id", ForeignKey("standing_requests.id")),
+    Index("ix_windows_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),
+)
+"""Planned observation window.
+
+`decision` is the decision of a person (draft, approved, failed). `state` is the progress of the window including
+telemetry, updated by `planning.progress`. `version` counts changes by persons. `edited_by` added the window
+or changed it last, `decided_by` made the decision. `closed`: it is processed although telemetry is missing.
+`uploads` is what its telecommands load on board.
+"""
+
+
+STANDING_REQUESTS = Table(
+    "standing_requests",
+    METADATA,
+    key("id", Integer),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("name", Text),
+    column("state", String(16)),
+    column("priority", Integer),
+    column("terms", JSON),
+    optional("plan", JSON),
+    column("plans", Integer),
+    optional("planned_utc_ns", BigInteger),
+    column("anchor_utc_ns", BigInteger),
+    column("version", Integer),
+    column("created_by", String(64)),
+    column("created_utc_ns", BigInteger),
+    column("changed_utc_ns", BigInteger),
+)
+"""Standing request with its last plan; `plans` counts plans, so that one of several processes stores each."""
+
+
+AUTOMATION_ACTIONS = Table(
+    "automation_actions",
+    METADATA,
+    key("id", Integer),
+    column("event_number", BigInteger),
+    column("trigger", String(32)),
+    column("rule", String(100)),
+    column("position", SmallInteger),
+    column("action", String(32)),
+    column("subject", String(32)),
+    optional("vehicle_id", Integer),
+    optional("pass_id", Integer, index=True),
+    optional("window_id", Integer),
+    optional("mission_id", ForeignKey("missions.id")),
+    column("text", Text),
+    column("state", String(16), index=True),
+    optional("result", JSON),
+    optional("error", Text),
+    optional("decided_by", String(64)),
+    column("created_utc_ns", BigInteger),
+    column("changed_utc_ns", BigInteger),
+    UniqueConstraint("event_number", "rule", "position", "subject"),
+)
+"""Action of an automation rule that an event caused; one for the same event, rule, place in it and subject.
+
+`subject` is the pass, vehicle or mission. `mission_id` is the revision in force; NULL without any.
+"""
+
+
+BUILDS = Table(
+    "builds",
+    METADATA,
+    key("digest", String(64)),
+    column("name", Text),
+    column("version", Text),
+    column("description", Text),
+    column("kind", String(16)),
+    column("files", JSON),
+    optional("flight_code", String(64)),
+    column("provenance", JSON),
+    column("registered_by", String(64)),
+    column("created_utc_ns", BigInteger),
+)
+"""A payload build under test; `digest` is the hash of everything that decides what it does."""
+
+
+REGRESSION_ARCHIVES = Table(
+    "regression_archives",
+    METADATA,
+    key("digest", String(64)),
+    column("name", Text),
+    column("manifest_sha256", String(64)),
+    column("frames", Integer),
+    column("octets", BigInteger),
+    column("pinned", Flag),
+    column("used_utc_ns", BigInteger, index=True),
+    column("created_utc_ns", BigInteger),
+)
+"""A pass archive kept to be flown again; `digest` is the SHA-256 of its manifest."""
+
+
+REPLAYS = Table(
+    "replays",
+    METADATA,
+    key("id", String(64)),
+    column("archive_digest", String(64), index=True),
+    column("build_digest", String(64), index=True),
+    column("outcome", String(16)),
+    column("detail", Text),
+    optional("downlink_sha256", String(64)),
+    optional("performance_sha256", String(64)),
+    column("wall_s", Double),
+    column("cpu_s", Double),
+    column("peak_rss_mib", Double),
+    column("isolation", Text),
+    column("machine", Text),
+    column("created_utc_ns", BigInteger),
+)
+"""Result of one build on one archive; `id` is the hash of both identities."""
+
+
+REGRESSIONS = Table(
+    "regressions",
+    METADATA,
+    key("id", String(32)),
+    column("baseline_digest", String(64)),
+    column("candidate_digest", String(64)),
+    column("verdict", String(16)),
+    column("result", JSON),
+    column("missions", JSON),
+    optional("html_sha256", String(64)),
+    column("created_utc_ns", BigInteger),
+)
+"""A candidate build judged against a baseline over archived passes."""

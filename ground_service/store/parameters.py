@@ -25,7 +25,7 @@ VALUE = np.dtype("<f8")
 
 @dataclass(frozen=True, slots=True)
 class Decoding:
-    """Progress of a definition for a vehicle: see `models.PacketDecoding`."""
+    """Progress of a definition for a vehicle: see `models.PACKET_DECODINGS`."""
 
     definition_id: int
     decoded_to: int

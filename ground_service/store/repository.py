@@ -27,51 +27,45 @@ class Page:
     total: int
 
 
-def _table(model: type[models.Base]) -> Table:
-    table = model.__table__
-    assert isinstance(table, Table)
-    return table
-
-
-FILES = _table(models.File)
-VEHICLES = _table(models.Vehicle)
-INGESTS = _table(models.Ingest)
-PACKETS = _table(models.Packet)
-PASSES = _table(models.Pass)
-MISSIONS = _table(models.MissionRecord)
-PACKET_DEFINITIONS = _table(models.PacketDefinition)
-PACKET_DECODINGS = _table(models.PacketDecoding)
-PARAMETER_SAMPLES = _table(models.ParameterSample)
-PIECES = _table(models.Piece)
-STANDING_REQUESTS = _table(models.StandingRequestRow)
-GOOD_LINKS = _table(models.GoodLink)
-KNOWN_LINKS = _table(models.KnownLink)
-STREAM_EDGES = _table(models.StreamEdge)
-PASS_FRAMES = _table(models.PassFrame)
-EPHEMERIDES = _table(models.EphemerisRecord)
-CORRELATIONS = _table(models.Correlation)
-RECEPTIONS = _table(models.Reception)
-JOBS = _table(models.Job)
-REPORTS = _table(models.Report)
-USERS = _table(models.User)
-TOKENS = _table(models.Token)
-AUDIT = _table(models.AuditEntry)
-AUDIT_HEAD = _table(models.AuditHead)
-ROW_DIGESTS = _table(models.RowDigest)
-EVENT_LOG = _table(models.LoggedEventRow)
-ANSWERS = _table(models.Answer)
-TELECOMMANDS = _table(models.Telecommand)
-LINKS = _table(models.LinkRecord)
-CONTACTS = _table(models.ContactRecord)
-TRANSMISSIONS = _table(models.Transmission)
-COMMAND_COUNTERS = _table(models.CommandCounter)
-WINDOWS = _table(models.Window)
-AUTOMATION_ACTIONS = _table(models.AutomationActionRow)
-BUILDS = _table(models.RegisteredBuild)
-REGRESSION_ARCHIVES = _table(models.RegressionArchive)
-REPLAYS = _table(models.Replay)
-REGRESSIONS = _table(models.Regression)
-SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
+FILES = models.FILES
+VEHICLES = models.VEHICLES
+INGESTS = models.INGESTS
+PACKETS = models.PACKETS
+PASSES = models.PASSES
+MISSIONS = models.MISSIONS
+PACKET_DEFINITIONS = models.PACKET_DEFINITIONS
+PACKET_DECODINGS = models.PACKET_DECODINGS
+PARAMETER_SAMPLES = models.PARAMETER_SAMPLES
+PIECES = models.PIECES
+STANDING_REQUESTS = models.STANDING_REQUESTS
+GOOD_LINKS = models.GOOD_LINKS
+KNOWN_LINKS = models.KNOWN_LINKS
+STREAM_EDGES = models.STREAM_EDGES
+PASS_FRAMES = models.PASS_FRAMES
+EPHEMERIDES = models.EPHEMERIDES
+CORRELATIONS = models.CORRELATIONS
+RECEPTIONS = models.RECEPTIONS
+JOBS = models.JOBS
+REPORTS = models.REPORTS
+USERS = models.USERS
+TOKENS = models.TOKENS
+AUDIT = models.AUDIT
+AUDIT_HEAD = models.AUDIT_HEAD
+ROW_DIGESTS = models.ROW_DIGESTS
+EVENT_LOG = models.EVENT_LOG
+ANSWERS = models.ANSWERS
+TELECOMMANDS = models.TELECOMMANDS
+LINKS = models.LINKS
+CONTACTS = models.CONTACTS
+TRANSMISSIONS = models.TRANSMISSIONS
+COMMAND_COUNTERS = models.COMMAND_COUNTERS
+WINDOWS = models.WINDOWS
+AUTOMATION_ACTIONS = models.AUTOMATION_ACTIONS
+BUILDS = models.BUILDS
+REGRESSION_ARCHIVES = models.REGRESSION_ARCHIVES
+REPLAYS = models.REPLAYS
+REGRESSIONS = models.REGRESSIONS
+SAMPLES: dict[str, Table] = {table.name: table for table in models.SAMPLE_TABLES}
 
 
 def add(connection: Connection, table: Table, **values: Any) -> Any:

@@ -17,7 +17,7 @@ from sqlalchemy import Connection, LargeBinary, and_, bindparam, delete, func, o
 
 from ground_service.store.bulk import insert_columns
 from ground_service.store.counters import hold
-from ground_service.store.models import SAMPLE_TABLES, Rollup
+from ground_service.store.models import ROLLUPS, SAMPLE_TABLES
 from lunar.arrays import FloatArray, IntArray
 
 STATE_VALUES = (
@@ -50,8 +50,8 @@ BASE_TICKS = 64 << 16
 STATISTICS = 4
 """Numbers kept of each value: count, sum, least, greatest."""
 
-_TABLE: Any = Rollup.__table__
-_SAMPLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
+_TABLE: Any = ROLLUPS
+_SAMPLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
 _BLOCK_ROWS = 50_000
 
 _KEY = ("vehicle_id", "dictionary_version", "kind", "part", "level")

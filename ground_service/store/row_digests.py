@@ -29,7 +29,7 @@ BARE = frozenset(
         "audit",
         "audit_head",
         "row_digests",
-        *(one.__tablename__ for one in models.SAMPLE_TABLES),
+        *(one.name for one in models.SAMPLE_TABLES),
     }
 )
 """Tables without digests: derived from raw files, or part of the audit chain."""
@@ -53,7 +53,7 @@ class StrayRow:
 @cache
 def guarded_tables() -> tuple[Table, ...]:
     """Return the tables whose rows have digests."""
-    return tuple(table for table in models.Base.metadata.sorted_tables if table.name not in BARE)
+    return tuple(table for table in models.METADATA.sorted_tables if table.name not in BARE)
 
 
 def row_sha256(*values: Any) -> str:

@@ -39,7 +39,7 @@ class TableDigest:
 
 def copied_tables() -> list[Table]:
     """Return the tables to copy, referenced tables first."""
-    return [table for table in models.Base.metadata.sorted_tables if table.name not in KEPT_BY_THE_PROGRAM]
+    return [table for table in models.METADATA.sorted_tables if table.name not in KEPT_BY_THE_PROGRAM]
 
 
 def row_blocks(connection: Connection, table: Table) -> Iterator[list[Row]]:

@@ -20,7 +20,7 @@ SPACECRAFT_ID_MAX = 1023
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A spacecraft in one instance: see `models.Vehicle`."""
+    """A spacecraft in one instance: see `models.VEHICLES`."""
 
     id: int
     ccsds_id: int

@@ -88,7 +88,7 @@ def run_upgrade(arguments: argparse.Namespace) -> int:
 
 def run_grant(arguments: argparse.Namespace) -> int:
     from ground_service.store.database import prepare_database
-    from ground_service.store.models import Base
+    from ground_service.store.models import METADATA
     from ground_service.store.roles import READ_ONLY, grant_service, grant_statements
     from linna.errors import UsageError
 
@@ -97,7 +97,7 @@ def run_grant(arguments: argparse.Namespace) -> int:
     if role is None:
         raise UsageError("--role: expected the database role of the service, found none")
     if arguments.print:
-        statements = list(grant_statements(role, [*Base.metadata.tables, *READ_ONLY]))
+        statements = list(grant_statements(role, [*METADATA.tables, *READ_ONLY]))
         emit(arguments, {"role": role, "statements": statements}, text=";\n".join(statements) + ";")
         return 0
     database = prepare_database(settings.resolved_migration_url())

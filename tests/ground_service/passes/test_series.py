@@ -11,7 +11,7 @@ from ground_service.ground import Ground
 from ground_service.ingest.store import store_samples
 from ground_service.passes import series
 from ground_service.passes.service import trend_series
-from ground_service.store.models import Rollup
+from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES, build_rollups
 from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY
@@ -69,7 +69,7 @@ def read(ground: Ground, vehicle: int, name: str, start: int, stop: int, points:
 
 
 def rollup_statistics(ground: Ground) -> tuple[list[Any], np.ndarray]:
-    table: Any = Rollup.__table__
+    table: Any = ROLLUPS
     with ground.database.reading() as connection:
         rows = connection.execute(table.select().order_by(*table.primary_key.columns)).all()
     return [tuple(row[:-1]) for row in rows], np.frombuffer(b"".join(row[-1] for row in rows), "<f8")
@@ -153,7 +153,7 @@ def test_roll_ups_of_an_older_database_are_built_afterwards(ground: Ground) -> N
     stored(ground, columns, [np.arange(COUNT)])
     expected_heads, expected = rollup_statistics(ground)
     with ground.database.writing() as connection:
-        connection.execute(delete(Rollup))
+        connection.execute(delete(ROLLUPS))
         assert build_rollups(connection) == COUNT
         assert build_rollups(connection) == 0
     heads, statistics = rollup_statistics(ground)

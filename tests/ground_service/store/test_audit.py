@@ -16,7 +16,7 @@ from sqlalchemy.exc import DBAPIError
 from ground_service.errors import AuditBroken, GroundError
 from ground_service.store import audit
 from ground_service.store.database import Database, prepare_database
-from ground_service.store.models import AuditEntry, AuditHead
+from ground_service.store.models import AUDIT, AUDIT_HEAD
 
 PROCESSES, EACH = 4, 25
 
@@ -84,8 +84,8 @@ def test_the_database_refuses_to_change_the_log(database: Database, statement: s
         assert audit.missing_guards(connection) == []
 
 
-TABLE: Any = AuditEntry.__table__
-HEAD: Any = AuditHead.__table__
+TABLE: Any = AUDIT
+HEAD: Any = AUDIT_HEAD
 DAMAGE: dict[str, tuple[Any, str]] = {
     "time": (update(TABLE).where(TABLE.c.id == 2).values(utc_ns=6), "changed content"),
     "actor": (update(TABLE).where(TABLE.c.id == 2).values(actor="bob"), "changed content"),

@@ -29,7 +29,7 @@ from ground_service.store.database import (
     upgrade_database,
 )
 from ground_service.store.files import FileArchive
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 from tests.ground_service.schema import described_schema
 
 
@@ -42,7 +42,7 @@ def test_a_new_database_is_made_with_the_newest_schema(tmp_path: Path) -> None:
     found, head, _ = schema_revisions(database)
     assert found == head
     with database.reading() as connection:
-        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+        assert compare_metadata(MigrationContext.configure(connection), METADATA) == []
     database.engine.dispose()
 
 
@@ -50,7 +50,7 @@ def test_a_migrated_database_has_the_schema_of_the_models(tmp_path: Path) -> Non
     migrated = prepare_database(url(tmp_path / "migrated"))
     made = open_database(url(tmp_path / "made"))
     with made.writing() as connection:
-        Base.metadata.create_all(connection)
+        METADATA.create_all(connection)
     assert described_schema(migrated) == described_schema(made)
     for database in (migrated, made):
         database.engine.dispose()

@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from ground_service.store.database import Database, empty_database, prepare_database, upgrade_database
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 from ground_service.store.row_digests import (
     BARE,
     StrayRow,
@@ -20,7 +20,7 @@ from ground_service.store.row_digests import (
     unknown_digests,
 )
 
-TABLES: dict[str, Any] = dict(Base.metadata.tables)
+TABLES: dict[str, Any] = dict(METADATA.tables)
 REPORT = {
     "id": "r1",
     "pass_id": 1,

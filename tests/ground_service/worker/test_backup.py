@@ -17,7 +17,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store.database import prepare_database
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 from ground_service.worker.backup import backup, restore
 from ground_service.worker.integrity import verify
 
@@ -29,7 +29,7 @@ def everything(ground: Ground) -> dict[str, list[Any]]:
     with ground.database.reading() as connection:
         return {
             table.name: sorted(map(tuple, connection.execute(select(table))), key=str)
-            for table in Base.metadata.sorted_tables
+            for table in METADATA.sorted_tables
             if table.name != "row_digests"  # each database has its own
         }
 

@@ -27,7 +27,7 @@ from ground_service.store.database import (
     prepare_database,
     schema_revisions,
 )
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker.app import run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
@@ -71,7 +71,7 @@ def test_a_migrated_database_has_the_schema_of_the_models(
 ) -> None:
     made = open_database(new_postgres_database())
     with made.writing() as connection:
-        Base.metadata.create_all(connection)
+        METADATA.create_all(connection)
     migrated = described_schema(ground_on_postgres.database)
     assert migrated == described_schema(made)
     made.engine.dispose()

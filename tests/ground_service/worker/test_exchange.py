@@ -25,7 +25,7 @@ from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from ground_service.store.database import open_database, prepare_database
 from ground_service.store.files import FileArchive
-from ground_service.store.models import Base
+from ground_service.store.models import METADATA
 from ground_service.worker.exchange import export_database, import_database
 from ground_service.worker.integrity import verify
 from tmtc.downlink import decode
@@ -39,7 +39,7 @@ def counts(ground: Ground) -> dict[str, int]:
     with ground.database.reading() as connection:
         return {
             name: len(connection.execute(select(table)).all())
-            for name, table in Base.metadata.tables.items()
+            for name, table in METADATA.tables.items()
             if name != "row_digests"
         }
 
