@@ -28,10 +28,11 @@ from ground_service.store.files import FileArchive
 from ground_service.store.models import METADATA
 from ground_service.worker.exchange import export_database, import_database
 from ground_service.worker.integrity import verify
+from lunar.timescales import parse_utc
 from tmtc.downlink import decode
 
 NS = 1_000_000_000
-START = 2_000_000_000 * NS
+START = parse_utc("2029-08-07T06:00:00Z")
 OLD_SCHEMA = Path(__file__).with_name("schema_0011.sql")
 
 
