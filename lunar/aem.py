@@ -12,12 +12,10 @@ CCSDS 504.0-B-1 (2008) and 504.0-B-2 (2024), Attitude Data Messages, section 4 a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.ephemeris import read_text
 from lunar.errors import EphemerisError, UnknownTimeSystemError
 from lunar.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
 from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns
@@ -78,11 +76,6 @@ class AttitudeSegment:
             raise EphemerisError(
                 f"an attitude segment: expected quaternions ({len(self.utc_ns)}, 4), found {self.q_wxyz.shape}"
             )
-
-
-def load_aem(path: Path | str) -> tuple[AttitudeSegment, ...]:
-    """Return the segments of an AEM file; raises as `parse_aem`."""
-    return parse_aem(read_text(path, "a CCSDS AEM"), source=str(path))
 
 
 def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...]:

@@ -7,10 +7,8 @@ above the sphere of radius `MOON_RADIUS_M`.  NaN marks values that a catalogue d
 from __future__ import annotations
 
 import csv
-import gzip
 import io
 import math
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.compressed import read_expanded
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
@@ -366,16 +365,11 @@ def _band(latitude_rad: float) -> int:
 
 def _read_columns(path: Path) -> dict[str, list[str]]:
     try:
-        octets = path.read_bytes()
-        if octets[:2] == b"\x1f\x8b":
-            octets = gzip.decompress(octets)
+        octets = read_expanded(path, "a crater catalogue in CSV, plain or gzip")
         text = octets.decode("utf-8-sig")
         lines = text.split("\n") if '"' not in text else None
         rows = list(csv.reader(io.StringIO(text))) if lines is None else []
-    except OSError as error:
-        found = error.strerror or str(error)
-        raise DataFileError(path, "", "a crater catalogue in CSV, plain or gzip", found) from None
-    except (EOFError, ValueError, csv.Error, zlib.error) as error:
+    except (ValueError, csv.Error) as error:
         raise DataFileError(path, "", "a complete CSV or gzip file", str(error)) from None
     if lines is not None:
         # Without quotes, a plain split is sufficient and five times as fast as the csv module.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import zipfile
 import zlib
@@ -36,23 +37,16 @@ def read_expanded(path: Path | str, expected: str, limit_octets: int = EXPANDED_
 
 
 def _gunzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
-    parts: list[bytes] = []
-    size = 0
-    rest = octets
-    while rest:
-        stream = zlib.decompressobj(wbits=31)
-        try:
-            part = stream.decompress(rest, limit_octets - size + 1)
-        except zlib.error as error:
-            raise DataFileError(path, "", "a gzip file", f"damaged data ({error})") from None
-        size += len(part)
-        if size > limit_octets:
-            raise _too_large(path, limit_octets)
-        if not stream.eof:
-            raise DataFileError(path, "", "a complete gzip file", "one that is cut short")
-        parts.append(part)
-        rest = stream.unused_data.lstrip(b"\0")
-    return b"".join(parts)
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(octets)) as stream:
+            expanded = stream.read(limit_octets + 1)
+    except EOFError:
+        raise DataFileError(path, "", "a complete gzip file", "one that is cut short") from None
+    except (OSError, zlib.error) as error:
+        raise DataFileError(path, "", "a gzip file", f"damaged data ({error})") from None
+    if len(expanded) > limit_octets:
+        raise _too_large(path, limit_octets)
+    return expanded
 
 
 def _unzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:

@@ -56,7 +56,7 @@ def parse_horizons(text: str, source: str = "Horizons table") -> Ephemeris:
         try:
             states.append([float(fields[k]) for k in where[1:]])
             epochs.append(_epoch_ns(fields[where[0]]))
-        except (ValueError, IndexError):
+        except (ValueError, IndexError, OverflowError):
             expected = "a date like A.D. 2029-Aug-07 00:00:00.0000 and six numbers"
             raise DataFileError(source, f"line {number}", expected, repr(line[:60])) from None
         if not np.all(np.isfinite(states[-1])):

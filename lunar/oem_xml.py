@@ -88,6 +88,8 @@ class _Reader:
             self.parser.Parse(octets, True)
         except expat.ExpatError as error:
             raise self._error("well-formed XML", expat.ErrorString(error.code)) from None
+        except (LookupError, ValueError) as error:  # an encoding that is unknown or not supported
+            raise self._error("XML in UTF-8", str(error)) from None
         return self.lines
 
     def _error(self, expected: str, found: str) -> DataFileError:

@@ -72,6 +72,10 @@ _ISO = re.compile(
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
+FIRST_YEAR, LAST_YEAR = 1700, 2250
+"""Years whose nanoseconds since 1970 fit 64 bits."""
+
+
 def parse_utc(text: str) -> int:
     """Return ``utc_ns`` of a text like ``2029-08-07T00:00:00.000Z`` or ``2029-219T00:00:00`` (day of year).
 
@@ -96,6 +100,8 @@ def parse_utc(text: str) -> int:
                 raise TimeFormatError(text)
     except ValueError:
         raise TimeFormatError(text) from None
+    if not FIRST_YEAR <= date.year <= LAST_YEAR:
+        raise TimeFormatError(text)
     hours, minutes, seconds = int(hour or 0), int(minute or 0), int(second or 0)
     if hours > 23 or minutes > 59 or seconds > 60 or (seconds == 60 and minutes != 59):
         raise TimeFormatError(text)

@@ -40,7 +40,7 @@ HINT_LENGTH = 12
 USED_STEP_NS = 3_600_000_000_000
 """Resolution of the stored time of last use, to limit the number of writes."""
 
-RESERVED_NAMES = ("local", "service", "archive")
+RESERVED_NAMES = ("local", "service", "archive", "planner", "link", "telemetry", "ingest")
 """Names of the program itself as an actor in the audit log."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
@@ -271,7 +271,9 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
     caller = authenticate(ground, token)
     now = utc_now_ns()
     with ground.database.writing() as connection:
-        parent = store.get_token(connection, caller.token_id or 0)
+        parent = store.get_token(connection, caller.token_id or 0, lock=True)
+        if parent.revoked_utc_ns is not None or parent.state != "active":
+            raise NotAuthorised("token: has been revoked")
         expires = now + SESSION_NS
         if parent.expires_utc_ns is not None:
             expires = min(expires, parent.expires_utc_ns)

@@ -106,15 +106,16 @@ def find_token(connection: Connection, sha256: str) -> TokenRecord | None:
     return None if row is None else TokenRecord.of(row)
 
 
-def get_token(connection: Connection, token_id: int) -> TokenRecord:
-    """Return a token and its user.
+def get_token(connection: Connection, token_id: int, *, lock: bool = False) -> TokenRecord:
+    """Return a token and its user; `lock`: until the transaction ends.
 
     Raises
     ------
     NotFound
         There is no such token.
     """
-    row = connection.execute(_tokens().where(TOKENS.c.id == token_id)).mappings().first()
+    query = _tokens().where(TOKENS.c.id == token_id)
+    row = connection.execute(query.with_for_update() if lock else query).mappings().first()
     if row is None:
         raise NotFound("token", token_id)
     return TokenRecord.of(row)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +81,8 @@ def add_mission(
     Raises
     ------
     Forbidden
-        It changes which telecommands need a second person, and the caller is not permitted to change that.
+        It changes which telecommands need a second person, whether windows are approved by a person, the links or the
+        channels of notifications, and the caller is not permitted to change these.
     """
     mission, text = read_mission(octets, source)
     with ground.database.writing() as connection:
@@ -91,6 +92,10 @@ def add_mission(
                 raise Forbidden(
                     f"{source}: changes which telecommands need a second person; expected an administrator"
                 )
+            mine = store.missions_in_force(connection).get(mission.spacecraft.id)
+            for name, given, found in _reaching_out(mission, mine):
+                if given != found:
+                    raise Forbidden(f"{source}: changes {name}; expected an administrator")
         _check_link_names(connection, mission, source)
         return store.detail(connection, enter(connection, mission, text, actor=actor))
 
@@ -109,6 +114,16 @@ def _check_link_names(connection: Connection, mission: Mission, source: str) -> 
                 "names that no other spacecraft uses",
                 f"{min(taken)!r} of spacecraft {spacecraft}",
             )
+
+
+def _reaching_out(mission: Mission, in_force: Mission | None) -> Iterator[tuple[str, object, object]]:
+    """Yield the parts that make the service read, write or connect elsewhere, or act without a person."""
+    yield "links", mission.links or (), () if in_force is None else in_force.links or ()
+    channels = {} if in_force is None else in_force.automation.channels or {}
+    yield "automation.channels", mission.automation.channels or {}, channels
+    windows = None if in_force is None else in_force.approval.windows
+    if mission.approval.windows == "automatic":
+        yield "approval.windows", "automatic", windows
 
 
 def _persons(approval: Approval) -> tuple[frozenset[str], frozenset[str]]:

@@ -160,11 +160,6 @@ def assign_window(connection: Connection, window_id: int, request_id: int) -> No
     repository.change(connection, _WINDOWS, window_id, request_id=request_id)
 
 
-def windows_of_request(connection: Connection, request_id: int) -> list[WindowRecord]:
-    """Return the windows of a request in order of time."""
-    return records_where(connection, _WINDOWS.c.request_id == request_id)
-
-
 def windows_around(connection: Connection, vehicle: int, since_utc_ns: int) -> list[WindowRecord]:
     """Return the windows of a vehicle that end after a time, and those of its requests in the current periods."""
     return records_where(

@@ -12,7 +12,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.access.service import audit
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding import service as commanding
 from ground_service.commanding import store as commands
 from ground_service.ephemerides import store as ephemerides
@@ -297,7 +297,7 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         start, stop = window.start.utc_ns, window.stop.utc_ns
         # The observation ends by the second telecommand; by itself a frame later should that one be lost.
         duration_s = (stop - start) / NS + window.cadence_s
-        timeout_s = round(max(stop - utc_now_ns(), 0) / NS) + VERIFICATION_MARGIN_S
+        timeout_s = round(max(stop - mission_now_ns(), 0) / NS) + VERIFICATION_MARGIN_S
         activities = (
             (start, ("start_observation", duration_s, window.cadence_s)),
             (stop, ("stop_observation", 0.0, 0.0)),

@@ -22,7 +22,7 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding import store as commands
 from ground_service.ephemerides import store as ephemerides
 from ground_service.ephemerides.model import Ephemeris
-from ground_service.errors import GroundError, InvalidInput, PlanConflicts, StateConflict
+from ground_service.errors import PASSING, GroundError, InvalidInput, PlanConflicts, StateConflict
 from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -47,7 +47,7 @@ from ground_service.planning.request_store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
-from lunar.errors import EphemerisCoverageError
+from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)
 
@@ -159,7 +159,9 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None) -> dict[str, int]:
         ground.check_stopping()
         try:
             done["added"] += _fill(ground, request_id, now)
-        except GroundError as error:
+        except PASSING:
+            raise
+        except (GroundError, LunarError) as error:  # the windows of other requests are still planned and sent
             log.warning("standing request %d: %s", request_id, error)
     approved, released = _advance(ground, now)
     return done | {"approved": approved, "released": released}

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from itertools import groupby
 from typing import Any
 
@@ -37,18 +40,39 @@ from ground_service.worker.upkeep import broken_limits
 log = logging.getLogger(__name__)
 
 
+_ONE_AT_A_TIME = threading.Lock()
+LOCK = 7604
+"""Lock of the database: one process at a time runs actions, so that no action runs twice."""
+
+WAIT_S = 0.2
+
+
 def run_actions(ground: Ground, event: int, job_id: str) -> dict[str, Any]:
     """Run the actions of an event that are queued; return their numbers by state."""
-    with ground.database.reading() as connection:
-        actions = store.actions_of_event(connection, event)
-    for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
-        _run_chain(ground, list(chain))
+    with _alone(ground):
+        with ground.database.reading() as connection:
+            actions = store.actions_of_event(connection, event)
+        for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
+            _run_chain(ground, list(chain))
     with ground.database.reading() as connection:
         after = store.actions_of_event(connection, event)
     counts: dict[str, int] = {}
     for one in after:
         counts[one.state] = counts.get(one.state, 0) + 1
     return {"event": event, **counts}
+
+
+@contextmanager
+def _alone(ground: Ground) -> Iterator[None]:
+    """Wait until no other thread or process runs actions, and keep others out."""
+    with _ONE_AT_A_TIME:
+        while True:
+            with ground.database.alone(LOCK) as alone:
+                if alone:
+                    yield
+                    return
+            ground.check_stopping()
+            time.sleep(WAIT_S)
 
 
 def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:

@@ -42,12 +42,10 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments
-from ground_service.missions.store import get_mission
 from ground_service.passes.span import pass_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.standing import needs_plan
-from ground_service.planning.store import get_record
 from ground_service.store import events
 from ground_service.store.events import LoggedEvent
 from ground_service.timekeeping.recorrelation import recorrelate
@@ -185,18 +183,6 @@ def _reevaluate(ground: Ground, pass_id: int, event: int) -> str | None:
         return add_job(connection, "re-evaluation", {"pass_id": pass_id, "event": event}, job_id=identity)
 
 
-def _report(ground: Ground, window_id: int, event: int) -> str | None:
-    """Add the job of the first report of a window if its mission description asks for automatic evaluation."""
-    with ground.database.writing() as connection:
-        window = get_record(connection, window_id)
-        pass_id, mission_id = window.pass_id, window.mission_id
-        if pass_id is None or mission_id is None or window.state != "downlinked":
-            return None
-        if not get_mission(connection, mission_id).automation.evaluate:
-            return None
-        return add_job(connection, "report", {"pass_id": pass_id}, job_id=_job_id("report", pass_id, 0))
-
-
 def _decode(ground: Ground, vehicle: int, event: int) -> str:
     """Add the job that decodes the packets of a vehicle with a new mission description."""
     with ground.database.writing() as connection:
@@ -303,6 +289,13 @@ class FollowUp:
                 log.error("event %d (%s) is not valid: %s", event.number, event.kind, error)
                 failed.append(
                     FollowUpFailed(work=event.kind, events=(event.number,), error="the event is not valid")
+                )
+            except PASSING:
+                raise
+            except Exception as error:  # one faulty event must not stop all later ones
+                log.exception("event %d (%s): its work cannot be determined", event.number, event.kind)
+                failed.append(
+                    FollowUpFailed(work=event.kind, events=(event.number,), error=public_text(error))
                 )
         for one in sorted(work, key=lambda one: (_ORDER[one[0]], one[1])):
             ground.check_stopping()

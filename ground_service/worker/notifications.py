@@ -79,7 +79,10 @@ def _post(url: str, identity: str, content: Mapping[str, Any], key: bytes | None
     headers = {"Content-Type": "application/json", "Idempotency-Key": identity}
     if key is not None:
         headers[SIGNATURE_HEADER] = signature(key, body)
-    response = httpx.post(url, content=body, headers=headers, timeout=TIMEOUT_S)
+    try:
+        response = httpx.post(url, content=body, headers=headers, timeout=TIMEOUT_S)
+    except httpx.InvalidURL as error:
+        raise NotDelivered(str(error)) from None
     if response.status_code >= 500:
         raise httpx.TransportError(f"status {response.status_code}")
     if response.status_code >= 300:

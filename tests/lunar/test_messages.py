@@ -16,7 +16,7 @@ from lunar.aem import AttitudeSegment, format_aem, parse_aem
 from lunar.compressed import read_expanded
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.ephemeris_files import load_ephemeris
-from lunar.errors import DataFileError, EphemerisError, UnknownFrameError
+from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError
 from lunar.frames import matrix_from_quaternion
 from lunar.oem import format_oem
 from lunar.oem_xml import format_oem_xml, parse_oem_xml
@@ -203,6 +203,25 @@ def test_faults_of_compressed_files_are_named(tmp_path: Path, octets: bytes, mes
     path.write_bytes(octets)
     with pytest.raises(DataFileError, match=rf"orbit\.gz: {message}"):
         read_expanded(path, "an ephemeris", 1 << 20)
+
+
+def test_many_gzip_members_take_linear_time(tmp_path: Path) -> None:
+    path = tmp_path / "many.gz"
+    path.write_bytes(gzip.compress(b"") * 200_000)  # 4 MB; minutes if each member copies the rest
+    assert read_expanded(path, "text") == b""
+
+
+@pytest.mark.parametrize("encoding", ["foo", "big5"])
+def test_encodings_of_xml_that_are_not_supported_are_named(encoding: str) -> None:
+    text = f'<?xml version="1.0" encoding="{encoding}"?><oem/>'
+    with pytest.raises(DataFileError, match="expected XML in UTF-8"):
+        parse_oem_xml(text.encode(), "orbit.xml")
+
+
+@pytest.mark.parametrize("year", ["9999", "1500"])
+def test_years_outside_64_bits_of_nanoseconds_are_refused(year: str) -> None:
+    with pytest.raises(TimeFormatError):
+        parse_utc(f"{year}-01-01T00:00:00Z")
 
 
 # AEM

@@ -150,8 +150,9 @@ dialog.addEventListener("close", async () => {
   try {
     await send("POST", "session", { token: given });
     const next = new URLSearchParams(location.search).get("next") ?? "";
-    // Only pages of this service: a path, and not the address of another host.
-    if (/^\/(?![/\\])/.test(next)) location.assign(next);
+    // Only pages of this service. The browser's own parser decides, which skips control characters in addresses.
+    const wanted = new URL(next || "/", location.origin);
+    if (next.startsWith("/") && wanted.origin === location.origin) location.assign(wanted.href);
     else location.reload();
   } catch (error) {
     trouble(error);

@@ -73,8 +73,11 @@ def test_a_page_that_needs_a_sign_in_opens_after_it(stranger, guarded):
     expect(stranger.locator("body")).to_contain_text("not found")
 
 
-def test_after_sign_in_no_other_host_is_opened(stranger, guarded):
-    stranger.goto("/?next=//example.org/")
+@pytest.mark.parametrize(
+    "next_page", ["//example.org/", "/%09/example.org/", "/%5Cexample.org/", "https://example.org/"]
+)
+def test_after_sign_in_no_other_host_is_opened(stranger, guarded, next_page):
+    stranger.goto(f"/?next={next_page}")
     sign_in(stranger, guarded[1])
     expect(stranger.locator("#user")).to_have_text("ada, viewer")
     assert stranger.url.startswith(guarded[0])
