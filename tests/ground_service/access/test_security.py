@@ -20,7 +20,7 @@ ROLES = ("viewer", "operator", "admin")
 
 def request(ground: Ground, open_without_users: bool) -> Any:
     app = SimpleNamespace(state=SimpleNamespace(ground=ground, open_without_users=open_without_users))
-    return SimpleNamespace(app=app, state=SimpleNamespace())
+    return SimpleNamespace(app=app, state=SimpleNamespace(), cookies={})
 
 
 def bearer(token: str) -> HTTPAuthorizationCredentials:

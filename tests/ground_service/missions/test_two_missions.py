@@ -136,9 +136,9 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
     add_mission(ground, NARROW.encode())
     add_ephemeris(ground, ground.files.put_file(made.folder / "reference.oem"), name="reference")
     planners = []
-    made_planner = planning._planner
+    made_planner = planning.planner_of
     monkeypatch.setattr(
-        planning, "_planner", lambda *given: planners.append(made_planner(*given)) or planners[-1]
+        planning, "planner_of", lambda *given: planners.append(made_planner(*given)) or planners[-1]
     )
     for spacecraft in (76, 77, 78):
         entry = planning.WindowEntry("w", START, STOP - 60_000_000_000, 15.0, spacecraft)
