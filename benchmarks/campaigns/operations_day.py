@@ -353,7 +353,7 @@ def evaluate(desk: Transcript, api: Client, window: int, folder: Path) -> dict[s
     return {
         "window": done.state,
         "frames": summary.frames,
-        "frames_planned": done.predicted["frames"],
+        "frames_planned": done.predicted.frames,
         "packets": summary.packets,
         "packets_lost": summary.packets_lost,
         "telecommands": dict(commands),

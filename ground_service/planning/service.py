@@ -485,7 +485,13 @@ def _prediction(
 
 
 def _coverage_conflict(connection: Connection, entry: WindowEntry) -> PlanConflict | None:
-    """Return the conflict of a window that no ephemeris covers; None as long as the service has no ephemeris."""
+    """Return the conflict of a window that no ephemeris covers.
+
+    A window needs one if it names it, or if tables for it are made from it (`[uploads]` of the mission description).
+    """
+    mission = missions.mission_in_force(connection, entry.spacecraft_id)
+    if entry.ephemeris_id is None and (mission is None or mission.uploads is None):
+        return None
     known, total = ephemerides.list_ephemerides(connection, limit=1, offset=0)
     if not total:
         return None

@@ -280,7 +280,7 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
             record = store.find_archive(connection, str(given))
         if record is None:
             raise InvalidInput(
-                str(given), "", "a pass archive, or the identity of one that is kept", "neither"
+                str(given), "", "a pass archive, or the identity or the pass of one that is kept", "neither"
             )
         return PassArchive(path, record.digest, {"pass_name": record.name}, record.frames)
     except (GroundError, LunarError) as error:

@@ -14,6 +14,7 @@ DERIVED = frozenset({"rollups", "parameter_samples", "stream_edges", *repository
 """Tables of an earlier revision that are not imported, because they are derived from the packets."""
 
 EARLIER_VALUES: dict[tuple[str, str], Any] = {
+    ("windows", "closed"): 0,
     ("users", "state"): "active",
     ("tokens", "hint"): "",
     ("regressions", "missions"): [],

@@ -256,7 +256,14 @@ def passes_of(total: int, asked: list[tuple[int, int]]) -> Callable[[httpx.Reque
         limit, offset = int(request.url.params["limit"]), int(request.url.params["offset"])
         asked.append((limit, offset))
         items = [
-            {"id": number, "name": "p", "start": "2029-08-07T00:00:00Z", "stop": "2029-08-07T01:00:00Z"}
+            {
+                "id": number,
+                "name": "p",
+                "spacecraft_id": 76,
+                "instance": "flight",
+                "start": "2029-08-07T00:00:00Z",
+                "stop": "2029-08-07T01:00:00Z",
+            }
             for number in range(offset, min(offset + limit, total))
         ]
         return httpx.Response(200, json={"items": items, "total": total, "limit": limit, "offset": offset})

@@ -27,12 +27,12 @@ VERBS = {
 }  # fmt: skip
 SUMMARY_VERBS = {
     "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "End",
-    "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Queue", "Refuse", "Register", "Reject", "Release",
-    "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
+    "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register", "Reject",
+    "Release", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
     "access", "alarms", "automation", "ephemerides", "exports", "jobs", "links", "missions", "passes", "planning",
-    "regression", "reports", "telecommands", "telemetry", "time",
+    "regression", "reports", "requests", "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
-from ground_service.ingest import service as ingesting
+from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -83,7 +83,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
         raise StorageFull("database")
 
     with monkeypatch.context() as disk:
-        disk.setattr(ingesting, "store_batch", no_space)
+        disk.setattr(ingest_store, "store_batch", no_space)
         with pytest.raises(StorageFull):
             run_job(ground, job)
     stopped = client.get(f"{V1}/jobs/{job}").json()

@@ -14,6 +14,7 @@ import pytest
 from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest import service as ingesting
+from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest, ingest_file
 from ground_service.ingest.stream import DownlinkReader
 from ground_service.store import files, repository
@@ -59,7 +60,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
         expected = hash_of(ground)
     stored: list[int] = []
     middle, go_on = threading.Event(), threading.Event()
-    original = ingesting.store_batch
+    original = ingest_store.store_batch
 
     def store(*given: Any) -> Any:
         result = original(*given)
@@ -70,7 +71,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
         return result
 
     with monkeypatch.context() as slow:
-        slow.setattr(ingesting, "store_batch", store)
+        slow.setattr(ingest_store, "store_batch", store)
         with open_ground(tmp_path / "stopped") as ground:
             dispatcher = ThreadDispatcher(ground)
             job, behind = enter(ground, downlink), enter(ground, downlink)
@@ -107,7 +108,7 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
         job = enter(ground, downlink)
         dispatcher = ThreadDispatcher(ground)
         with monkeypatch.context() as disk:
-            disk.setattr(ingesting, "store_batch", no_space)
+            disk.setattr(ingest_store, "store_batch", no_space)
             for _ in range(80):  # every 15 s for 20 minutes, as the service sweeps
                 dispatcher.resume()
                 dispatcher._pool.submit(int).result()
@@ -129,7 +130,9 @@ def test_a_job_is_done_once_the_disk_has_space(
         job = enter(ground, downlink)
         dispatcher = ThreadDispatcher(ground)
         with monkeypatch.context() as disk:
-            disk.setattr(ingesting, "store_batch", lambda *_: (_ for _ in ()).throw(StorageFull("database")))
+            disk.setattr(
+                ingest_store, "store_batch", lambda *_: (_ for _ in ()).throw(StorageFull("database"))
+            )
             dispatcher.resume()
             dispatcher._pool.submit(int).result()
         assert job_of(ground, job)["state"] == "queued"
