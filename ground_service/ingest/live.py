@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ground_service.errors import GroundError, InvalidInput, StoreError, storage_error
+from ground_service.errors import PASSING, GroundError, InvalidInput, StoreError, storage_error
 from ground_service.store.files import make_durable_folder, replace_durably
 from tmtc.downlink import decode
 from tmtc.errors import TmtcError
@@ -79,16 +79,20 @@ class Spool:
             self.seal()
 
     def keep(self, octets: bytes, *, durably: bool = False) -> None:
-        """Write octets to the current segment, and to the disk if that is required."""
+        """Write octets to the current segment, and to the disk if that is required; after an error none are kept."""
         try:
             if self._stream is None:
                 self._stream = self._current.open("ab", buffering=0)
+                self._size = os.fstat(self._stream.fileno()).st_size
             rest = memoryview(octets)
             while rest:
                 rest = rest[self._stream.write(rest) :]
             if durably:
                 os.fdatasync(self._stream.fileno())
         except OSError as error:
+            if self._stream is not None:
+                with contextlib.suppress(OSError):
+                    self._stream.truncate(self._size)
             raise storage_error(error, self.folder) from None
         self._size += len(octets)
 
@@ -115,11 +119,15 @@ class Spool:
         """End the current segment, for `drain`, which may run in another thread; return its file, None if empty."""
         if self._size == 0:
             return None
-        self._stream.close()
-        self._stream, self._size = None, 0
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
         sealed = self._sealed(self._next)
-        replace_durably(self._current, sealed)
-        self._next += 1
+        self._next += 1  # also after an error: the file may already have its new name
+        try:
+            replace_durably(self._current, sealed)
+        finally:
+            self._size = self._current.stat().st_size if self._current.exists() else 0
         return sealed
 
     def drain(self) -> None:
@@ -127,7 +135,7 @@ class Spool:
         for path in sorted(self.folder.glob("*.segment")):
             try:
                 self.report(path, self.ingest(path))
-            except (StoreError, OSError):
+            except (*PASSING, StoreError, OSError):
                 raise
             except GroundError as error:
                 self.report(path, error)
@@ -259,7 +267,7 @@ class WatchedFolder:
                 continue
             try:
                 self.report(path, self.ingest(path))
-            except (StoreError, OSError):
+            except (*PASSING, StoreError, OSError):
                 raise
             except GroundError as error:
                 self.report(path, error)

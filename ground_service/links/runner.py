@@ -15,10 +15,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from ground_service.clock import mission_now_ns
-from ground_service.errors import PASSING, GroundError, storage_error
+from ground_service.errors import PASSING, GroundError, StorageFull, StorageReadOnly, storage_error
 from ground_service.ground import Ground
 from ground_service.ingest.live import PAUSE_S, SEGMENT_OCTETS, Spool, WatchedFolder
 from ground_service.ingest.model import IngestResult
@@ -63,12 +63,16 @@ class LinkRunner:
         self._ground, self._owner = ground, owner
         self._name = declared.link.name
         self._stopping, self._work = threading.Event(), threading.Event()
+        self._cut_all = threading.Event()
         self._threads: list[threading.Thread] = []
         self._progress = _Progress()
         self._folder = ground.home / INCOMING / f"link-{self._name}"
         self._spool = Spool(self._folder, self._ingest, self._report)
         self._down = self._connector(declared.link.downlink)
         self._up = self._connector(declared.link.uplink)
+        self._lock: TextIO | None = None
+        self._opened = False
+        self._block: bytes | None = None
         self._contact: ContactRow | None = None
         self._shown: tuple[str, str | None] | None = None
         self._ingest_fault: str | None = None
@@ -97,7 +101,7 @@ class LinkRunner:
         """Operate the link in threads of this process, which has its lease."""
         runs = (self._operate, self._ingest_all)
         self._threads = [threading.Thread(target=run, name=f"link {self._name}", daemon=True) for run in runs]
-        for thread in self._threads:
+        for thread in reversed(self._threads):  # the first joins the second
             thread.start()
 
     def stop(self) -> None:
@@ -116,38 +120,48 @@ class LinkRunner:
     # Receiving, contacts and sending
 
     def _operate(self) -> None:
-        with self._spool_lock() as free:
-            while not self._stopping.is_set() and not free():
-                self._show("waiting", "another process holds the spool of the link")
-                self._stopping.wait(RETRY_S)
-                if not self._keep_lease():
-                    return
-            if self._stopping.is_set():
-                return
-            self._guarded(self._open)
+        try:
             while not self._stopping.is_set() and not self.lost:
-                self._guarded(self._step)
+                self._guarded(self._step if self._opened else self._open)
             with contextlib.suppress(GroundError, OSError):
+                if self._block is not None:
+                    self._keep(self._block)
                 self._cut()
+        finally:
+            # The ingest ends before another process can hold the spool: one process at a time removes segments.
+            self._cut_all.set()
+            self._work.set()
+            self._threads[1].join()
+            if self._lock is not None:
+                self._lock.close()
 
     def _guarded(self, work: Callable[[], None]) -> None:
         """Do one step; faults of the database or the disk are shown and the step is repeated later."""
         try:
             work()
         except PASSING as error:
-            self._shown = None
             log.warning("link %s: %s", self._name, error)
+            if isinstance(error, StorageFull | StorageReadOnly):
+                self._show_failed(error)
+            else:
+                self._shown = None
             self._stopping.wait(RETRY_S)
         except (GroundError, OSError) as error:
             log.warning("link %s: %s", self._name, error)
-            with contextlib.suppress(GroundError):
-                self._show("failed", str(error))
+            self._show_failed(error)
             self._stopping.wait(RETRY_S)
 
     def _open(self) -> None:
-        self._progress.received += self._spool.open()
+        if not self._keep_lease():
+            return
+        if not self._hold_spool():
+            self._show("waiting", "another process holds the spool of the link")
+            self._stopping.wait(RETRY_S)
+            return
+        self._progress.received = self._progress.ingested + self._spool.open()
         self._contact = service.find_open_contact(self._ground, self._name)
         self._progress.heard_utc_ns = mission_now_ns() if self._contact is not None else None
+        self._opened = True
         self._work.set()
 
     def _step(self) -> None:
@@ -165,15 +179,17 @@ class LinkRunner:
         if self._down is None:
             self._stopping.wait(TICK_S)
             return
-        if not self._down.connected:
-            self._acknowledged = 0
-        if not self._down.connect():
-            self._stopping.wait(TICK_S)
-            return
-        if self._progress.received - self._progress.ingested >= SPOOL_LIMIT_OCTETS:
-            self._stopping.wait(TICK_S)  # the flow control of TCP holds the station back
-            return
-        octets = self._down.receive(POLL_S)
+        if self._block is None:
+            if not self._down.connected:
+                self._acknowledged = 0
+            if not self._down.connect():
+                self._stopping.wait(TICK_S)
+                return
+            if self._progress.received - self._progress.ingested >= SPOOL_LIMIT_OCTETS:
+                self._stopping.wait(TICK_S)  # the flow control of TCP holds the station back
+                return
+            self._block = self._down.receive(POLL_S)
+        octets = self._block
         if octets is None:
             idle = self._progress.received - self._spool.size <= self._progress.ingested
             pause = time.monotonic() - self._last_block_s >= PAUSE_S or not self._down.connected
@@ -183,13 +199,18 @@ class LinkRunner:
             return
         self._last_block_s = time.monotonic()
         self._hear()
-        self._spool.keep(octets, durably=self.declared.link.acknowledge)
-        self._progress.received += len(octets)
+        self._keep(octets)
         if self.declared.link.acknowledge:
             self._acknowledged += len(octets)
             self._down.send(ACKNOWLEDGEMENT.pack(self._acknowledged))
         if self._spool.size >= SEGMENT_OCTETS:
             self._cut()
+
+    def _keep(self, octets: bytes) -> None:
+        """Write the received block to the spool; after an error it stays in `_block` for the next attempt."""
+        self._spool.keep(octets, durably=self.declared.link.acknowledge)
+        self._block = None
+        self._progress.received += len(octets)
 
     def _hear(self) -> None:
         """Note a reception now; after a silence it starts a new contact."""
@@ -305,19 +326,18 @@ class LinkRunner:
         while True:
             self._work.wait()
             self._work.clear()
+            over = self._cut_all.is_set()
             try:
-                self._spool.drain()
+                if self._lock is not None:  # without it another process removes the segments
+                    self._spool.drain()
                 self._ingest_fault = None
             except PASSING as error:
                 self._retry(error)
             except Exception as error:  # outermost loop of the thread: the segment stays in the spool
                 log.exception("link %s: ingest", self._name)
                 self._retry(error)
-            if self._stopping.is_set() and not self._threads[0].is_alive():
+            if over:
                 return
-            if self._stopping.is_set():
-                self._threads[0].join()
-                self._work.set()
 
     def _retry(self, error: Exception) -> None:
         self._ingest_fault = f"ingest waits: {error}"
@@ -388,29 +408,31 @@ class LinkRunner:
         if service.change_state(self._ground, self._name, self._owner, state, reason):
             self._shown = (state, reason)
 
+    def _show_failed(self, error: Exception) -> None:
+        with contextlib.suppress(GroundError):
+            self._show("failed", str(error))
+
     def _connector(self, address: str | None) -> Connector | None:
         if address is None or self.declared.link.kind != "tcp":
             return None
         return Connector(address_of(address), self.declared.link.reconnect)
 
-    @contextlib.contextmanager
-    def _spool_lock(self) -> Any:
-        """Hold the lock file of the spool; yields a function that takes it and returns whether it is held."""
+    def _hold_spool(self) -> bool:
+        """Take the lock file of the spool; return whether this process holds it."""
+        if self._lock is not None:
+            return True
         try:
             make_durable_folder(self._folder)
             file = (self._folder / "lock").open("a")
         except OSError as error:
             raise storage_error(error, self._folder) from None
-
-        def free() -> bool:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                return False
-            return True
-
-        with file:
-            yield free
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.close()
+            return False
+        self._lock = file
+        return True
 
 
 def _clock_offset_ns(made: IngestResult | None, heard_utc_ns: int | None) -> int | None:

@@ -34,6 +34,7 @@ from ground_service.missions.places import outages_of, station_of
 from ground_service.store.vehicles import get_vehicle, vehicle_id
 from lunar.ephemeris import Ephemeris
 from lunar.ephemeris_files import load_ephemeris
+from lunar.errors import LunarError
 
 ACTOR = "link"
 REPEAT_ATTEMPTS = 3
@@ -159,9 +160,12 @@ def predict(
         references = ephemerides.covering_ephemerides(connection, start_utc_ns, stop_utc_ns)
     if not references:
         return (), "no reference ephemeris covers the time"
-    ephemeris = _loaded(str(ground.files.path(references[0].sha256)))
     outages = outages_of(declared.stations)
-    return core.predict_contacts(ephemeris, [station], start_utc_ns, stop_utc_ns, outages), None
+    try:
+        ephemeris = _loaded(str(ground.files.path(references[0].sha256)))
+        return core.predict_contacts(ephemeris, [station], start_utc_ns, stop_utc_ns, outages), None
+    except LunarError as error:
+        return (), f"reference ephemeris {references[0].name}: {error}"
 
 
 def acquire(ground: Ground, declared: DeclaredLink, owner: str, lease_ns: int) -> bool:
@@ -241,7 +245,8 @@ def end_contact(ground: Ground, contact_id: int, name: str, stop_utc_ns: int) ->
         if found is None or found.id != contact_id:
             return
         stop = max(stop_utc_ns, found.start_utc_ns)
-        store.change_contact(connection, contact_id, state="ended", stop_utc_ns=stop)
+        if not store.end_contact(connection, contact_id, stop):
+            return
         publish(
             connection,
             ContactEnded(
@@ -379,10 +384,14 @@ def repeat_unconfirmed(ground: Ground, declared: DeclaredLink, contact: ContactR
             REPEAT_ATTEMPTS,
         )
         lost = [one for one in earlier if commanding.are_unreported(connection, one.telecommands)]
+    repeated = 0
     if lost:
         with ground.database.writing() as connection:
             for one in lost:
-                store.repeat_transmission(connection, one.id, declared.link.name)
+                name, seen = declared.link.name, one.transmitted_utc_ns
+                if not store.repeat_transmission(connection, one.id, name, seen=seen):
+                    continue
+                repeated += 1
                 audit(
                     connection,
                     ACTOR,
@@ -390,7 +399,7 @@ def repeat_unconfirmed(ground: Ground, declared: DeclaredLink, contact: ContactR
                     str(one.id),
                     {"telecommands": list(one.telecommands)},
                 )
-    return len(lost)
+    return repeated
 
 
 def _add_missed(
@@ -525,6 +534,6 @@ def _belongs(row: ContactRow, contact: PredictedContact) -> bool:
     return row.start_utc_ns <= contact.stop_utc_ns + MARGIN_NS and contact.start_utc_ns - MARGIN_NS <= stop
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=8)
 def _loaded(path: str) -> Ephemeris:
     return load_ephemeris(Path(path))

@@ -9,6 +9,7 @@ from sqlalchemy import Connection, RowMapping, func, or_, select, update
 
 from ground_service.links.model import ContactState, LinkState
 from ground_service.store import repository
+from ground_service.store.states import change_if
 
 _LINKS, _CONTACTS, _TRANSMISSIONS = repository.LINKS, repository.CONTACTS, repository.TRANSMISSIONS
 
@@ -175,9 +176,11 @@ def add_contact(connection: Connection, **columns: Any) -> int:
     return int(repository.add(connection, _CONTACTS, **columns))
 
 
-def change_contact(connection: Connection, contact_id: int, **values: Any) -> None:
-    """Change columns of a contact."""
-    connection.execute(update(_CONTACTS).where(_CONTACTS.c.id == contact_id).values(**values))
+def end_contact(connection: Connection, contact_id: int, stop_utc_ns: int) -> bool:
+    """End a contact if it is open; return whether this call ended it."""
+    return change_if(
+        connection, _CONTACTS, contact_id, {"state": "open"}, state="ended", stop_utc_ns=stop_utc_ns
+    )
 
 
 def count_in_contact(
@@ -243,13 +246,10 @@ def transmitted_before(
     return [_transmission(row) for row in connection.execute(query.order_by(_TRANSMISSIONS.c.id)).mappings()]
 
 
-def repeat_transmission(connection: Connection, transmission_id: int, link: str) -> None:
-    """Have a transmission sent again over a link."""
-    connection.execute(
-        update(_TRANSMISSIONS)
-        .where(_TRANSMISSIONS.c.id == transmission_id)
-        .values(transmitted_utc_ns=None, link=link)
-    )
+def repeat_transmission(connection: Connection, transmission_id: int, link: str, *, seen: int | None) -> bool:
+    """Have a transmission sent again over a link if its time is still `seen`; return whether this call did it."""
+    found = {"transmitted_utc_ns": seen}
+    return change_if(connection, _TRANSMISSIONS, transmission_id, found, transmitted_utc_ns=None, link=link)
 
 
 def note_transmitted(

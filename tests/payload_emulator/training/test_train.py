@@ -171,10 +171,10 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
         "from payload_emulator.training.model import train as t\n"
         "from payload_emulator.training.data.dataset import Dataset\n"
         "from payload_emulator.training.data.feeder import TrainParameters\n"
-        "save = t._save\n"
-        "def slow(path, *rest):\n"
-        "    save(path, *rest); print(path.name, flush=True); time.sleep(0.4)\n"
-        "t._save = slow\n"
+        "write = t._RunFiles._write\n"
+        "def slow(self, path, *rest):\n"
+        "    write(self, path, *rest); print(path.name, flush=True); time.sleep(0.4)\n"
+        "t._RunFiles._write = slow\n"
         f"p = TrainParameters(minutes=0.0, steps=5, batch=2, crop_px=96, warm_up_steps={SHORT.warm_up_steps},\n"
         f"    validation_frames={SHORT.validation_frames}, replicas=1, validate_every_minutes=0.0, detail_blocks=0)\n"
         "t.train([Dataset(Path(sys.argv[1]))], Path(sys.argv[2]), p)\n"
@@ -186,8 +186,8 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
         text=True,
     )
     assert process.stdout is not None
-    while process.stdout.readline().strip() != "checkpoint.pt":
-        pass
+    while (line := process.stdout.readline()).strip() != "checkpoint.pt":
+        assert line, "the run ended before it wrote a checkpoint"
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
