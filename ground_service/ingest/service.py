@@ -518,8 +518,12 @@ class _Reading:
         parts = [*before, edges.Part(self.piece.file_sha256, 0, self.piece.octets), *behind]
         octets = b"".join(self.ground.files.read(one.file_sha256, one.start, one.stop) for one in parts)
         try:
-            reaches, _ = reaches_of(as_octets(octets), DEFAULT_LINKS)
+            reaches, plan = reaches_of(as_octets(octets), DEFAULT_LINKS)
         except UnknownCoding:
+            return None
+        proposal = None if plan is None else plan.proposal
+        if not self.piece.stream and proposal and not any(one.packets for one in proposal.evidence[:1]):
+            # A piece that came twice has markers at a regular distance, which is no proof of a link.
             return None
         # octets that are adjacent only by order of arrival must not determine a link without proof
         link = reaches[0].link if reaches else None
