@@ -40,16 +40,19 @@ from ground_service.worker.upkeep import broken_limits
 log = logging.getLogger(__name__)
 
 
-_ONE_AT_A_TIME = threading.Lock()
 LOCK = 7604
-"""Lock of the database: one process at a time runs actions, so that no action runs twice."""
+"""Lock of the database for an event: one process at a time runs its actions, so that none runs twice."""
+
+_running: set[tuple[int, int]] = set()
+_changed = threading.Condition()
+"""Grounds and events whose actions run in this process, and the notification of changes of this set."""
 
 WAIT_S = 0.2
 
 
 def run_actions(ground: Ground, event: int, job_id: str) -> dict[str, Any]:
     """Run the actions of an event that are queued; return their numbers by state."""
-    with _alone(ground):
+    with _alone(ground, event):
         with ground.database.reading() as connection:
             actions = store.actions_of_event(connection, event)
         for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
@@ -63,16 +66,29 @@ def run_actions(ground: Ground, event: int, job_id: str) -> dict[str, Any]:
 
 
 @contextmanager
-def _alone(ground: Ground) -> Iterator[None]:
-    """Wait until no other thread or process runs actions, and keep others out."""
-    with _ONE_AT_A_TIME:
+def _alone(ground: Ground, event: int) -> Iterator[None]:
+    """Wait until no other thread or process runs actions of an event, and keep others out.
+
+    Actions cause later events only, whose actions may run inside: nobody waits for an earlier event.
+    """
+    mine = (id(ground), event)
+    with _changed:
+        while mine in _running:
+            ground.check_stopping()
+            _changed.wait(WAIT_S)
+        _running.add(mine)
+    try:
         while True:
-            with ground.database.alone(LOCK) as alone:
+            with ground.database.alone(LOCK << 40 | event) as alone:
                 if alone:
                     yield
                     return
             ground.check_stopping()
             time.sleep(WAIT_S)
+    finally:
+        with _changed:
+            _running.discard(mine)
+            _changed.notify_all()
 
 
 def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:
