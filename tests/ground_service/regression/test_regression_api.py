@@ -193,7 +193,7 @@ def test_commands_compare_and_analyse_builds_over_archives(
     assert [one["state"] for one in both["passes"]] == ["judged", "unusable"]
     assert both["verdict"] == "inconclusive"
     assert both["passes"][1]["detail"] == (
-        f"{unused}: expected a pass archive, or the identity of one that is kept, found neither"
+        f"{unused}: expected a pass archive, or the identity or the pass of one that is kept, found neither"
     )
     with open_ground(tmp_path / "home") as ground:
         jobs = list(local_client(ground, "ann").list_jobs())
