@@ -107,7 +107,7 @@ def _detections(packets: list[bytes], tick: int) -> np.ndarray:
     return np.column_stack([table.items["u_px"][mine], table.items["v_px"][mine]]).astype(float)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def rich_ground(rich_pass: RichPass, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
     """A service with the pass as pass 1; not to be altered."""
     with open_ground(tmp_path_factory.mktemp("exports") / "home") as ground:
