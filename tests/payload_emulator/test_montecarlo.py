@@ -98,7 +98,7 @@ def test_each_way_of_not_knowing_its_errors_is_named(fault: dict[str, Any], word
     assert len(judged.reasons) == 1 and words in judged.reasons[0]
 
 
-def test_errors_of_a_run_are_drawn_anew_for_each_seed(navigation_case: Any) -> None:
+def test_errors_of_a_run_differ_for_each_seed(navigation_case: Any) -> None:
     case = navigation_case(
         30,
         start_position_m=100.0,

@@ -131,7 +131,7 @@ def test_boots_are_accounted_apart():
     ]
 
 
-def test_a_counter_that_begins_anew_is_a_restart_and_no_gap():
+def test_a_counter_that_begins_again_is_a_restart_and_no_gap():
     counts = np.concatenate((np.arange(3000, 3100), np.arange(0, 50)))
     result = report(counts)
     assert (result.accounts[0].restarts, result.gaps, result.conflicts, result.duplicates) == (1, 0, 0, 0)

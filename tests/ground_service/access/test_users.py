@@ -331,7 +331,7 @@ def test_only_the_token_itself_is_accepted(ground: Ground) -> None:
     assert token_sha256("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def test_a_deployment_sets_role_and_token_anew_and_revokes_the_old_one(ground: Ground) -> None:
+def test_a_deployment_replaces_role_and_token_and_revokes_the_old_one(ground: Ground) -> None:
     old = add_user(ground, "ann", "viewer")
     assert ensure_user(ground, "ann", "operator", SECRET)
     assert (get_user(ground, "ann").role, token_valid(ground, old)) == ("operator", False)
