@@ -162,20 +162,7 @@ def _read_segment(reader: Lines) -> AttitudeSegment:
     line = reader.take()
     if line != "META_START":
         raise reader.error("META_START", repr(line[:60]))
-    comments: list[str] = []
-    meta: dict[str, str] = {}
-    while True:
-        comments += reader.comments()
-        if reader.peek() == "META_STOP":
-            reader.take()
-            break
-        key, value = reader.keyword(_META_KEYS)
-        if key in meta:
-            raise reader.error(f"{key} once", "it again")
-        meta[key] = value
-    missing = [key for key in _MANDATORY if key not in meta]
-    if missing:
-        raise reader.error(f"{missing[0]} before META_STOP", "none")
+    comments, meta, _ = reader.metadata(_META_KEYS, _MANDATORY)
     system = meta["TIME_SYSTEM"].upper()
     if system not in TIME_SYSTEMS:
         raise UnknownTimeSystemError(meta["TIME_SYSTEM"], TIME_SYSTEMS, reader.source)

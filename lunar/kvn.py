@@ -63,6 +63,27 @@ class Lines:
             raise self.error(f"a value of {key}", "nothing")
         return key, value
 
+    def metadata(
+        self, allowed: Iterable[str], mandatory: Iterable[str]
+    ) -> tuple[list[str], dict[str, str], dict[str, int]]:
+        """Return comments, values and line indices of the keywords up to META_STOP, which is passed."""
+        comments: list[str] = []
+        meta: dict[str, str] = {}
+        where: dict[str, int] = {}
+        while True:
+            comments += self.comments()
+            if self.peek() == "META_STOP":
+                self.take()
+                break
+            key, value = self.keyword(allowed)
+            if key in meta:
+                raise self.error(f"{key} once", "it again")
+            meta[key], where[key] = value, self.at - 1
+        for key in mandatory:
+            if key not in meta:
+                raise self.error(f"{key} before META_STOP", "none")
+        return comments, meta, where
+
     def epoch(self, value: str, time_system: str, at: int | None = None) -> int:
         """Return ``utc_ns`` of an epoch in a time system."""
         try:

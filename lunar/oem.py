@@ -150,7 +150,7 @@ def _read_segment(reader: Lines) -> EphemerisSegment:
     line = reader.take()
     if line != "META_START":
         raise reader.error("META_START", repr(line[:60]))
-    comments, meta, where = _read_metadata(reader)
+    comments, meta, where = reader.metadata(_META_KEYS, _MANDATORY)
     system = meta["TIME_SYSTEM"].upper()
     if system not in TIME_SYSTEMS:
         place = f"{reader.source}: line {reader.number(where['TIME_SYSTEM'])}"
@@ -194,26 +194,6 @@ def _read_segment(reader: Lines) -> EphemerisSegment:
         comments=tuple(comments),
         covariances=tuple(_read_covariances(reader, system, meta["REF_FRAME"])),
     )
-
-
-def _read_metadata(reader: Lines) -> tuple[list[str], dict[str, str], dict[str, int]]:
-    """Return comments, values and line indices of the keywords up to META_STOP."""
-    comments: list[str] = []
-    meta: dict[str, str] = {}
-    where: dict[str, int] = {}
-    while True:
-        comments += reader.comments()
-        if reader.peek() == "META_STOP":
-            reader.take()
-            break
-        key, value = reader.keyword(_META_KEYS)
-        if key in meta:
-            raise reader.error(f"{key} once", "it again")
-        meta[key], where[key] = value, reader.at - 1
-    missing = [key for key in _MANDATORY if key not in meta]
-    if missing:
-        raise reader.error(f"{missing[0]} before META_STOP", "none")
-    return comments, meta, where
 
 
 def _degree(reader: Lines, meta: dict[str, str], where: dict[str, int], method: str) -> int:

@@ -33,4 +33,6 @@ async def watch(
     sockets: Sockets = socket.app.state.sockets
     async with sockets.admitted(socket) as session:
         if session is not None:
-            await until_over(session, sockets.follow(session, after), until_gone(socket))
+            newest = await sockets.open(session)  # before `until_gone`, so that one task at a time receives
+            number = newest if after is None else after
+            await until_over(session, sockets.follow(session, number), until_gone(socket))

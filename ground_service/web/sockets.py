@@ -119,17 +119,17 @@ class Sockets:
                 del self._holders[holder]
             session.end(POLICY_VIOLATION)
 
-    async def follow(self, session: Session, after: int | None) -> None:
-        """Open a socket and send it events until cancelled: first messages after a number, then new messages.
-
-        Without a number, only messages after the opening of the socket are sent.
-        """
+    async def open(self, session: Session) -> int:
+        """Accept a socket, queue new events for it, and return the number of the newest event before them."""
         newest = await run_in_threadpool(last_number, self._ground.database)
         if not self._readers:
             self._number = newest
         self._readers.add(session)
         await session.accept()
-        number = newest if after is None else after
+        return newest
+
+    async def follow(self, session: Session, number: int) -> None:
+        """Send an open socket the events after a number, until cancelled."""
         known = self._number  # later messages are queued for the session
         at = number
         while at < known:

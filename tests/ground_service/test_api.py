@@ -1,5 +1,6 @@
 """The HTTP interface: operations, problem documents, authorisation, limits."""
 
+import asyncio
 import json
 import math
 import threading
@@ -412,6 +413,9 @@ def test_the_matrix_above_names_every_operation(client: TestClient) -> None:
 def test_what_happens_is_sent_live_and_can_be_caught_up_with(
     client: TestClient, make_pass: Callable[..., Any]
 ) -> None:
+    def payload_of(message: dict[str, Any]) -> tuple[int, str]:
+        return message["payload"]["id"], message["payload"]["state"]
+
     stream = (make_pass(frames=3, seed=9).folder / "downlink.cadu").read_bytes()
     other = threading.Thread(target=lambda: client.post(f"{V1}/telemetry", content=b"no downlink"))
     with client.websocket_connect(f"{V1}/live") as socket:
@@ -419,14 +423,48 @@ def test_what_happens_is_sent_live_and_can_be_caught_up_with(
         job = client.post(f"{V1}/telemetry", content=stream).json()["job_id"]
         other.join()
         messages = [socket.receive_json()]
-        while (messages[-1]["payload"]["id"], messages[-1]["payload"]["state"]) != (job, "done"):
+        while messages[-1]["kind"] != "job" or payload_of(messages[-1]) != (job, "done"):
             messages.append(socket.receive_json())
-    states = [m["payload"]["state"] for m in messages if m["payload"]["id"] == job]
+    jobs = [payload_of(message) for message in messages if message["kind"] == "job"]
+    states = [state for number, state in jobs if number == job]
     assert states == ["queued", "running", "done"]
     numbers = [m["sequence"] for m in messages]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     with client.websocket_connect(f"{V1}/live?after={numbers[0]}") as socket:
         assert [socket.receive_json() for _ in numbers[1:]] == messages[1:]
+
+
+def test_a_socket_opens_whose_server_announces_the_client_late(client: TestClient) -> None:
+    """The first message of a socket may come after its handler started; nothing else may take it."""
+    scope: dict[str, Any] = {
+        "type": "websocket",
+        "scheme": "ws",
+        "path": f"{V1}/live",
+        "raw_path": f"{V1}/live".encode(),
+        "root_path": "",
+        "query_string": b"",
+        "headers": [(b"host", b"testserver")],
+        "subprotocols": [],
+        "client": ("testclient", 50000),
+        "server": ("testserver", 80),
+        "extensions": {},
+    }
+
+    async def opened() -> dict[str, Any]:
+        arriving: asyncio.Queue[Any] = asyncio.Queue()
+        sent: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        handler = asyncio.ensure_future(client.app(scope, arriving.get, sent.put))  # type: ignore[arg-type]
+        await asyncio.sleep(0.5)
+        await arriving.put({"type": "websocket.connect"})
+        try:
+            return await asyncio.wait_for(sent.get(), 20)
+        finally:
+            await arriving.put({"type": "websocket.disconnect", "code": 1000})
+            handler.cancel()
+            await asyncio.wait([handler])
+
+    assert client.portal is not None
+    assert client.portal.call(opened)["type"] == "websocket.accept"
 
 
 def test_watching_needs_a_token_where_there_are_users(guarded: tuple[TestClient, dict[str, str]]) -> None:
