@@ -1,4 +1,4 @@
-"""Renderers: python -m benchmarks render [--poses N] [--every K] [--terrain procedural|real].
+"""Renderers: python -m benchmarks render, or python -m benchmarks.render [--poses N] [--every K] [--terrain KIND].
 
 One JSON object, on the procedural Moon and, where LINNA_DATA names it, on GLD100 terrain no detector was trained on.
 
