@@ -12,6 +12,7 @@ from payload_emulator.flight.vision.detections import Detections, states
 from payload_emulator.flight.vision.detector import (
     DetectorParameters,
     OnnxDetector,
+    _tile_starts,
     decode,
     decode_classes,
     drop_duplicates,
@@ -107,6 +108,14 @@ def test_images_of_any_size_are_searched_in_tiles(detector):
     small_quality, small = detector.examine_any_size(tile[:200, :300])
     assert small_quality is ImageQuality.OK
     assert (small.u_px < 300).all() and (small.v_px < 200).all()
+
+
+def test_tiles_cover_every_pixel_and_overlap_by_half_a_tile():
+    for length in (1, 511, 512, 513, 768, 769, 1300, 4000):
+        starts = _tile_starts(length)
+        assert starts[0] == 0
+        assert starts[-1] == max(length - 512, 0)
+        assert (np.diff(starts) <= 256).all()
 
 
 def test_the_same_frame_gives_the_same_octets(detector):

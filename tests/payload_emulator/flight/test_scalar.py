@@ -49,7 +49,7 @@ def test_the_gate_refuses_beyond_its_limit_and_leaves_the_state() -> None:
     assert inside is not None and inside[1].used
     assert outside is not None and not outside[1].used
     np.testing.assert_array_equal(outside[0].mean, np.zeros(SIZE))
-    assert outside[1].residual == -15.1
+    assert outside[1] == Innovation(-15.1, 5.0, used=False)
 
 
 def test_the_gate_uses_one_measurement_and_the_weight_the_correlation() -> None:

@@ -354,13 +354,14 @@ def test_a_table_is_uplinked_in_parts_in_any_order_and_used_after_resets(moon: A
 
 def test_a_damaged_or_unknown_table_is_refused_and_the_old_one_stays(moon: Any, rig: Any) -> None:
     octets = pack_anchor_table([moon.ticks_at(s) for s in (0.0, 30.0, 60.0)], moon.orbit([0.0, 30.0, 60.0]))
-    for table, content, reason in (
-        (1, octets[:-1] + b"\0", "table_corrupt"),
-        (6, b"x", "value_out_of_range"),
+    for table, content, reason, events in (
+        (1, octets[:-1] + b"\0", "table_corrupt", 1),
+        (6, b"x", "value_out_of_range", 0),
     ):
         (name, values), *_ = split(content, transaction=table, table=table, part_length=4096, link="uplink")
         packets = rig.step(rig.command(name, **values))
         assert rig.refusals(packets) == [reason]
+        assert rig.events(packets).count("table_refused") == events
     assert rig.board.read_table(1) == b""
 
 
