@@ -1,6 +1,15 @@
 # The ground service and the command line; the same image serves, works and migrates.
 # Another base (one pinned by its digest, or from a mirror) can be given: --build-arg PYTHON_IMAGE=...@sha256:...
 ARG PYTHON_IMAGE=python:3.11.14-slim-bookworm
+ARG NODE_IMAGE=node:20.19.5-bookworm-slim
+
+# Telemetry displays: one package without dependencies, by version and checksum; its source maps are not served.
+FROM ${NODE_IMAGE} AS displays
+WORKDIR /displays
+COPY deploy/openmct/package.json deploy/openmct/package-lock.json ./
+RUN npm ci --ignore-scripts --no-audit --no-fund \
+    && mkdir openmct && cp -r node_modules/openmct/dist node_modules/openmct/package.json node_modules/openmct/LICENSE.md openmct \
+    && find openmct -name '*.map' -delete
 
 FROM ${PYTHON_IMAGE} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
@@ -25,12 +34,14 @@ LABEL org.opencontainers.image.title="linna" org.opencontainers.image.licenses="
 RUN groupadd --gid 10001 linna && useradd --uid 10001 --gid linna --create-home linna \
     && mkdir /var/lib/linna /exchange && chown linna:linna /var/lib/linna /exchange && chmod 2770 /exchange
 COPY --from=build /opt/linna /opt/linna
+COPY --from=displays /displays/openmct /opt/linna/share/openmct
 ENV PATH=/opt/linna/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     MPLBACKEND=Agg \
     MPLCONFIGDIR=/tmp/matplotlib \
     NUMBA_CACHE_DIR=/var/lib/linna/.numba \
-    LINNA_HOME=/var/lib/linna
+    LINNA_HOME=/var/lib/linna \
+    LINNA_OPENMCT=/opt/linna/share/openmct
 USER 10001:10001
 WORKDIR /var/lib/linna
 VOLUME /var/lib/linna

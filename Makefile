@@ -18,7 +18,7 @@ DEMO_OUT    ?= linna-demo
 SAMPLE ?= 60
 SEED   ?= 1
 
-.PHONY: demo test check docs sbom package bench mutation up install install-dev clean
+.PHONY: demo test check openmct docs sbom package bench mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -36,6 +36,13 @@ check: $(VENV)/.dev
 # The documentation site; `linna serve` shows it at /help.
 docs: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+# Telemetry displays; `linna serve` shows them at /mct. The lock file states version and checksum.
+openmct: deploy/openmct/node_modules/.package-lock.json
+
+deploy/openmct/node_modules/.package-lock.json: deploy/openmct/package.json deploy/openmct/package-lock.json
+	npm ci --prefix deploy/openmct --ignore-scripts --no-audit --no-fund
+	touch $@
 
 # Software bill of materials of the runtime, CycloneDX.
 sbom: $(VENV)/.dev
@@ -84,4 +91,4 @@ $(VENV)/.mutation: requirements/mutation.txt $(VENV)/.dev
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info linna-demo
+	rm -rf $(VENV) build dist *.egg-info linna-demo deploy/openmct/node_modules

@@ -28,6 +28,7 @@ from ground_service.links.supervisor import LinkSupervisor
 from ground_service.planning.standing import needs_plan
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings
+from ground_service.web.displays import FOLDER, displays
 from ground_service.web.documentation import documentation
 from ground_service.web.live import live
 from ground_service.web.pages import pages
@@ -120,8 +121,9 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     )
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.live_console = settings.resolved_live_console()
+    app.state.openmct = settings.openmct or FOLDER
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    routers = (*(one.load() for one in OPERATIONS), operations, pages, documentation)
+    routers = (*(one.load() for one in OPERATIONS), operations, pages, displays, documentation)
     for one in (*routers, live, payload_console):
         app.include_router(one)
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]

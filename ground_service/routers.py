@@ -41,6 +41,7 @@ OPERATIONS = (
     Router("ground_service.planning.request_routes", "requests", "requests"),
     Router("ground_service.commanding.routes", "telecommands", "telecommands"),
     Router("ground_service.alarms.routes", "alarms", "alarms"),
+    Router("ground_service.displays.routes", "displays", "displays"),
     Router("ground_service.automation.routes", "automation", "automation"),
     Router("ground_service.regression.routes", "regressions", "regressions"),
     Router("ground_service.access.routes", "access", "users"),

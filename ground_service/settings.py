@@ -71,6 +71,11 @@ class Settings(BaseSettings):
         pattern=r"^[A-Za-z0-9.:-]+:[0-9]{1,5}$",
         description="HOST:PORT of the console of a payload flown live, for the live page",
     )
+    openmct: Path | None = Field(
+        default=None,
+        description="Folder of the npm package openmct for the telemetry displays at /mct; "
+        "default: the one that `make openmct` installs",
+    )
     links: bool = Field(
         default=True,
         description="Operate the links of mission descriptions in `linna serve`; false where `linna link run` does",

@@ -182,6 +182,16 @@ class Event(Entity):
     correlation_id: CorrelationId
 
 
+class Image(Entity):
+    """An image of the payload: a downlinked thumbnail, or a full frame from a pass archive."""
+
+    frame_number: int
+    time: UtcTime
+    source: Literal["thumbnail", "archive"]
+    pass_id: int | None = Field(description="Pass of the archive; null for a thumbnail")
+    address: str = Field(description="Address of the image as PNG", examples=["/api/v1/passes/1/images/12"])
+
+
 class Trend(Entity):
     """Statistics, slope and limit state of a housekeeping parameter over an interval."""
 

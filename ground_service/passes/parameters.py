@@ -16,10 +16,11 @@ from ground_service.missions import store as missions
 from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
 from ground_service.passes import store
 from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
-from ground_service.passes.series import PARAMETERS, KindSamples, SampleSource
+from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, SampleSource
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store import parameters as declared_values
 from ground_service.store import rollups
+from ground_service.store.vehicles import find_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
@@ -40,6 +41,14 @@ INSTRUMENT_FIELDS = {
     if field.size == 1
 }
 """Packet and field of the parameters of optional instruments, by their names in addresses."""
+
+STATE_PACKET = "navigation_state"
+STATE_PARAMETERS = {
+    f"{STATE_PACKET}.{estimator}.{value}": (code, value)
+    for code, estimator in DICTIONARY.labels(STATE_PACKET, "estimator").items()
+    for value in STATE_VALUES
+}
+"""Code of the estimator and value of the parameters of on-board estimators, by their names in addresses."""
 
 LABELS_LIMIT = 256
 """Largest number of codes of one name that are listed."""
@@ -202,12 +211,46 @@ def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
     )
 
 
+def spacecraft_parameters(ground: Ground, spacecraft_id: int, instance: str) -> list[ParameterInfo]:
+    """Return the parameters of a spacecraft with series, those of its mission description last.
+
+    Raises
+    ------
+    NotFound
+        There is no such spacecraft.
+    """
+    with ground.database.reading() as connection:
+        found = declared_reading(connection, find_vehicle(connection, spacecraft_id, instance).id)
+    declared = () if found is None else found.parameters.values()
+    return [*own_parameters(), *(one.info for one in declared)]
+
+
+def state_unit(value: str) -> str:
+    """Return the unit of a value of an on-board estimator."""
+    units = {field.name: field.unit for field in DICTIONARY.packet(STATE_PACKET).fields}
+    return units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else "")
+
+
 def own_parameters() -> tuple[ParameterInfo, ...]:
-    """Return the parameters of our housekeeping and of the optional instruments."""
+    """Return the parameters of our housekeeping, of the on-board estimators and of the optional instruments."""
     fields = DICTIONARY.packet(OWN_PACKET).fields
     return (
         *(_own_info(field.name, OWN_PACKET, field) for field in fields if field.name in PARAMETERS),
+        *(_state_info(name, value) for name, (_, value) in STATE_PARAMETERS.items()),
         *(_own_info(name, packet, field) for name, (packet, field) in INSTRUMENT_FIELDS.items()),
+    )
+
+
+def _state_info(name: str, value: str) -> ParameterInfo:
+    return ParameterInfo(
+        name=name,
+        packet=STATE_PACKET,
+        source="dictionary",
+        description=f"{value} of the estimator {name.split('.')[1]}",
+        unit=state_unit(value),
+        labels={},
+        warning=None,
+        alarm=None,
     )
 
 
@@ -273,6 +316,10 @@ def series_source(
     if parameter in PARAMETERS:
         unit = DICTIONARY.packet(OWN_PACKET).field(parameter).unit
         return KindSamples(OWN_PACKET, span.dictionary_version), span, parameter, unit
+    if parameter in STATE_PARAMETERS:
+        code, value = STATE_PARAMETERS[parameter]
+        source = KindSamples("navigation_states", span.dictionary_version, code)
+        return source, span, value, state_unit(value)
     if parameter in INSTRUMENT_FIELDS:
         packet, field = INSTRUMENT_FIELDS[parameter]
         return InstrumentSamples(packet, field.name, span.dictionary_version), span, parameter, field.unit
@@ -281,8 +328,8 @@ def series_source(
     if found is None or one is None:
         raise NotFound("parameter", parameter[:80])
     number = one.declared.numbers[one.container]
-    source = DeclaredSamples(found.decoding.definition_id, number, {parameter: one.index})
-    return source, span_of(span, one.declared), parameter, one.value.type.unit
+    declared = DeclaredSamples(found.decoding.definition_id, number, {parameter: one.index})
+    return declared, span_of(span, one.declared), parameter, one.value.type.unit
 
 
 def span_of(span: PassSpan, declared: DeclaredPackets) -> PassSpan:

@@ -28,14 +28,16 @@ from ground_service.http.times import GivenTime
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import get_job
+from ground_service.passes import images, parameters, service
 from ground_service.passes import live as newest
-from ground_service.passes import parameters, service
 from ground_service.passes.model import (
     Completeness,
     Detection,
     Event,
     ExportFormat,
+    Image,
     LiveParameter,
+    ParameterInfo,
     ParameterSeries,
     PassDefinition,
     PassDetail,
@@ -237,6 +239,54 @@ def get_trend(
 def list_spacecraft(ground: GroundOf, _: Viewer) -> PageOf[SpacecraftInstance]:
     """List the spacecraft, flown ones first."""
     return PageOf.all_of(newest.list_spacecraft(ground))
+
+
+@passes.get("/spacecraft/{spacecraft_id}/parameters")
+def list_spacecraft_parameters(
+    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> PageOf[ParameterInfo]:
+    """List the parameters of a spacecraft with series."""
+    return PageOf.all_of(parameters.spacecraft_parameters(ground, spacecraft_id, instance))
+
+
+PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}}}
+
+
+@passes.get("/spacecraft/{spacecraft_id}/images")
+def list_images(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: SpacecraftId,
+    start: GivenTime,
+    stop: GivenTime,
+    instance: Instance = FLOWN,
+) -> PageOf[Image]:
+    """List the images of an interval: downlinked thumbnails, and frames of pass archives; at most 2000."""
+    return PageOf.all_of(images.list_images(ground, spacecraft_id, instance, start.utc_ns, stop.utc_ns))
+
+
+@passes.get("/spacecraft/{spacecraft_id}/thumbnails/{ticks}", response_class=Response, responses=PNG)
+def get_thumbnail(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: SpacecraftId,
+    ticks: Annotated[int, Path(ge=0, lt=1 << 48, description="On-board time of the frame, 2^-16 s")],
+    instance: Instance = FLOWN,
+) -> Response:
+    """Return a downlinked thumbnail as PNG."""
+    octets = images.thumbnail_image(ground, spacecraft_id, instance, ticks)
+    return Response(octets, media_type="image/png")
+
+
+@passes.get("/passes/{pass_id}/images/{frame_number}", response_class=Response, responses=PNG)
+def get_image(
+    ground: GroundOf,
+    _: Viewer,
+    pass_id: PassId,
+    frame_number: Annotated[int, Path(ge=0, lt=1 << 32)],
+) -> Response:
+    """Return a frame of a pass archive as PNG."""
+    return Response(images.archived_image(ground, pass_id, frame_number), media_type="image/png")
 
 
 @passes.get("/parameters", responses=problems(404))

@@ -27,7 +27,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.passes.packet_accounting import packet_accounting
-from ground_service.passes.parameters import series_source
+from ground_service.passes.parameters import series_source, state_unit
 from ground_service.passes.series import (
     PARAMETERS,
     STATE_VALUES,
@@ -36,7 +36,7 @@ from ground_service.passes.series import (
     SeriesReading,
     series_document,
 )
-from ground_service.passes.span import PassSpan, pass_span
+from ground_service.passes.span import LAST_TICKS, PassSpan, pass_span, vehicle_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
 from ground_service.passes.trends import trend_of
 from ground_service.store import rollups
@@ -44,12 +44,10 @@ from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
-from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
 from reports.values import PacketAccounting, PassEvent
 from tmtc.dictionary import DICTIONARY
 
-LAST_TICKS = (1 << 48) - 1
 TREND_DAYS = 30
 TREND_POINTS = 60
 
@@ -228,16 +226,10 @@ def _state_series(
     codes = {name: code for code, name in DICTIONARY.labels("navigation_state", "estimator").items()}
     if estimator not in codes:
         raise NotFound("estimator", estimator[:80])
-    units = {field.name: field.unit for field in DICTIONARY.packet("navigation_state").fields}
     span = pass_span(connection, record)
     source = KindSamples("navigation_states", span.dictionary_version, codes[estimator])
     reading = SeriesReading(connection, span, source, max_points)
-    found = reading.series(
-        {
-            value: units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else "")
-            for value in values
-        }
-    )
+    found = reading.series({value: state_unit(value) for value in values})
     by_name = {one.name: one for one in found}
     return [by_name[value] for value in values]
 
@@ -283,14 +275,7 @@ def trend_series(
     """The series of one parameter of a spacecraft over any span, all there is by default."""
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id
-        correlations = load_correlations(connection, vehicle)
-        span = PassSpan(
-            vehicle,
-            0 if start_utc_ns is None else ticks_of_utc_ns(start_utc_ns, correlations),
-            LAST_TICKS if stop_utc_ns is None else ticks_of_utc_ns(stop_utc_ns, correlations),
-            correlations,
-            readable_version(connection, vehicle),
-        )
+        span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns)
         return _parameter_series(connection, span, parameter, max_points)
 
 

@@ -34,6 +34,23 @@ PASS_MARGIN_NS = 60_000_000_000
 """Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""
 
 
+LAST_TICKS = (1 << 48) - 1
+
+
+def vehicle_span(
+    connection: Connection, vehicle: int, start_utc_ns: int | None, stop_utc_ns: int | None
+) -> PassSpan:
+    """Return an interval of a vehicle's on-board time; None: without an end."""
+    correlations = load_correlations(connection, vehicle)
+    return PassSpan(
+        vehicle,
+        0 if start_utc_ns is None else ticks_of_utc_ns(start_utc_ns, correlations),
+        LAST_TICKS if stop_utc_ns is None else ticks_of_utc_ns(stop_utc_ns, correlations),
+        correlations,
+        readable_version(connection, vehicle),
+    )
+
+
 def pass_span(connection: Connection, record: PassRecord) -> PassSpan:
     """The stretch of on-board time of a pass, a margin included."""
     correlations = load_correlations(connection, record.vehicle_id)

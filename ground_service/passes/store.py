@@ -175,6 +175,20 @@ def frame_files(connection: Connection, pass_id: int) -> dict[int, str]:
     return {int(number): sha256 for number, sha256 in rows}
 
 
+def passes_with_images(
+    connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int
+) -> list[PassRecord]:
+    """Return the passes of a vehicle with archived images that overlap an interval, oldest first."""
+    query = select(_PASSES).where(
+        _PASSES.c.vehicle_id == vehicle,
+        _PASSES.c.start_utc_ns <= stop_utc_ns,
+        _PASSES.c.stop_utc_ns >= start_utc_ns,
+        _PASSES.c.id.in_(select(_FRAMES.c.pass_id)),
+    )
+    rows = connection.execute(query.order_by(_PASSES.c.start_utc_ns, _PASSES.c.id)).mappings()
+    return [PassRecord.of(row) for row in rows]
+
+
 def archive_state(connection: Connection) -> Hashable:
     """Return a value that differs after new packets, ingests, decodings or correlations.
 

@@ -730,6 +730,23 @@ ALARM_POSITIONS = Table(
 """Last packet of a vehicle that has been examined for alarms."""
 
 
+DISPLAY_OBJECTS = Table(
+    "display_objects",
+    METADATA,
+    key("key", String(64)),
+    column("name", Text),
+    column("type", Text),
+    column("version", Integer),
+    column("document", Text),
+    column("octets", Integer),
+    column("created_by", String(64)),
+    column("created_utc_ns", BigInteger),
+    column("changed_by", String(64)),
+    column("changed_utc_ns", BigInteger),
+)
+"""Object of the telemetry displays as JSON; `version` counts its changes."""
+
+
 EVENT_POSITIONS = Table(
     "event_positions",
     METADATA,

@@ -59,12 +59,16 @@ class Page:
     section: str = ""
 
 
+DISPLAYS = Page("/mct", "mct", "Telemetry displays", "Displays")
+"""Page that `web.displays` serves."""
+
 PAGES = (
     Page("/", "overview", "Overview", "Overview"),
     Page("/planner", "planner", "Planner", "Planner"),
     Page("/passes", "passes", "Passes", "Passes"),
     Page("/passes/{pass_id}", "pass", "Pass", "", "passes"),
     Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
+    DISPLAYS,
     Page("/alarms", "alarms", "Alarms", "Alarms"),
     Page("/commands", "commands", "Commands", "Commands"),
     Page("/regression", "regression", "Regression", "Regression"),
@@ -82,17 +86,21 @@ pages = APIRouter(include_in_schema=False)
 
 def _page_answer(page: Page) -> Any:
     def answer() -> Response:
-        return Response(
-            _rendered(page),
-            media_type="text/html; charset=utf-8",
-            headers={"Content-Security-Policy": POLICY},
-        )
+        return page_response(rendered(page))
 
     return answer
 
 
+def page_response(body: str, policy: str = POLICY) -> Response:
+    """Return a page with its content security policy."""
+    return Response(body, media_type="text/html; charset=utf-8", headers={"Content-Security-Policy": policy})
+
+
 for _page in PAGES:
-    pages.add_api_route(_page.path, _page_answer(_page), methods=["GET", "HEAD"], name=f"page {_page.name}")
+    if _page is not DISPLAYS:
+        pages.add_api_route(
+            _page.path, _page_answer(_page), methods=["GET", "HEAD"], name=f"page {_page.name}"
+        )
 
 
 @pages.get("/static/{path:path}")
@@ -172,8 +180,9 @@ def _version() -> str:
     return whole.hexdigest()[:12]
 
 
-@lru_cache(maxsize=len(PAGES))
-def _rendered(page: Page) -> str:
+@lru_cache(maxsize=len(PAGES) + 1)
+def rendered(page: Page, template: str = "", openmct: str = "") -> str:
+    """Return the HTML of a page, by default with the template of its name; `openmct` is a version of Open MCT."""
     environment = Environment(
         loader=FileSystemLoader(_HERE / "templates"),
         autoescape=select_autoescape(default=True, default_for_string=True),
@@ -181,8 +190,9 @@ def _rendered(page: Page) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(f"{page.name}.html").render(
+    return environment.get_template(f"{template or page.name}.html").render(
         page=page,
+        openmct=openmct,
         pages=[one for one in PAGES if one.entry],
         version=_version(),
         dictionary=_dictionary(),

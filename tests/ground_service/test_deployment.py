@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -60,10 +61,32 @@ def test_nothing_starts_before_what_it_needs() -> None:
 def test_images_are_exact_versions() -> None:
     for name in ("db", "broker"):
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
-    given = default_of(SERVICES["api"]["build"]["args"]["PYTHON_IMAGE"])
-    (written,) = re.findall(r"^ARG PYTHON_IMAGE=(\S+)$", DOCKERFILE, re.MULTILINE)
-    assert given == written and EXACT.fullmatch(written)
-    assert set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) == {"${PYTHON_IMAGE}"}
+    for name in ("PYTHON_IMAGE", "NODE_IMAGE"):
+        given = default_of(SERVICES["api"]["build"]["args"][name])
+        (written,) = re.findall(rf"^ARG {name}=(\S+)$", DOCKERFILE, re.MULTILINE)
+        assert given == written and EXACT.fullmatch(written)
+    assert set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
+
+
+def test_the_image_holds_the_displays_and_no_source_maps() -> None:
+    stage = DOCKERFILE.split("\nFROM ${NODE_IMAGE} AS displays\n")[1].split("\nFROM ")[0]
+    assert "npm ci --ignore-scripts" in stage and "find openmct -name '*.map' -delete" in stage
+    last = DOCKERFILE.split("\nFROM ")[-1]
+    (folder,) = re.findall(r"^COPY --from=displays /displays/openmct (\S+)$", last, re.MULTILINE)
+    assert f"LINNA_OPENMCT={folder}" in last
+
+
+def test_the_lock_file_of_the_displays_names_the_public_registry_and_checksums() -> None:
+    lock = json.loads((ROOT / "deploy/openmct/package-lock.json").read_text())
+    wanted = json.loads((ROOT / "deploy/openmct/package.json").read_text())["dependencies"]
+    found = {name: one for name, one in lock["packages"].items() if name}
+    assert {f"node_modules/{name}": version for name, version in wanted.items()} == {
+        name: one["version"] for name, one in found.items()
+    }
+    for one in found.values():
+        assert one["resolved"].startswith("https://registry.npmjs.org/") and one["integrity"].startswith(
+            "sha512-"
+        )
 
 
 def test_only_the_interface_is_reached_from_outside_and_from_this_machine_alone() -> None:

@@ -31,8 +31,8 @@ SUMMARY_VERBS = {
     "Release", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
-    "access", "alarms", "automation", "ephemerides", "exports", "jobs", "links", "missions", "passes", "planning",
-    "regression", "reports", "requests", "telecommands", "telemetry", "time",
+    "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "links", "missions", "passes",
+    "planning", "regression", "reports", "requests", "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 

@@ -509,6 +509,20 @@ def upgrade() -> None:
     )
     op.create_index("ix_alarms_newest", "alarms", ["open", "last_ticks"])
     op.create_table(
+        "display_objects",
+        sa.Column("key", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("type", sa.Text(), nullable=False),
+        sa.Column("version", sa.Integer(), nullable=False),
+        sa.Column("document", sa.Text(), nullable=False),
+        sa.Column("octets", sa.Integer(), nullable=False),
+        sa.Column("created_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("changed_by", sa.String(length=64), nullable=False),
+        sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("key", name=op.f("pk_display_objects")),
+    )
+    op.create_table(
         "alarm_changes",
         sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
         sa.Column("alarm_id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
@@ -937,6 +951,7 @@ def downgrade() -> None:
     op.drop_table("known_links")
     op.drop_table("good_links")
     op.drop_table("alarm_positions")
+    op.drop_table("display_objects")
     op.drop_table("alarm_changes")
     op.drop_table("alarms")
     op.drop_table("pieces")

@@ -9,12 +9,13 @@ export class Problem extends Error {
   }
 }
 
-export async function request(path, { method = "GET", json, body, headers = {} } = {}) {
+export async function request(path, { method = "GET", json, body, headers = {}, signal } = {}) {
   const sent = { ...headers };
   if (json !== undefined) sent["Content-Type"] = "application/json";
   const answer = await fetch(path.startsWith("/") ? path : `${PREFIX}/${path}`, {
     method,
     headers: sent,
+    signal,
     body: json === undefined ? body : JSON.stringify(json),
   });
   if (answer.ok) return answer;
@@ -23,13 +24,13 @@ export async function request(path, { method = "GET", json, body, headers = {} }
   throw new Problem(answer.status, document);
 }
 
-export async function get(path, query = {}) {
+export async function get(path, query = {}, options = {}) {
   const words = new URLSearchParams();
   for (const [name, value] of Object.entries(query)) {
     for (const one of [value].flat()) if (one !== undefined && one !== null) words.append(name, one);
   }
   const text = words.toString();
-  return (await request(text ? `${path}?${text}` : path)).json();
+  return (await request(text ? `${path}?${text}` : path, options)).json();
 }
 
 export async function send(method, path, json, headers) {

@@ -1,5 +1,8 @@
 // What every page shares: elements, tables, notices, sign-in, clock.
 import { follow, get, send } from "./api.js";
+import { parameterName, unitText } from "./units.js";
+
+export { parameterName, unitText };
 
 export const dictionary = JSON.parse(document.getElementById("dictionary").textContent);
 
@@ -100,10 +103,6 @@ export function figure(value, digits = 3) {
   return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", " ") : String(+value.toPrecision(digits));
 }
 
-// Names of parameters end in their unit, which stands beside them anyway: "bus voltage, V" for bus_voltage_v.
-const UNIT_SUFFIX = { degC: "_c", V: "_v", W: "_w", KiB: "_kib", permille: "_permille", deg: "_deg", m: "_m" };
-export const parameterName = (name, unit) => (unit in UNIT_SUFFIX && name.endsWith(UNIT_SUFFIX[unit]) ? name.slice(0, -UNIT_SUFFIX[unit].length) : name).replaceAll("_", " ");
-
 // Options of a list of parameters, in groups by packet.
 export function parameterOptions(parameters) {
   const option = (one) => element("option", { value: one.name }, parameterName(one.name, one.unit));
@@ -115,7 +114,6 @@ export function limitText([least, greatest]) {
   if (least === null) return `above ${greatest}`;
   return greatest === null ? `below ${least}` : `outside ${least} to ${greatest}`;
 }
-export const unitText = (unit) => ({ degC: "°C", deg: "°", permille: "‰" })[unit] ?? unit;
 
 export const stateMark = (state) => element("span", { class: `state ${state}` }, state);
 

@@ -1,22 +1,19 @@
 """Products in large data: image thumbnails and the map of landmarks that were used.
 
-Thumbnail: frame number (u32), on-board time (u64), rows (u16), columns (u16), zlib-compressed gray levels (u8, row by
-row). Landmark map: for every crater, by identity: identity (u32), frames that used it (u16). Big-endian.
+Thumbnail: see `tmtc.thumbnails`. Landmark map: for every crater, by identity: identity (u32), frames that used it
+(u16). Big-endian.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import OctetArray
+from tmtc.thumbnails import Thumbnail, pack_thumbnail
 
-_THUMBNAIL = struct.Struct(">IQHH")
 _LANDMARK = np.dtype([("crater_id", ">u4"), ("frames", ">u2")])
 
 
@@ -33,15 +30,7 @@ def thumbnail_octets(image: NDArray[Any], factor: int, frame_number: int, ticks:
     levels = (
         np.nan_to_num(squares.mean(axis=(1, 3)) * (255.0 / full)) if squares.size else squares[:, 0, :, 0]
     )
-    octets = np.clip(np.rint(levels), 0, 255).astype(np.uint8).tobytes()
-    return _THUMBNAIL.pack(frame_number & 0xFFFFFFFF, ticks, rows, columns) + zlib.compress(octets, 9)
-
-
-def unpack_thumbnail(octets: bytes) -> tuple[int, int, OctetArray]:
-    """(frame number, on-board time, gray levels (rows, columns)) of a thumbnail."""
-    frame_number, ticks, rows, columns = _THUMBNAIL.unpack_from(octets)
-    levels = np.frombuffer(zlib.decompress(octets[_THUMBNAIL.size :]), dtype=np.uint8)
-    return frame_number, ticks, levels.reshape(rows, columns)
+    return pack_thumbnail(Thumbnail(frame_number, ticks, np.clip(np.rint(levels), 0, 255).astype(np.uint8)))
 
 
 def map_octets(sightings: Mapping[int, int]) -> bytes:

@@ -16,11 +16,12 @@ from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
 from payload_emulator.flight.onboard.parameters import PARAMETERS, find_parameter
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
-from payload_emulator.flight.telemetry.products import map_octets, unpack_map, unpack_thumbnail
+from payload_emulator.flight.telemetry.products import map_octets, unpack_map
 from tmtc.crc import append_crc
 from tmtc.dictionary import DICTIONARY
 from tmtc.large_data import LargeDataReceiver, split
 from tmtc.tables import pack_anchor_table
+from tmtc.thumbnails import unpack_thumbnail
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 
@@ -320,10 +321,10 @@ def test_a_thumbnail_comes_down_as_large_data(rig: Any) -> None:
         if name.startswith("large_data_"):
             whole = receiver.accept(name, values) or whole
     assert whole is not None and whole.table == 6
-    frame, ticks, levels = unpack_thumbnail(whole.octets)
-    assert (frame, ticks, levels.shape) == (0, rig.ticks, (8, 8))
+    found = unpack_thumbnail(whole.octets)
+    assert (found.frame_number, found.ticks, found.levels.shape) == (0, rig.ticks, (8, 8))
     expected = image.astype(float).mean(axis=2).reshape(8, 8, 8, 8).mean(axis=(1, 3))
-    np.testing.assert_allclose(levels, expected, atol=0.5)
+    np.testing.assert_allclose(found.levels, expected, atol=0.5)
 
 
 def test_the_map_of_landmarks_reads_back(rig: Any) -> None:

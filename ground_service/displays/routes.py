@@ -1,0 +1,44 @@
+"""HTTP operations on stored display objects."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Path, Response
+
+from ground_service.access.security import Operator, Viewer
+from ground_service.displays import service
+from ground_service.displays.model import KEY_PATTERN, Display, DisplayIn, DisplaySummary
+from ground_service.http.common import GroundOf, PagingOf
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations, problems
+
+DisplayKey = Annotated[str, Path(pattern=KEY_PATTERN)]
+
+displays = operations("displays")
+
+
+@displays.get("/displays")
+def list_displays(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[DisplaySummary]:
+    """List the stored objects of the telemetry displays, the one that changed last first."""
+    items, total = service.list_displays(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
+
+
+@displays.get("/displays/{key}")
+def get_display(ground: GroundOf, _: Viewer, key: DisplayKey) -> Display:
+    """Show a stored object of the telemetry displays."""
+    return service.get_display(ground, key)
+
+
+@displays.put("/displays/{key}", responses=problems(409))
+def keep_display(ground: GroundOf, caller: Operator, key: DisplayKey, given: DisplayIn) -> Display:
+    """Keep an object of the telemetry displays; it replaces the stated version only."""
+    return service.keep_display(ground, key, given, actor=caller.name)
+
+
+@displays.delete("/displays/{key}", status_code=204)
+def delete_display(ground: GroundOf, caller: Operator, key: DisplayKey) -> Response:
+    """Delete a stored object of the telemetry displays."""
+    service.delete_display(ground, key, actor=caller.name)
+    return Response(status_code=204)

@@ -1,0 +1,150 @@
+"""Images of the payload: downlinked thumbnails, and full frames that came with pass archives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from sqlalchemy import Connection
+
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.ground import Ground
+from ground_service.passes import store
+from ground_service.passes.model import Image
+from ground_service.passes.span import PassSpan, pass_span, vehicle_span
+from ground_service.store.vehicles import find_vehicle
+from ground_service.timekeeping.core import utc_ns_of_ticks
+from tmtc.dictionary import APID_LARGE_DATA, DICTIONARY
+from tmtc.errors import ValueRefused
+from tmtc.large_data import LargeDataReceiver
+from tmtc.stream import cut_packets
+from tmtc.thumbnails import Thumbnail, unpack_thumbnail
+
+IMAGES_LIMIT = 2000
+"""Largest number of images in a list; the newest of an interval are listed."""
+
+DAY_NS = 86_400_000_000_000
+DAYS_LIMIT = 31
+DELAY_NS = DAY_NS
+"""Thumbnails are looked for in packets up to a day later than their frame."""
+
+THUMBNAIL = {name: code for code, name in DICTIONARY.labels("large_data_last", "table").items()}["thumbnail"]
+
+
+def list_images(
+    ground: Ground, spacecraft_id: int, instance: str, start_utc_ns: int, stop_utc_ns: int
+) -> list[Image]:
+    """Return the images of a spacecraft in an interval, in time order; of more than `IMAGES_LIMIT` the newest.
+
+    Raises
+    ------
+    NotFound
+        There is no such spacecraft.
+    InvalidInput
+        The interval is longer than `DAYS_LIMIT`.
+    """
+    if stop_utc_ns - start_utc_ns > DAYS_LIMIT * DAY_NS:
+        found_days = f"{(stop_utc_ns - start_utc_ns) / DAY_NS:.0f} days"
+        raise InvalidInput("images", "stop", f"at most {DAYS_LIMIT} days after start", found_days)
+    with ground.database.reading() as connection:
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        found = [
+            *_archived(connection, vehicle, start_utc_ns, stop_utc_ns),
+            *_downlinked(connection, vehicle, spacecraft_id, instance, start_utc_ns, stop_utc_ns),
+        ]
+    inside = [one for one in found if start_utc_ns <= one.time.utc_ns <= stop_utc_ns]
+    return sorted(inside, key=lambda one: (one.time.utc_ns, one.source, one.frame_number))[-IMAGES_LIMIT:]
+
+
+def archived_image(ground: Ground, pass_id: int, frame_number: int) -> bytes:
+    """Return a full frame of a pass archive as PNG.
+
+    Raises
+    ------
+    NotFound
+        There is no such pass, or its archive has no such frame.
+    """
+    with ground.database.reading() as connection:
+        store.get_pass(connection, pass_id)
+        sha256 = store.frame_files(connection, pass_id).get(frame_number)
+    if sha256 is None:
+        raise NotFound(f"pass {pass_id}: image of frame", frame_number)
+    return ground.files.get(sha256)
+
+
+def thumbnail_image(ground: Ground, spacecraft_id: int, instance: str, ticks: int) -> bytes:
+    """Return the thumbnail of the frame with an on-board time as PNG.
+
+    Raises
+    ------
+    NotFound
+        There is no such spacecraft, or no such thumbnail was received completely.
+    """
+    import cv2
+
+    with ground.database.reading() as connection:
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        time_ns = int(vehicle_span(connection, vehicle, None, None).utc_ns([ticks])[0])
+        span = vehicle_span(connection, vehicle, time_ns, time_ns + DELAY_NS)
+        found = next((one for one in _thumbnails(connection, span) if one.ticks == ticks), None)
+    if found is None:
+        raise NotFound("thumbnail", ticks)
+    _, octets = cv2.imencode(".png", found.levels)
+    return octets.tobytes()
+
+
+def _archived(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int) -> Iterator[Image]:
+    for record in store.passes_with_images(connection, vehicle, start_utc_ns, stop_utc_ns):
+        span = pass_span(connection, record)
+        rows = store.samples(connection, span, "detections", ("frame_number", "ticks"))
+        ticks = dict(zip(rows["frame_number"], rows["ticks"], strict=True))
+        numbers = [number for number in store.frame_files(connection, record.id) if number in ticks]
+        for number, time_ns in zip(
+            numbers, span.utc_ns([ticks[number] for number in numbers]).tolist(), strict=True
+        ):
+            address = f"/api/v1/passes/{record.id}/images/{number}"
+            yield Image.of(
+                {},
+                frame_number=number,
+                time=time_ns,
+                source="archive",
+                pass_id=record.id,
+                address=address,
+            )
+
+
+def _downlinked(
+    connection: Connection,
+    vehicle: int,
+    spacecraft_id: int,
+    instance: str,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+) -> Iterator[Image]:
+    span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns + DELAY_NS)
+    for one in {found.ticks: found for found in _thumbnails(connection, span)}.values():
+        time_ns = int(utc_ns_of_ticks(np.array([one.ticks]), span.correlations)[0][0])
+        address = f"/api/v1/spacecraft/{spacecraft_id}/thumbnails/{one.ticks}?instance={instance}"
+        yield Image.of(
+            {},
+            frame_number=one.frame_number,
+            time=time_ns,
+            source="thumbnail",
+            pass_id=None,
+            address=address,
+        )
+
+
+def _thumbnails(connection: Connection, span: PassSpan) -> Iterator[Thumbnail]:
+    """Yield the thumbnails that were received completely in a span."""
+    receiver = LargeDataReceiver()
+    octets = store.packet_octets(connection, span, APID_LARGE_DATA)
+    cut = cut_packets(octets)
+    for start, length in zip(cut.offsets.tolist(), cut.lengths.tolist(), strict=True):
+        name, values = DICTIONARY.unpack(octets[start : start + length])
+        whole = receiver.accept(name, values) if name.startswith("large_data_") else None
+        if whole is not None and whole.table == THUMBNAIL:
+            try:
+                yield unpack_thumbnail(whole.octets)
+            except ValueRefused:
+                continue  # the parts of two transfers with one number

@@ -1,0 +1,54 @@
+// Downlinked thumbnails and frames of pass archives as imagery.
+import { get } from "../api.js";
+import { addExtra } from "./dictionary.js";
+import { listen, milliseconds } from "./feed.js";
+
+const METADATA = {
+  values: [
+    { key: "name", source: "name", name: "Frame" },
+    { key: "utc", source: "utc", name: "Spacecraft time", format: "utc", hints: { domain: 1 } },
+    { key: "url", source: "url", name: "Image", format: "image", hints: { image: 1 } },
+    { key: "file", source: "file", name: "File name", format: "string", hints: { imageDownloadName: 1 } },
+  ],
+};
+
+function datum(one) {
+  const name = `frame ${one.frame_number}, ${one.source}`;
+  return { name, utc: milliseconds(one.time), url: one.address, file: `${name.replaceAll(/[ ,]+/g, "-")}.png` };
+}
+
+const LONGEST_MS = 31 * 86_400_000;
+
+async function request({ spacecraft }, { start, end, size, strategy, signal }) {
+  const from = Math.max(start, end - LONGEST_MS, 0);
+  const query = { instance: spacecraft.instance, start: new Date(from).toISOString(), stop: new Date(Math.max(end, 0)).toISOString() };
+  const { items } = await get(`spacecraft/${spacecraft.spacecraft_id}/images`, query, { signal });
+  return (strategy === "latest" || size === 1 ? items.slice(-1) : items).map(datum);
+}
+
+function subscribe(openmct, object, callback) {
+  const known = new Set();
+  return listen("telemetry", async () => {
+    try {
+      const { start } = openmct.time.getBounds();
+      const found = await request(object, { start, end: start + LONGEST_MS });
+      const fresh = found.filter((one) => !known.has(one.url));
+      fresh.forEach((one) => known.add(one.url));
+      if (fresh.length) callback(fresh);
+    } catch (error) {
+      console.warn(`${object.name}: ${error.message}`);
+    }
+  });
+}
+
+export function installImagery(openmct) {
+  const isImagery = (object) => object.type === "linna.images";
+  openmct.types.addType("linna.images", { name: "Images", cssClass: "icon-image", creatable: false });
+  addExtra("images", () => ({ type: "linna.images", name: "Images", telemetry: METADATA, configuration: { layers: [] } }));
+  openmct.telemetry.addProvider({
+    supportsRequest: isImagery,
+    request,
+    supportsSubscribe: isImagery,
+    subscribe: (object, callback) => subscribe(openmct, object, callback),
+  });
+}

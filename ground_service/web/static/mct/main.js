@@ -1,0 +1,82 @@
+// Open MCT with the telemetry, alarms, events, plans and stored layouts of this service.
+import { get } from "../api.js";
+import { installClocks } from "./clocks.js";
+import { addressOf, allSpacecraft, installDictionary } from "./dictionary.js";
+import { installFaults } from "./faults.js";
+import { onState, startFeed } from "./feed.js";
+import { installImagery } from "./imagery.js";
+import { installLayouts, SHIFT } from "./layouts.js";
+import { installPlan } from "./plan.js";
+import { installStored } from "./stored.js";
+import { installTelemetry } from "./telemetry.js";
+
+const MINUTE_MS = 60_000;
+const HOUR_MS = 60 * MINUTE_MS;
+const openmct = window.openmct;
+
+window.addEventListener("linna-sign-in", () => location.assign("/?next=/mct"));
+
+function installConductor(last) {
+  const recent = (clock) => ({ name: clock, timeSystem: "utc", clock, clockOffsets: { start: -30 * MINUTE_MS, end: MINUTE_MS } });
+  openmct.install(openmct.plugins.UTCTimeSystem());
+  openmct.install(
+    openmct.plugins.Conductor({
+      menuOptions: [
+        recent("newest"),
+        recent("mission"),
+        { name: "Fixed", timeSystem: "utc", bounds: { start: last - HOUR_MS, end: last + 5 * MINUTE_MS }, zoomOutLimit: 366 * 24 * HOUR_MS, zoomInLimit: 1000 },
+      ],
+    }),
+  );
+}
+
+function installIndicators(session) {
+  const feed = openmct.indicators.simpleIndicator();
+  feed.iconClass("icon-connectivity");
+  onState((connected) => {
+    feed.text(connected ? "Live feed connected" : "Live feed not connected");
+    feed.statusClass(connected ? "s-status-on" : "s-status-off");
+  });
+  openmct.indicators.add(feed);
+  const user = openmct.indicators.simpleIndicator();
+  user.iconClass("icon-person");
+  user.text(session.browser ? `${session.name}, ${session.role}` : session.name);
+  openmct.indicators.add(user);
+  const home = openmct.indicators.simpleIndicator();
+  home.iconClass("icon-arrow-left");
+  home.text("LINNA pages");
+  home.on?.("click", () => location.assign("/"));
+  openmct.indicators.add(home);
+}
+
+async function start() {
+  const session = await get("session");
+  const spacecraft = (await allSpacecraft())[0];
+  openmct.setAssetPath(document.getElementById("plugin").dataset.assets);
+  const { plugins } = openmct;
+  openmct.install(matchMedia("(prefers-color-scheme: light)").matches ? plugins.Snow() : plugins.Espresso());
+  openmct.install(plugins.DisplayLayout({ showAsView: [] }));
+  installDictionary(openmct);
+  installTelemetry(openmct);
+  installLayouts(openmct);
+  installPlan(openmct);
+  installImagery(openmct);
+  installFaults(openmct, session);
+  installStored(openmct, session);
+  startFeed();
+  const last = await installClocks(openmct, spacecraft);
+  // The time system is needed before the conductor.
+  installConductor(last);
+  installIndicators(session);
+  // Without an object in the address: the layout of a shift.
+  if (spacecraft && !location.hash) location.hash = addressOf(spacecraft, SHIFT);
+  openmct.on("start", () => performance.mark("linna-started"));
+  openmct.start(document.body.firstElementChild);
+}
+
+start().catch((error) => {
+  if (error.status === 401) return;
+  const text = document.createElement("p");
+  text.textContent = `The displays could not be started: ${error.message}`;
+  document.body.replaceChildren(text);
+});

@@ -1,0 +1,80 @@
+"""Stored display objects: versions, limits, audit and roles, on both databases."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from pydantic import ValidationError
+
+from ground_service.access.audit_log import list_entries
+from ground_service.displays import service
+from ground_service.displays.model import DOCUMENT_LIMIT_OCTETS, DisplayIn
+from ground_service.errors import Conflict, InvalidInput, NotFound
+from ground_service.events import read_events
+from ground_service.ground import Ground
+
+
+def layout(version: int = 0, **document: object) -> DisplayIn:
+    return DisplayIn(name="Pass shift", type="layout", version=version, document=document)
+
+
+def keep(ground: Ground, given: DisplayIn, actor: str = "eva") -> int:
+    return service.keep_display(ground, "mine", given, actor=actor).version
+
+
+def test_an_object_is_kept_with_its_versions_actors_audit_and_events(either: Ground) -> None:
+    ground = either
+    assert keep(ground, layout(items=[1, "Sägezahn"])) == 1
+    assert keep(ground, layout(1, items=[2]), actor="ida") == 2
+    found = service.get_display(ground, "mine")
+    assert found.document == {"items": [2]}
+    assert (found.created_by, found.changed_by, found.octets) == ("eva", "ida", len('{"items":[2]}'))
+    listed, total = service.list_displays(ground, limit=10, offset=0)
+    assert total == 1 and [(one.key, one.name, one.version) for one in listed] == [("mine", "Pass shift", 2)]
+    service.delete_display(ground, "mine", actor="ida")
+    with pytest.raises(NotFound):
+        service.get_display(ground, "mine")
+    entries = [(one.actor, one.action) for one in list_entries(ground, target="display mine")[0]]
+    assert entries == [("ida", "delete display"), ("ida", "keep display"), ("eva", "keep display")]
+    events = [one.payload for one in read_events(ground.database, 0) if one.kind == "display"]
+    assert events == [{"key": "mine", "version": 1}, {"key": "mine", "version": 2}, {"key": "mine"}]
+
+
+@pytest.mark.parametrize("version", [0, 1, 3])
+def test_a_version_that_is_not_the_current_one_changes_nothing(either: Ground, version: int) -> None:
+    keep(either, layout(items=[1]))
+    keep(either, layout(1, items=[2]))
+    with pytest.raises(Conflict, match=f"expected version {version}, found 2 of eva"):
+        keep(either, layout(version, items=[3]), actor="ida")
+    assert service.get_display(either, "mine").document == {"items": [2]}
+
+
+def test_an_object_that_was_deleted_is_not_replaced(either: Ground) -> None:
+    with pytest.raises(NotFound):
+        keep(either, layout(4))
+    with pytest.raises(NotFound):
+        service.delete_display(either, "mine", actor="eva")
+
+
+def test_one_of_several_simultaneous_changes_succeeds(either: Ground) -> None:
+    keep(either, layout())
+
+    def change(number: int) -> bool:
+        try:
+            keep(either, layout(1, number=number))
+        except Conflict:
+            return False
+        return True
+
+    with ThreadPoolExecutor(4) as threads:
+        assert sum(threads.map(change, range(4))) == 1
+
+
+def test_documents_and_their_number_are_limited(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = len('{"text":""}')
+    assert keep(either, layout(text="x" * (DOCUMENT_LIMIT_OCTETS - frame))) == 1
+    with pytest.raises(ValidationError, match=f"expected at most {DOCUMENT_LIMIT_OCTETS} octets"):
+        layout(text="x" * (DOCUMENT_LIMIT_OCTETS - frame + 1))
+    monkeypatch.setattr(service, "OBJECTS_LIMIT", 1)
+    with pytest.raises(InvalidInput, match="at most 1 stored objects"):
+        service.keep_display(either, "other", layout(), actor="eva")
+    assert keep(either, layout(1)) == 2  # a change adds none

@@ -1,0 +1,117 @@
+"""Images of a spacecraft: downlinked thumbnails and frames of pass archives, on spacecraft time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes import images, store
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.live import list_spacecraft
+from ground_service.passes.parameters import spacecraft_parameters
+from ground_service.passes.service import trend_series
+from ground_service.store.stored_files import register_file
+from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tests.ground_service.conftest import NS, SPACECRAFT, SyntheticPass, encode_downlink
+from tmtc.dictionary import DICTIONARY
+from tmtc.large_data import split
+from tmtc.thumbnails import Thumbnail, pack_thumbnail
+
+START = parse_utc("2029-08-07T06:00:00Z")
+TICKS = int(ticks_from_utc_ns(START))
+SECOND = 1 << 16
+HOUR_NS = 3600 * NS
+
+
+def thumbnail(frame_number: int, ticks: int) -> tuple[Thumbnail, bytes]:
+    levels = np.random.default_rng(frame_number).integers(0, 256, (8, 12), dtype=np.uint8)
+    made = Thumbnail(frame_number, ticks, levels)
+    return made, pack_thumbnail(made)
+
+
+def large_data(octets: bytes, transaction: int, ticks: int, table: str = "thumbnail") -> list[bytes]:
+    """Packets of a transfer; their sequence counts continue those of earlier transfers."""
+    parts = split(octets, transaction=transaction, table=table, part_length=50)
+    return [
+        DICTIONARY.pack(name, values, ticks=ticks + k, sequence_count=100 * transaction + k)
+        for k, (name, values) in enumerate(parts)
+    ]
+
+
+def receive(ground: Ground, folder: Path, packets: list[bytes]) -> None:
+    file = folder / "downlink.cadu"
+    file.write_bytes(encode_downlink(packets))
+    ingest_file(ground, file, spacecraft_id=SPACECRAFT)
+
+
+def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Ground, tmp_path: Path) -> None:
+    first, octets = thumbnail(1, TICKS)
+    second, others = thumbnail(2, TICKS + 15 * SECOND)
+    _, incomplete = thumbnail(3, TICKS + 30 * SECOND)
+    later = TICKS + 600 * SECOND
+    receive(
+        ground,
+        tmp_path,
+        [
+            *large_data(octets, 1, later),
+            *large_data(b"map", 2, later + 100, table="landmark_map"),
+            *large_data(others, 3, later + 200),
+            *large_data(incomplete, 4, later + 300)[:-1],
+        ],
+    )
+    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert [(one.frame_number, one.time.utc_ns, one.source) for one in found] == [
+        (1, START, "thumbnail"),
+        (2, START + 15 * NS, "thumbnail"),
+    ]
+    assert images.list_images(ground, SPACECRAFT, "flight", START + NS, START + HOUR_NS) == found[1:]
+    for one, levels in ((found[0], first.levels), (found[1], second.levels)):
+        ticks = int(one.address.split("/thumbnails/")[1].split("?")[0])
+        png = images.thumbnail_image(ground, SPACECRAFT, "flight", ticks)
+        decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(decoded, levels)
+    with pytest.raises(NotFound):
+        images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS + 30 * SECOND)
+    with pytest.raises(InvalidInput, match="at most 31 days"):
+        images.list_images(ground, SPACECRAFT, "flight", START, START + 32 * 24 * HOUR_NS)
+
+
+def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass: SyntheticPass) -> None:
+    pass_id = import_archive(ground, synthetic_pass.folder)
+    _, png = cv2.imencode(".png", np.full((4, 4), 77, np.uint8))
+    stored = ground.files.put_octets(png.tobytes())
+    with ground.database.writing() as connection:
+        register_file(connection, stored, "frame", "3.png", START)
+        store.add_frames(connection, pass_id, {3: stored.sha256})
+        record = store.get_pass(connection, pass_id)
+    (vehicle,) = {one.instance for one in list_spacecraft(ground)}
+    (found,) = images.list_images(ground, SPACECRAFT, vehicle, record.start_utc_ns, record.stop_utc_ns)
+    assert (found.frame_number, found.source, found.pass_id) == (3, "archive", pass_id)
+    assert record.start_utc_ns < found.time.utc_ns < record.stop_utc_ns
+    assert found.address == f"/api/v1/passes/{pass_id}/images/3"
+    assert images.archived_image(ground, pass_id, 3) == png.tobytes()
+    with pytest.raises(NotFound, match="image of frame"):
+        images.archived_image(ground, pass_id, 4)
+
+
+def test_states_of_each_estimator_are_parameters_of_the_spacecraft(
+    ground: Ground, synthetic_pass: SyntheticPass
+) -> None:
+    import_archive(ground, synthetic_pass.folder)
+    (one,) = list_spacecraft(ground)
+    listed = {found.name: found for found in spacecraft_parameters(ground, SPACECRAFT, one.instance)}
+    name = "navigation_state.spherical.altitude_m"
+    assert listed[name].unit == "m" and listed["temperature_c"].packet == "housekeeping"
+    assert listed["navigation_state.spherical.velocity_x_m_s"].unit == "m/s"
+    found = trend_series(ground, SPACECRAFT, one.instance, name, 1000)
+    assert found.samples == 40 and 20e3 < found.buckets.mean.min() < 40e3
+    none = trend_series(ground, SPACECRAFT, one.instance, "navigation_state.anchored.altitude_m", 1000)
+    assert none.samples == 0
+    with pytest.raises(NotFound):
+        spacecraft_parameters(ground, SPACECRAFT, "flight")

@@ -1,0 +1,189 @@
+"""Telemetry displays at /mct: Open MCT in Chromium, and the service without it."""
+
+import gzip
+import json
+import os
+import re
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from ground_service.ground import open_ground
+from ground_service.passes.archive_import import import_archive
+from ground_service.web import displays
+from ground_service.web.pages import POLICY
+from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+
+SOURCE = Path(__file__).parents[3] / "deploy" / "openmct"
+
+
+def ask(url, **headers):
+    """Status, body and headers of a GET."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+            return answer.status, answer.read(), answer.headers
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read(), error.headers
+
+
+@pytest.fixture(scope="session")
+def openmct(tmp_path_factory):
+    """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
+    if displays.FOLDER.is_dir():
+        return displays.FOLDER
+    folder = tmp_path_factory.mktemp("openmct")
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(SOURCE / name, folder)
+    command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+    try:
+        subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=240)
+    except (OSError, subprocess.SubprocessError) as error:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(f"Open MCT cannot be installed: {error}")
+    return folder / "node_modules" / "openmct"
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory, synthetic_pass, serve, openmct):
+    """A service with the displays, the synthetic pass imported."""
+    home = tmp_path_factory.mktemp("displays") / "home"
+    with open_ground(home) as ground:
+        import_archive(ground, synthetic_pass.folder)
+    running = serve(home, home / "serve.log", 1, openmct)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def mct(browser, shown):
+    """A page for the displays; the test fails on an error in the console or a violation of the policy."""
+    context = browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900})
+    opened = context.new_page()
+    opened.set_default_timeout(30_000)
+    opened.add_init_script(
+        "document.addEventListener('securitypolicyviolation', (event) =>"
+        " console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"
+    )
+    errors = []
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    own = (shown.url, shown.url.replace("http", "ws", 1), "blob:", "data:")
+    opened.on("request", lambda request: request.url.startswith(own) or errors.append(request.url))
+    yield opened
+    context.close()
+    assert errors == []
+
+
+def spacecraft(url):
+    """The only spacecraft: that of the synthetic pass."""
+    (found,) = json.loads(ask(f"{url}/api/v1/spacecraft")[1])["items"]
+    return found
+
+
+def receive(url, temperature_c, second):
+    """Upload a housekeeping packet, later than those of the pass."""
+    zeros = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values = zeros | {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c, "mode": 1}
+    ticks = int(ticks_from_utc_ns(parse_utc("2029-08-07T06:15:00Z"))) + second * 65_536
+    packet = DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=900 + second)
+    request = urllib.request.Request(
+        f"{url}/api/v1/telemetry?name=live-{second}.cadu&instance={spacecraft(url)['instance']}",
+        data=encode_cadus([packet], spacecraft_id=76),
+        headers={"Content-Type": "application/octet-stream"},
+    )
+    with urllib.request.urlopen(request, timeout=20) as answer:
+        assert answer.status == 202
+
+
+def test_without_open_mct_the_page_says_how_to_install_it(service):
+    status, body, headers = ask(service.url + "/mct")
+    assert status == 200 and headers["Content-Security-Policy"] == POLICY
+    assert b"<code>make openmct</code>" in body and b"LINNA_OPENMCT" in body
+    assert ask(service.url + "/mct/4.2.0/openmct.js")[0] == 404
+    assert ask(service.url + "/telemetry")[0] == 200
+
+
+def test_only_the_page_of_the_displays_permits_eval(shown):
+    _, body, headers = ask(shown.url + "/mct")
+    assert headers["Content-Security-Policy"] == displays.POLICY
+    assert displays.POLICY.count("unsafe-eval") == 1 and "http" not in displays.POLICY
+    for source in re.findall(rb'src="([^"]+)"', body):
+        assert ask(shown.url + source.decode())[0] == 200, source
+    assert ask(shown.url + "/")[2]["Content-Security-Policy"] == POLICY
+
+
+def test_files_of_open_mct_are_compressed_kept_and_no_others_are_reached(shown, openmct):
+    version = json.loads((openmct / "package.json").read_text())["version"]
+    _, plain, headers = ask(f"{shown.url}/mct/{version}/openmct.js")
+    assert "Content-Encoding" not in headers and "immutable" in headers["Cache-Control"]
+    assert plain == (openmct / "dist" / "openmct.js").read_bytes()
+    _, packed, headers = ask(f"{shown.url}/mct/{version}/openmct.js", **{"Accept-Encoding": "gzip"})
+    assert headers["Content-Encoding"] == "gzip" and gzip.decompress(packed) == plain
+    assert len(packed) < len(plain) / 3
+    for path in (
+        "../package.json",
+        "%2e%2e/package.json",
+        "openmct.js.map",
+        "package.json",
+        "",
+        "/etc/passwd",
+    ):
+        assert ask(f"{shown.url}/mct/{version}/{path}")[0] == 404, path
+    assert ask(f"{shown.url}/mct/4.1.0/openmct.js")[0] == 404
+
+
+def test_a_parameter_is_found_in_the_tree_and_its_plot_is_drawn(mct):
+    mct.goto("/mct")
+    tree = mct.get_by_role("tree", name="Main Tree")
+    tree.get_by_label("Expand Spacecraft linna.packet").click()
+    tree.get_by_label("Expand Spacecraft 76").click()
+    tree.get_by_label("Expand housekeeping linna.packet").click()
+    with mct.expect_response(lambda answer: "/telemetry/temperature_c?" in answer.url) as received:
+        tree.get_by_label("Navigate to temperature linna.parameter").click()
+    assert len(received.value.json()["buckets"]) == 40  # the whole pass is in the interval
+    expect(mct.locator(".c-plot").get_by_text("temperature °C")).to_be_visible()
+    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible()
+
+
+def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
+    mct.goto("/mct")
+    row = mct.get_by_role("row").filter(has=mct.get_by_text("temperature", exact=True))
+    expect(row).to_contain_text("23.9")
+    receive(shown.url, 95.25, 1)
+    expect(row).to_contain_text("95.25")
+    expect(row.locator(".is-limit--red")).to_have_count(1)
+    mode = mct.get_by_role("row").filter(has=mct.get_by_text("mode", exact=True))
+    expect(mode).to_contain_text(DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "))
+    fault = mct.get_by_label("Select fault: temperature")
+    fault.check()
+    mct.get_by_role("button", name="Acknowledge").click()
+    mct.get_by_label("Save", exact=True).click()
+    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible()
+    (alarm,) = json.loads(ask(f"{shown.url}/api/v1/alarms")[1])["items"]
+    assert (alarm["name"], alarm["state"]) == ("temperature_c", "acknowledged")
+
+
+def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
+    mct.goto("/mct#/browse/linna.stored:layouts")
+    mct.get_by_role("button", name="Create").click()
+    mct.get_by_role("menuitem", name="Folder").click()
+    mct.get_by_label("Title", exact=True).fill("Shift of Monday")
+    mct.get_by_label("Save", exact=True).click()
+    expect(mct.get_by_label("Navigate to Shift of Monday folder").first).to_be_visible()
+    other = browser.new_context(base_url=shown.url).new_page()
+    try:
+        other.goto("/mct#/browse/linna.stored:layouts")
+        expect(other.get_by_text("Shift of Monday").first).to_be_visible(timeout=30_000)
+    finally:
+        other.context.close()
+    names = [one["name"] for one in json.loads(ask(f"{shown.url}/api/v1/displays")[1])["items"]]
+    assert sorted(names) == ["Shift of Monday", "Stored layouts"]
