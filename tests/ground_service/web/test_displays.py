@@ -21,6 +21,7 @@ from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
+WAIT_MS = 30_000
 SOURCE = Path(__file__).parents[3] / "deploy" / "openmct"
 
 
@@ -150,24 +151,29 @@ def test_a_parameter_is_found_in_the_tree_and_its_plot_is_drawn(mct):
     with mct.expect_response(lambda answer: "/telemetry/temperature_c?" in answer.url) as received:
         tree.get_by_label("Navigate to temperature linna.parameter").click()
     assert len(received.value.json()["buckets"]) == 40  # the whole pass is in the interval
-    expect(mct.locator(".c-plot").get_by_text("temperature °C")).to_be_visible()
-    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible()
+    expect(mct.locator(".c-plot").get_by_text("temperature °C")).to_be_visible(timeout=WAIT_MS)
+    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible(timeout=WAIT_MS)
 
 
 def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     mct.goto("/mct")
-    row = mct.get_by_role("row").filter(has=mct.get_by_text("temperature", exact=True))
-    expect(row).to_contain_text("23.9")
+    row = mct.get_by_label("lad row").filter(has=mct.get_by_text("temperature", exact=True))
+    expect(row).to_contain_text("23.9", timeout=WAIT_MS)
+    expect(mct.get_by_text("Live feed connected")).to_be_visible(timeout=WAIT_MS)
     receive(shown.url, 95.25, 1)
-    expect(row).to_contain_text("95.25")
-    expect(row.locator(".is-limit--red")).to_have_count(1)
-    mode = mct.get_by_role("row").filter(has=mct.get_by_text("mode", exact=True))
-    expect(mode).to_contain_text(DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "))
+    expect(row).to_contain_text("95.25", timeout=WAIT_MS)
+    expect(row.locator(".is-limit--red")).to_have_count(1, timeout=WAIT_MS)
+    mode = mct.get_by_label("lad row").filter(has=mct.get_by_text("mode", exact=True))
+    expect(mode).to_contain_text(
+        DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "), timeout=WAIT_MS
+    )
     fault = mct.get_by_label("Select fault: temperature")
     fault.check()
     mct.get_by_role("button", name="Acknowledge").click()
     mct.get_by_label("Save", exact=True).click()
-    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible()
+    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible(
+        timeout=WAIT_MS
+    )
     (alarm,) = json.loads(ask(f"{shown.url}/api/v1/alarms")[1])["items"]
     assert (alarm["name"], alarm["state"]) == ("temperature_c", "acknowledged")
 
@@ -178,7 +184,7 @@ def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
     mct.get_by_role("menuitem", name="Folder").click()
     mct.get_by_label("Title", exact=True).fill("Shift of Monday")
     mct.get_by_label("Save", exact=True).click()
-    expect(mct.get_by_label("Navigate to Shift of Monday folder").first).to_be_visible()
+    expect(mct.get_by_role("region", name="Shift of Monday Object View")).to_be_visible(timeout=WAIT_MS)
     other = browser.new_context(base_url=shown.url).new_page()
     try:
         other.goto("/mct#/browse/linna.stored:layouts")

@@ -23,6 +23,8 @@ export function startFeed() {
     (message) => listeners.get(message.kind)?.forEach((listener) => listener(message)),
     (state) => {
       connected = state;
+      // What was read before the connection may be older than its first message.
+      if (state) for (const kind of ["telemetry", "alarm"]) listeners.get(kind)?.forEach((listener) => listener({ kind }));
       states.forEach((listener) => listener(state));
     },
   );
