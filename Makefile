@@ -18,7 +18,7 @@ DEMO_OUT    ?= linna-demo
 SAMPLE ?= 60
 SEED   ?= 1
 
-.PHONY: demo test check openmct docs sbom package bench mutation up install install-dev clean
+.PHONY: demo test check openmct docs links sbom package bench mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -33,9 +33,14 @@ check: $(VENV)/.dev
 	$(PYTHON) -m pip --python $(BIN)/python check
 	$(BIN)/python -m pytest -q tests/test_dependencies.py
 
-# The documentation site; `linna serve` shows it at /help.
+# The documentation site with executed notebooks; `linna serve` shows it at /help.
 docs: $(VENV)/.dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	$(BIN)/python docs_site.py build/notebooks
+	NO_MKDOCS_2_WARNING=1 NOTEBOOK_OUTPUTS=build/notebooks $(BIN)/python -m mkdocs build --strict
+
+# External links of the documentation; needs the network.
+links: $(VENV)/.dev
+	$(BIN)/python docs_site.py --links
 
 # Telemetry displays; `linna serve` shows them at /mct. The lock file states version and checksum.
 openmct: deploy/openmct/node_modules/.package-lock.json

@@ -1,14 +1,45 @@
-"""Hook of the documentation site: pages generated from the program, so that they cannot differ from it."""
+"""Hook of the documentation site: pages generated from the program, so that they cannot differ from it.
+
+`python docs_site.py FOLDER` flies the passes of the notebooks, executes the notebooks and saves them with their outputs
+in FOLDER. A build of the site with `NOTEBOOK_OUTPUTS=FOLDER` shows these outputs; without it, text and code only.
+"""
 
 from __future__ import annotations
 
 import argparse
+import base64
 import importlib
 import json
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-NOTEBOOKS = Path(__file__).resolve().parent / "docs" / "notebooks"
+ROOT = Path(__file__).resolve().parent
+NOTEBOOKS = ROOT / "docs" / "notebooks"
+PASSES = ("2029-08-07T01:40:00Z", "2029-08-07T03:31:12Z")
+"""Starts of the two passes of the notebooks, one revolution apart."""
+
+SCENARIO = """
+name = "notebook"
+seed = 7
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+[window]
+search = "none"
+start = "{start}"
+duration_s = 480.0
+[terrain]
+source = "procedural"
+[navigation]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+_STYLE = re.compile(r"<style.*?</style>\s*", re.DOTALL)
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -21,19 +52,79 @@ def on_files(files: Any, config: Any) -> Any:
         ("reference/configuration.md", configuration_page()),
     ):
         files.append(File.generated(config, path, content=content))
-    for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
-        page = notebook_page(json.loads(notebook.read_text(encoding="utf-8")))
+    folder = Path(os.environ.get("NOTEBOOK_OUTPUTS") or NOTEBOOKS)
+    for notebook in sorted(folder.glob("*.ipynb")):
+        page, pictures = notebook_page(notebook.stem, json.loads(notebook.read_text(encoding="utf-8")))
         files.append(File.generated(config, f"notebooks/{notebook.stem}.md", content=page))
+        for name, octets in pictures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=octets))
     return files
 
 
-def notebook_page(notebook: dict[str, Any]) -> str:
-    """Return a notebook as a page: its text and its code, without outputs."""
-    parts = []
+def notebook_page(stem: str, notebook: dict[str, Any]) -> tuple[str, dict[str, bytes]]:
+    """Return a notebook as a page with text, code and the outputs it has, and its pictures by file name."""
+    parts: list[str] = []
+    pictures: dict[str, bytes] = {}
     for cell in notebook["cells"]:
         text = "".join(cell["source"])
-        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
-    return "\n\n".join(parts) + "\n"
+        if cell["cell_type"] == "markdown":
+            parts.append(text)
+            continue
+        parts.append(f"```python\n{text}\n```")
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"{stem}-{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode("".join(data["image/png"]))
+                parts.append(f"![Output of the cell]({name})")
+            elif "text/html" in data:
+                # A blank line would end the block of HTML.
+                table = _STYLE.sub("", "".join(data["text/html"]))
+                parts.append("\n".join(line for line in table.splitlines() if line.strip()))
+            else:
+                plain = "".join(data.get("text/plain", output.get("text", ""))).rstrip()
+                parts.append(f"```text\n{plain}\n```")
+    return "\n\n".join(parts) + "\n", pictures
+
+
+def fly_passes(home: Path, starts: tuple[str, ...] = PASSES) -> None:
+    """Emulate passes over the procedural Moon and import them into a home folder."""
+    from ground_service.ground import open_ground
+    from ground_service.passes.archive_import import import_archive
+    from lunar.datafolder import DataFolder
+    from payload_emulator.session.emulator import emulate
+    from payload_emulator.session.scenario import parse_scenario
+
+    with tempfile.TemporaryDirectory() as folder, open_ground(home) as ground:
+        for number, start in enumerate(starts):
+            archive = Path(folder) / str(number)
+            emulate(parse_scenario(SCENARIO.format(start=start)), DataFolder(), archive)
+            import_archive(ground, archive)
+
+
+def executed_notebooks(home: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Return the file name of each notebook and the notebook with its outputs for the passes of a home folder."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    os.environ |= {"LINNA_HOME": str(home), "PYTHONPATH": str(ROOT)}
+    os.environ.pop("MPLBACKEND", None)  # pictures are outputs of cells
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        notebook = nbformat.read(path, as_version=4)
+        NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+        yield path.name, notebook
+
+
+def main(arguments: list[str]) -> None:
+    """Save the executed notebooks in a folder."""
+    import nbformat
+
+    out = Path(arguments[0])
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as home:
+        fly_passes(Path(home))
+        for name, notebook in executed_notebooks(Path(home)):
+            nbformat.write(notebook, out / name)
 
 
 def cli_page() -> str:
@@ -77,9 +168,6 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
 
 def http_page() -> str:
     """Return every operation of the HTTP interface."""
-    import tempfile
-    from pathlib import Path
-
     from ground_service.app import create_app
     from ground_service.settings import Settings
 
@@ -127,3 +215,7 @@ def configuration_page() -> str:
 
 def _cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

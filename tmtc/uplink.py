@@ -227,12 +227,15 @@ class UplinkDecode:
 
 @dataclass(slots=True)
 class UplinkDecoder:
-    """The receiving end; keeps the acceptance state and unfinished packets from one call to the next."""
+    """The receiving end; keeps the acceptance state and unfinished packets from one call to the next.
+
+    `parts` are the octets of unfinished packets by virtual channel and MAP.
+    """
 
     spacecraft_id: int
     randomised: bool = True
     farms: dict[int, Farm] = field(default_factory=dict)
-    _parts: dict[tuple[int, int], bytes] = field(default_factory=dict)
+    parts: dict[tuple[int, int], bytes] = field(default_factory=dict)
 
     def decode(self, octets: Octets) -> UplinkDecode:
         """Packets in a stream of whole CLTUs with anything between them; nothing on the wire makes it fail."""
@@ -279,7 +282,7 @@ class UplinkDecoder:
         flags, key = frame.data[0] >> 6, (frame.virtual_channel, frame.data[0] & 0x3F)
         piece = frame.data[1:]
         faults = []
-        open_part = self._parts.pop(key, None)
+        open_part = self.parts.pop(key, None)
         if flags in (SEGMENT_FIRST, SEGMENT_WHOLE):
             if open_part is not None:
                 faults.append("segment: expected a continuation, found the beginning of another packet")
@@ -291,7 +294,7 @@ class UplinkDecoder:
         if flags in (SEGMENT_FIRST, SEGMENT_CONTINUATION):
             if len(whole) > PRIMARY_HEADER_LENGTH + 65_536:
                 return [], [*faults, "segment: expected a packet of at most 65542 octets, found more"]
-            self._parts[key] = whole
+            self.parts[key] = whole
             return [], faults
         return [*self._packets(whole, faults)], faults
 

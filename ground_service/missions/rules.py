@@ -249,8 +249,6 @@ class Automation(Section):
         Receivers of notifications by name.
     """
 
-    accept: Literal["all", "declared", "none"] | None = None
-    keep_days: Annotated[float, Field(gt=0.0)] | None = None
     evaluate: bool | None = None
     rules: Annotated[tuple[Rule, ...], Array] | None = None
     channels: dict[ChannelName, Channel] | None = None

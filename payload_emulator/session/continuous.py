@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import math
-import pickle
 import selectors
 import struct
 import threading
@@ -36,8 +35,15 @@ from lunar.errors import LunarError
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import sunlit_fraction
-from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.checkpoint import (
+    Account,
+    BoardState,
+    Checkpoint,
+    LinkState,
+    load_checkpoint,
+    save_checkpoint,
+)
 from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector
 from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.live import TelecommandBuffer
@@ -59,7 +65,6 @@ from payload_emulator.session.world import (
 from payload_emulator.sim.board.contact_plan import StationContact, plan_contacts
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import Receiver, Transmitter, transmit
-from payload_emulator.sim.board.platform import SimulatedBoard
 from payload_emulator.sim.orbit.truth import Spliced, Truth
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.link import LinkSettings
@@ -81,65 +86,7 @@ _LEAST_STEP_NS = 20_000_000
 _FIRST_DOWNLINK_S = 2.0
 _NO_ATTITUDE = np.full(7, np.nan)
 _CLOCK = struct.Struct("<q")
-_CHECKPOINT_VERSION = 1
 _ARCS_KEPT = 2
-
-
-@dataclass(slots=True)
-class Account:
-    """What the session has done since its epoch."""
-
-    frames: int = 0
-    packets: int = 0
-    frames_sent: int = 0
-    frames_lost: int = 0
-    packets_lost_on_link: int = 0
-    contacts: int = 0
-    telecommands: int = 0
-    telecommand_octets_lost: int = 0
-    resets: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """State of a session outside of observations, from which it can go on after its process has ended.
-
-    The payload starts again from its board as after a loss of power.
-    """
-
-    scenario: str
-    utc_ns: int
-    board: SimulatedBoard
-    resets: tuple[int, ...]
-    clock_error_ticks: int
-    begun: frozenset[Any]
-    receiver: Receiver
-    transmitter: Transmitter
-    state_utc_ns: int
-    state_icrf: Any
-    account: Account
-
-
-def load_checkpoint(path: Path, scenario: Scenario) -> Checkpoint | None:
-    """Return the checkpoint in a file of this program; None without a file.
-
-    Raises
-    ------
-    RecordError
-        The file is damaged, or belongs to another scenario.
-    """
-    try:
-        version, checkpoint = pickle.loads(path.read_bytes())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, EOFError, AttributeError, ImportError, pickle.UnpicklingError) as error:
-        raise RecordError(f"{path}: expected the state of a session, found damage ({error})") from None
-    if version != _CHECKPOINT_VERSION or checkpoint.scenario != scenario.name:
-        raise RecordError(
-            f"{path}: expected the state of scenario {scenario.name}, found that of {checkpoint.scenario}"
-        )
-    assert isinstance(checkpoint, Checkpoint)
-    return checkpoint
 
 
 @dataclass(slots=True, eq=False)
@@ -214,8 +161,10 @@ class ContinuousSession:
         self._loaded = launch_payload(scenario, self.world.camera, self.data, self.catalogue)
         self.utc_ns = scenario.epoch_utc_ns
         self._planned_until_ns = self.utc_ns
-        checkpoint = load_checkpoint(self.checkpoint_file, scenario) if self.checkpoint_file else None
-        board = new_board(scenario.seed) if checkpoint is None else checkpoint.board
+        checkpoint = load_checkpoint(self.checkpoint_file, scenario.name) if self.checkpoint_file else None
+        board = new_board(scenario.seed)
+        if checkpoint is not None:
+            checkpoint.board.put_on(board)
         self.spacecraft = Spacecraft(
             self._loaded,
             board,
@@ -585,34 +534,32 @@ class ContinuousSession:
             return
         spacecraft = self.spacecraft
         position, velocity = self.world.truth.states(self.utc_ns)
-        state = Checkpoint(
-            self.scenario.name,
-            self.utc_ns,
-            spacecraft.board,
-            tuple(spacecraft.resets),
-            spacecraft.clock_error_ticks,
-            frozenset(spacecraft.begun),
-            self._receiver,
-            self._transmitter,
-            self.utc_ns,
-            np.concatenate([position[0], velocity[0]]),
-            self.account,
+        save_checkpoint(
+            self.checkpoint_file,
+            Checkpoint(
+                scenario=self.scenario.name,
+                utc_ns=self.utc_ns,
+                board=BoardState.of(spacecraft.board),
+                resets=spacecraft.resets,
+                clock_error_ticks=spacecraft.clock_error_ticks,
+                begun=sorted(spacecraft.begun, key=lambda one: (one.at_s, one.kind)),
+                link=LinkState.of(self._receiver, self._transmitter),
+                state_icrf=np.concatenate([position[0], velocity[0]]).tolist(),
+                account=self.account,
+            ),
         )
-        beside = self.checkpoint_file.with_name(self.checkpoint_file.name + ".new")
-        beside.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(pickle.dumps((_CHECKPOINT_VERSION, state)))
-        beside.replace(self.checkpoint_file)
 
     def _restore(self, state: Checkpoint) -> None:
         """Go on where a checkpoint was made."""
         self.utc_ns = self._planned_until_ns = state.utc_ns
-        self.account, self._receiver, self._transmitter = state.account, state.receiver, state.transmitter
+        self.account = state.account
+        state.link.put_on(self._receiver, self._transmitter)
         self.spacecraft.go_on(state.utc_ns, state.resets, state.clock_error_ticks, state.begun)
         start = self.world
         truth = Truth(
             lambda tdb_s: np.broadcast_to(state.state_icrf, (tdb_s.size, 6)).copy(),
-            state.state_utc_ns,
-            state.state_utc_ns,
+            state.utc_ns,
+            state.utc_ns,
             start.truth.orientation,
         )
         longer, burns = flown_on(replace(start, truth=truth), CHUNK_S)

@@ -88,20 +88,20 @@ class Receiver:
     carrier: bool = True
     bit_lock: bool = True
     decoder: UplinkDecoder = field(init=False)
-    _station: UplinkEncoder = field(init=False)
+    station: UplinkEncoder = field(init=False)
 
     def __post_init__(self) -> None:
         self.decoder = UplinkDecoder(self.spacecraft_id)
-        self._station = UplinkEncoder(self.spacecraft_id)
+        self.station = UplinkEncoder(self.spacecraft_id)
 
     def take(self, packets: bytes) -> bytes:
         """Telecommand packets of a station, sent as it sends them and received here."""
-        return b"".join(self.decoder.decode(self._station.encode(cut_telecommands(packets))).packets)
+        return b"".join(self.decoder.decode(self.station.encode(cut_telecommands(packets))).packets)
 
     @property
     def clcw(self) -> bytes:
         """The operational control field of a frame that is sent now."""
-        state = self.decoder.farms.get(self._station.virtual_channel, Farm()).clcw
+        state = self.decoder.farms.get(self.station.virtual_channel, Farm()).clcw
         return pack_clcw(replace(state, no_rf_available=not self.carrier, no_bit_lock=not self.bit_lock))
 
 
@@ -128,10 +128,10 @@ class Transmitter:
     spacecraft_id: int
     settings: LinkSettings
     dumps: list[Dump] = field(default_factory=list)
-    _encoder: DownlinkEncoder = field(init=False)
+    encoder: DownlinkEncoder = field(init=False)
 
     def __post_init__(self) -> None:
-        self._encoder = DownlinkEncoder(self.spacecraft_id, self.settings)
+        self.encoder = DownlinkEncoder(self.spacecraft_id, self.settings)
 
     def send(
         self,
@@ -142,7 +142,7 @@ class Transmitter:
         clcw: bytes | Sequence[bytes] | None = None,
     ) -> bytes:
         """The CADUs of these packets; `clcw` as for `DownlinkEncoder.encode`."""
-        octets = self._encoder.encode(packets, virtual_channel, clcw)
+        octets = self.encoder.encode(packets, virtual_channel, clcw)
         if not packets:
             return octets
         frames = len(octets) // self.settings.cadu_length
@@ -165,7 +165,7 @@ class Transmitter:
 
     def idle(self, clcw: bytes) -> bytes:
         """Return a CADU that carries nothing but the CLCW."""
-        return self._encoder.idle(1, clcw)
+        return self.encoder.idle(1, clcw)
 
     def _zone(self, ocf: bool) -> int:
         """Octets of a frame for packets."""

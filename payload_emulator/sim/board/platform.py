@@ -81,6 +81,8 @@ class SimulatedBoard:
         Octets of packets that TM/TC takes in this step.
     readings
         What the sensors said last.
+    uptime, counter_ns
+        Time since the first start, in ticks, and processor time used.
     """
 
     model: PlatformModel
@@ -101,18 +103,18 @@ class SimulatedBoard:
     memory: dict[int, Memory] = field(default_factory=dict)
     readings: FloatArray = field(default_factory=lambda: np.full(4, np.nan))
     _loads: int = 0
-    _uptime: int = 0
-    _counter_ns: int = 0
+    uptime: int = 0
+    counter_ns: int = 0
     _stage: int = 0
-    _generator: np.random.Generator = field(init=False)
+    generator: np.random.Generator = field(init=False)
 
     def __post_init__(self) -> None:
-        self._generator = np.random.default_rng((self.seed, 2**40))
+        self.generator = np.random.default_rng((self.seed, 2**40))
 
     def advance(self, seconds: float, sunlit: float) -> None:
         """Let time pass, the arrays lit by a share of the Sun."""
         model = self.model
-        self._uptime += round(seconds * TICKS_PER_SECOND)
+        self.uptime += round(seconds * TICKS_PER_SECOND)
         drawn_w = self.drawn_w
         energy_wh = (model.array_w * sunlit - drawn_w) * seconds / 3600.0
         self.charge = min(max(self.charge + energy_wh / model.capacity_wh, 0.0), 1.0)
@@ -167,7 +169,7 @@ class SimulatedBoard:
         # The current that carries the power through the resistance.
         root = math.sqrt(max(open_v**2 - 4.0 * model.resistance_ohm * drawn_w, 0.0))
         volts = 0.5 * (open_v + root)
-        noise = self._generator.standard_normal(3) * (0.005, 0.05, 0.05)
+        noise = self.generator.standard_normal(3) * (0.005, 0.05, 0.05)
         self.readings = np.array(
             [
                 volts + noise[0],
@@ -184,18 +186,18 @@ class SimulatedBoard:
     def enter(self, stage: int) -> int:
         spent_ms = self.model.stage_ms[self._stage]
         if spent_ms:
-            spent_ms *= 1.0 + 0.1 * float(self._generator.standard_normal())
+            spent_ms *= 1.0 + 0.1 * float(self.generator.standard_normal())
             if self._stage == _DETECTOR:
                 spent_ms *= self.detector_factor
-        self._counter_ns += max(round(spent_ms * 1e6), 0)
+        self.counter_ns += max(round(spent_ms * 1e6), 0)
         self._stage = stage
-        return self._counter_ns
+        return self.counter_ns
 
     def memory_octets(self) -> int:
         return self.model.program_octets + sum(memory.size for memory in self.memory.values())
 
     def uptime_ticks(self) -> int:
-        return self._uptime
+        return self.uptime
 
     def downlink_octets(self) -> int:
         return self.downlink
