@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fastapi import Response
+from fastapi.responses import StreamingResponse
 
 from ground_service.access.security import Viewer
 from ground_service.exports import service
@@ -25,10 +26,13 @@ exports = operations("exports")
 def export_pass(ground: GroundOf, _: Viewer, request: ExportRequest) -> Response:
     """Return a pass in a format of other tools."""
     found = service.export_pass(ground, request)
-    return Response(
-        found.octets,
+    return StreamingResponse(
+        found.blocks(),
         media_type=MEDIA,
-        headers={"Content-Disposition": f'attachment; filename="{found.name}"'},
+        headers={
+            "Content-Disposition": f'attachment; filename="{found.name}"',
+            "Content-Length": str(found.size),
+        },
     )
 
 

@@ -1,17 +1,25 @@
-"""Exports of passes: everything is computed from the archive as it is now; nothing is stored."""
+"""Exports of passes: everything is computed from the archive as it is now; nothing is stored.
+
+Formats of several files are written to a temporary file, one file of the format after another. The memory that an
+export needs is therefore that of its largest file.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import io
+import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import chain
+from typing import IO
 
 import numpy as np
 from sqlalchemy import Connection
 
-from ground_service.errors import EvaluationError
+from ground_service.errors import EvaluationError, storage_error
 from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.navigation.trajectory import format_tum
 from ground_service.evaluation.store import load_pass_inputs
@@ -30,6 +38,7 @@ from ground_service.passes import store
 from ground_service.passes.parameters import packets_by_name
 from ground_service.passes.service import get_pass
 from ground_service.passes.span import PassSpan, pass_span
+from ground_service.store.files import INCOMING, unfinished_prefix
 from lunar.frames import mcmf_from_spherical
 from tmtc.errors import MissingLibrary
 
@@ -37,15 +46,25 @@ ORBITS = ("oem", "oem-xml", "opm", "spk")
 ATTITUDES = ("aem", "ck")
 TEXT_KERNELS = ("sclk", "fk", "ik")
 MAPS = ("geojson", "gpkg", "czml")
+SPOOLED_OCTETS = 8 << 20
+"""A zip archive up to this size stays in memory."""
+
 _EPOCH_OF_ZIP = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """File of an export."""
+    """File of an export, open at its beginning; it is gone when it is closed."""
 
     name: str
-    octets: bytes
+    size: int
+    stream: IO[bytes]
+
+    def blocks(self, size: int = 1 << 20) -> Iterator[bytes]:
+        """Yield the content in blocks, and close the file."""
+        with self.stream as stream:
+            while block := stream.read(size):
+                yield block
 
 
 def list_formats() -> list[ExportFormatInfo]:
@@ -80,9 +99,12 @@ def export_pass(ground: Ground, request: ExportRequest) -> Exported:
         raise MissingLibrary(f"export as {chosen.name}", chosen.library, f"linna[{chosen.extra}]")
     name = f"pass-{request.pass_id}.{chosen.ending}"
     if chosen.several_files:
-        files = _files(ground, request, chosen)
-        return Exported(f"pass-{request.pass_id}-{chosen.name}.zip", _zipped(files))
-    return Exported(name, _octets(ground, request))
+        stream = _zipped(ground, _files(ground, request, chosen))
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        return Exported(f"pass-{request.pass_id}-{chosen.name}.zip", size, stream)
+    octets = _octets(ground, request)
+    return Exported(name, len(octets), io.BytesIO(octets))
 
 
 def _octets(ground: Ground, request: ExportRequest) -> bytes:
@@ -116,40 +138,46 @@ def _map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:
     return format_geojson(layers, inputs.title).encode() if kind == "geojson" else geopackage_octets(layers)
 
 
-def _files(ground: Ground, request: ExportRequest, chosen: Format) -> dict[str, bytes]:
+def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[tuple[str, bytes]]:
+    """Yield name and content of each file of a format; EvaluationError without any."""
     if chosen.name == "parquet":
         with ground.database.reading() as connection:
-            span = _span(connection, request.pass_id)
-            files = parquet_files(packets_by_name(connection, span), {"pass": str(request.pass_id)})
-        return _some(files, request.pass_id, "packets")
-    if chosen.name == "images":
+            packets = packets_by_name(connection, _span(connection, request.pass_id))
+            yield from _some(
+                parquet_files(packets, {"pass": str(request.pass_id)}), request.pass_id, "packets"
+            )
+    elif chosen.name == "images":
         with ground.database.reading() as connection:
             store.get_pass(connection, request.pass_id)
             found = store.frame_files(connection, request.pass_id)
-        images = {f"{number:06d}.png": ground.files.get(sha256) for number, sha256 in found.items()}
-        return _some(images, request.pass_id, "archived images")
-    inputs = load_pass_inputs(ground, request.pass_id)
-    if chosen.name == "csv":
-        return csv_files(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
-    return _some(_trajectories(inputs), request.pass_id, "navigation solutions with a reference")
+        images = ((f"{number:06d}.png", ground.files.get(sha256)) for number, sha256 in found.items())
+        yield from _some(images, request.pass_id, "archived images")
+    else:
+        inputs = load_pass_inputs(ground, request.pass_id)
+        if chosen.name == "csv":
+            yield from csv_files(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
+        else:
+            yield from _some(_trajectories(inputs), request.pass_id, "navigation solutions with a reference")
 
 
 def _span(connection: Connection, pass_id: int) -> PassSpan:
     return pass_span(connection, store.get_pass(connection, pass_id))
 
 
-def _some(files: dict[str, bytes], pass_id: int, what: str) -> dict[str, bytes]:
-    if not files:
+def _some(files: Iterable[tuple[str, bytes]], pass_id: int, what: str) -> Iterator[tuple[str, bytes]]:
+    """Yield the files; without any the pass lacks what the format contains."""
+    left = iter(files)
+    first = next(left, None)
+    if first is None:
         raise EvaluationError(f"pass {pass_id}: expected {what}, found none")
-    return files
+    return chain([first], left)
 
 
-def _trajectories(inputs: PassInputs) -> dict[str, bytes]:
-    """Return each navigation solution, and the reference at its times, in TUM form."""
+def _trajectories(inputs: PassInputs) -> Iterator[tuple[str, bytes]]:
+    """Yield each navigation solution, and the reference at its times, in TUM form."""
     report = evaluate_pass(inputs)
-    files: dict[str, bytes] = {}
     if report.reference is None:
-        return files
+        return
     reference = report.reference
     truth = mcmf_from_spherical(
         np.radians(reference.latitude_deg), np.radians(reference.longitude_deg), reference.altitude_m
@@ -165,9 +193,8 @@ def _trajectories(inputs: PassInputs) -> dict[str, bytes]:
             continue
         utc_ns, there = series.utc_ns[known], truth[rows[known]]
         stem = "".join(c if c.isalnum() else "-" for c in series.name.lower())
-        files[f"{stem}.tum"] = format_tum(utc_ns, position[known], there).encode()
-        files[f"{stem}-reference.tum"] = format_tum(utc_ns, there, there).encode()
-    return files
+        yield f"{stem}.tum", format_tum(utc_ns, position[known], there).encode()
+        yield f"{stem}-reference.tum", format_tum(utc_ns, there, there).encode()
 
 
 def _about(inputs: PassInputs) -> dict[str, str]:
@@ -180,12 +207,23 @@ def _about(inputs: PassInputs) -> dict[str, str]:
     }
 
 
-def _zipped(files: Mapping[str, bytes]) -> bytes:
-    """Return a zip archive; the same files give the same octets."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, octets in files.items():
-            entry = zipfile.ZipInfo(name, _EPOCH_OF_ZIP)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, octets)
-    return buffer.getvalue()
+def _zipped(ground: Ground, files: Iterable[tuple[str, bytes]]) -> IO[bytes]:
+    """Return a zip archive in a temporary file without a name; the same files give the same octets."""
+    folder = ground.files.root
+    with ExitStack() as unfinished:
+        try:
+            stream = tempfile.SpooledTemporaryFile(
+                SPOOLED_OCTETS, dir=str(folder), prefix=unfinished_prefix(INCOMING)
+            )
+            unfinished.push(stream)
+            with zipfile.ZipFile(stream, "w") as archive:
+                for name, octets in files:
+                    entry = zipfile.ZipInfo(name, _EPOCH_OF_ZIP)
+                    # Images are compressed already.
+                    stored = name.endswith(".png")
+                    entry.compress_type = zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED
+                    archive.writestr(entry, octets)
+        except OSError as error:
+            raise storage_error(error, folder) from None
+        unfinished.pop_all()
+    return stream

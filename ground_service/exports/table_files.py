@@ -11,7 +11,7 @@ import csv
 import io
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +24,19 @@ CSV_METADATA = "csv-metadata.json"
 _UTC_UNITS = "nanoseconds since 1970-01-01T00:00:00"
 
 
-def csv_files(tables: Sequence[Table], about: Mapping[str, str]) -> dict[str, bytes]:
-    """Return a CSV file for each table, and `csv-metadata.json` with types, units and descriptions.
+def csv_files(tables: Sequence[Table], about: Mapping[str, str]) -> Iterator[tuple[str, bytes]]:
+    """Yield a CSV file for each table, and `csv-metadata.json` with types, units and descriptions.
 
     Unknown numbers are empty.
     """
-    files = {f"{table.name}.csv": _csv(table) for table in tables}
+    for table in tables:
+        yield f"{table.name}.csv", _csv(table)
     document = {
         "@context": "http://www.w3.org/ns/csvw",
         **{f"dc:{key}": value for key, value in about.items()},
         "tables": [_csv_metadata(table) for table in tables],
     }
-    return {**files, CSV_METADATA: json.dumps(document, indent=1).encode()}
+    yield CSV_METADATA, json.dumps(document, indent=1).encode()
 
 
 def _csv(table: Table) -> bytes:

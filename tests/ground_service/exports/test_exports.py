@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import io
 import json
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -15,7 +16,8 @@ import pytest
 import xarray
 from PIL import Image
 
-from ground_service.errors import EvaluationError, NotFound
+from ground_service.errors import EvaluationError, FileDamaged, NotFound
+from ground_service.exports import service
 from ground_service.exports.formats import FORMATS
 from ground_service.exports.model import ExportRequest
 from ground_service.exports.service import export_pass, list_formats
@@ -24,10 +26,11 @@ from lunar.aem import parse_aem
 from lunar.camera import PinholeCamera
 from lunar.catalogue import load_catalogue
 from lunar.ephemeris_files import load_ephemeris
-from lunar.frames import mcmf_from_spherical
+from lunar.frames import IauOrientation, mcmf_from_spherical
 from lunar.oem import parse_oem
 from lunar.oem_xml import parse_oem_xml
 from lunar.spice import camera_id, et_from_utc_ns, spacecraft_id
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import SPACECRAFT, SPHERICAL_ERROR_RTN_M
 from tests.ground_service.exports.conftest import FILTER_OFFSET_M, FRAMES, RichPass
 from tests.lunar.spice_pool import kernels
@@ -37,9 +40,11 @@ CRAFT = spacecraft_id(SPACECRAFT)
 
 
 def export(ground: Ground, kind: str, states: str = "reference") -> bytes:
-    return export_pass(
-        ground, ExportRequest.model_validate({"pass_id": 1, "format": kind, "states": states})
-    ).octets
+    request = ExportRequest.model_validate({"pass_id": 1, "format": kind, "states": states})
+    found = export_pass(ground, request)
+    octets = b"".join(found.blocks())
+    assert found.size == len(octets) and found.stream.closed
+    return octets
 
 
 def unzipped(octets: bytes) -> dict[str, bytes]:
@@ -218,12 +223,21 @@ def test_maps_of_an_estimator_move_with_its_error(rich_ground: Ground) -> None:
     assert np.median(shift) == pytest.approx(horizontal, rel=0.25)
 
 
-def test_czml_is_valid_and_follows_the_spacecraft(rich_ground: Ground, rich_pass: RichPass) -> None:
-    from czml3 import Document, Packet
+def test_czml_is_read_by_czml3_with_the_positions_of_the_oem(
+    rich_ground: Ground, rich_pass: RichPass
+) -> None:
+    from czml3 import Packet
 
     packets = json.loads(export(rich_ground, "czml"))
     assert packets[0]["id"] == "document" and packets[0]["version"] == "1.0"
-    Document(packets=[Packet(id=one["id"], name=one.get("name")) for one in packets[1:20]])
+    read = {one["id"]: Packet.model_validate(one) for one in packets}
+    position = read["spacecraft"].position
+    assert position.referenceFrame == "FIXED" and str(position.epoch).startswith("2029-08-07T06:00:00")
+    nodes = np.array(position.cartesian.values).reshape(-1, 4)
+    utc_ns = parse_utc("2029-08-07T06:00:00Z") + np.round(nodes[:, 0] * 1e9).astype(np.int64)
+    in_oem = parse_oem(export(rich_ground, "oem").decode()).at(utc_ns)[0]
+    rotation = IauOrientation().mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns)))
+    np.testing.assert_allclose(nodes[:, 1:], np.einsum("nij,nj->ni", rotation, in_oem), atol=2e-3)
     craft = next(one for one in packets if one["id"] == "spacecraft")
     table = np.array(craft["position"]["cartesian"]).reshape(-1, 4)
     np.testing.assert_allclose(table[:, 0], (rich_pass.utc_ns - rich_pass.utc_ns[0]) / 1e9)
@@ -317,6 +331,38 @@ def test_images_are_those_of_the_archive(rich_ground: Ground) -> None:
     files = unzipped(export(rich_ground, "images"))
     assert sorted(files) == ["000000.png", "000004.png", "000008.png"]
     assert np.asarray(Image.open(io.BytesIO(files["000004.png"])))[0, 0] == 40
+
+
+def test_an_export_of_images_needs_the_memory_of_a_few_of_them(
+    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = np.random.default_rng(1).bytes(1 << 20)
+    stored = rich_ground.files.put_octets(image)
+    monkeypatch.setattr(service.store, "frame_files", lambda *_: dict.fromkeys(range(64), stored.sha256))
+    tracemalloc.start()
+    try:
+        found = export_pass(rich_ground, ExportRequest(pass_id=1, format="images"))
+        size = sum(len(block) for block in found.blocks())
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert size == found.size > 64 << 20
+    # The archive in memory until it is moved to disk, twice while it is moved, and some images.
+    assert peak < 2 * service.SPOOLED_OCTETS + (6 << 20)
+
+
+def test_a_damaged_image_refuses_the_export_and_leaves_no_file(
+    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged = rich_ground.files.put_octets(b"an image")
+    rich_ground.files.path(damaged.sha256).chmod(0o600)
+    rich_ground.files.path(damaged.sha256).write_bytes(b"another one")
+    whole = rich_ground.files.put_octets(bytes(service.SPOOLED_OCTETS + 1))
+    monkeypatch.setattr(service.store, "frame_files", lambda *_: {1: whole.sha256, 2: damaged.sha256})
+    before = sorted(rich_ground.files.root.iterdir())
+    with pytest.raises(FileDamaged):
+        export_pass(rich_ground, ExportRequest(pass_id=1, format="images"))
+    assert sorted(rich_ground.files.root.iterdir()) == before
 
 
 # Requests
