@@ -35,12 +35,12 @@ check: $(VENV)/.dev
 
 # The documentation site with executed notebooks; `linna serve` shows it at /help.
 docs: $(VENV)/.dev
-	$(BIN)/python docs_site.py build/notebooks
+	$(BIN)/python docs_site.py notebooks build/notebooks
 	NO_MKDOCS_2_WARNING=1 NOTEBOOK_OUTPUTS=build/notebooks $(BIN)/python -m mkdocs build --strict
 
 # External links of the documentation; needs the network.
 links: $(VENV)/.dev
-	$(BIN)/python docs_site.py --links
+	$(BIN)/python docs_site.py links
 
 # Telemetry displays; `linna serve` shows them at /mct. The lock file states version and checksum.
 openmct: deploy/openmct/node_modules/.package-lock.json

@@ -1,11 +1,13 @@
 """The documentation site: strict build, generated reference, self-contained pages, spelling, and commands that run."""
 
+import http.server
 import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -76,6 +78,45 @@ def test_spelling() -> None:
         cwd=ROOT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert checked.returncode == 0, checked.stdout
+
+
+def test_external_links_are_found_with_their_places_and_local_ones_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "a.md").write_text(
+        "[one](https://a.org/x) `http://127.0.0.1:8042/` <https://b.org/y> https://ops.example/linna http://localhost:1\n"
+    )
+    (tmp_path / "CITATION.cff").write_text('url: "https://c.org"\n')
+    monkeypatch.setattr(docs_site, "ROOT", tmp_path)
+    found = docs_site.external_links()
+    assert {link: place for link, place in found.items() if not place.startswith("data product")} == {
+        "https://a.org/x": "docs/a.md",
+        "https://b.org/y": "docs/a.md",
+        "https://c.org": "CITATION.cff",
+    }
+    assert any(place.startswith("data product") for place in found.values())
+
+
+def test_links_without_an_answer_are_broken() -> None:
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_HEAD(self) -> None:
+            self.send_response({"/good": 200, "/get": 405}.get(self.path, 404))
+            self.end_headers()
+
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        broken = docs_site.broken_links({f"{address}/{name}": "a.md" for name in ("good", "get", "gone")})
+        server.shutdown()
+    assert broken == [f"a.md: {address}/gone: expected an answer, found status 404"]
 
 
 def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:

@@ -2,6 +2,7 @@
 
 import builtins
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import pytest
 import uvicorn
 from nbclient import NotebookClient
 
+import docs_site
 import linna
 from ground_service.access.service import add_user
 from ground_service.app import create_app
@@ -151,6 +153,45 @@ def test_a_notebook_runs(
     shown = [one for cell in notebook.cells for one in cell.get("outputs", [])]
     assert any("image/png" in one.get("data", {}) for one in shown)
     assert not any(one["output_type"] == "error" or one.get("name") == "stderr" for one in shown)
+    page, pictures = docs_site.notebook_page(path.stem, json.loads(nbformat.writes(notebook)))
+    assert re.findall(r"!\[Output of the cell\]\((.*?)\)", page) == list(pictures)
+    assert all(octets.startswith(b"\x89PNG") and len(octets) < 150_000 for octets in pictures.values())
+    assert "<table" in page and "<style" not in page
+    assert len(page) < 40_000
+
+
+def test_a_page_shows_outputs_in_the_order_of_the_cells() -> None:
+    cells = [
+        {"cell_type": "markdown", "source": ["# Title\n", "Text."]},
+        {
+            "cell_type": "code",
+            "source": "both()",
+            "outputs": [
+                {"output_type": "stream", "name": "stdout", "text": ["12 frames\n"]},
+                {
+                    "output_type": "execute_result",
+                    "data": {"text/plain": ["3"], "text/html": "<style>a</style><p>\n\n3</p>"},
+                },
+                {"output_type": "display_data", "data": {"image/png": "iVBORw==", "text/plain": "<Figure>"}},
+            ],
+        },
+        {
+            "cell_type": "code",
+            "source": "7",
+            "outputs": [{"output_type": "execute_result", "data": {"text/plain": "7"}}],
+        },
+    ]
+    page, pictures = docs_site.notebook_page("pass", {"cells": cells})
+    assert page.split("\n\n") == [
+        "# Title\nText.",
+        "```python\nboth()\n```",
+        "```text\n12 frames\n```",
+        "<p>\n3</p>",
+        "![Output of the cell](pass-1.png)",
+        "```python\n7\n```",
+        "```text\n7\n```\n",
+    ]
+    assert pictures == {"pass-1.png": b"\x89PNG"}
 
 
 def test_there_are_three_notebooks() -> None:
