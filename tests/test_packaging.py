@@ -1,18 +1,31 @@
 """Wheel and source distribution: complete, and usable from another folder without the checkout."""
 
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tarfile
+import urllib.request
 import venv
 import zipfile
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+from tests.ground_service.conftest import free_port, wait_for
+
 ROOT = Path(__file__).resolve().parents[1]
+OUTSIDE = {
+    name: value
+    for name, value in os.environ.items()
+    if name not in ("PYTHONPATH", "LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
+}
+"""Environment of commands that do not know of the checkout."""
+
 SCENARIO_NAMES = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"))
 
 
@@ -66,38 +79,110 @@ def test_the_source_distribution_can_be_built_again(built: Path, tmp_path: Path)
     assert "payload_emulator/flight/models/craters.onnx" in names
 
 
-@pytest.mark.slow
-def test_the_installed_wheel_works_from_another_folder(built: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder `bin` of a new environment into which pip has installed the wheel; it sees the packages of this one."""
     (wheel,) = built.glob("*.whl")
-    home = tmp_path / "venv"
-    venv.create(home, with_pip=False)
+    home = tmp_path_factory.mktemp("installed") / "venv"
+    venv.create(home, with_pip=not has_base_pip())
+    done = pip_of(home / "bin", "install", "--no-deps", "--no-index", str(wheel))
+    assert done.returncode == 0, done.stdout + done.stderr
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(home), "platbase": str(home)}))
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(packages)
-    here = sysconfig.get_path("purelib")
-    (packages / "shared.pth").write_text(here + "\n")
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "LINNA_DATA")}
+    (packages / "shared.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return home / "bin"
 
-    def linna(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [str(home / "bin" / "python"), "-m", "linna", *arguments],
-            cwd=elsewhere, env=kept | {"XDG_DATA_HOME": str(elsewhere)}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
 
-    where = subprocess.run(
-        [str(home / "bin" / "python"), "-c", "import linna; print(linna.__file__)"],
-        cwd=elsewhere, env=kept, capture_output=True, text=True, check=True,
-    ).stdout  # fmt: skip
-    assert str(packages) in where
-    assert linna("demo", "--help").returncode == 0
-    flown = linna("orbit", "propagate", "selenita", "--days", "0.1", "--step", "60", "--out", "day.oem")
-    assert flown.returncode == 0, flown.stderr
-    assert (elsewhere / "day.oem").is_file()
-    assert linna("mission", "write", "selenita", "--out", "mission.toml").returncode == 0
-    assert linna("detector", "info").returncode == 0
-    assert linna("pass", "list", "--home", "home").returncode == 0
+@cache
+def has_base_pip() -> bool:
+    version = [sys._base_executable, "-m", "pip", "--version"]
+    return subprocess.run(version, env=OUTSIDE, capture_output=True, check=False).returncode == 0
+
+
+def pip_of(programs: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run pip for an environment: that of the base interpreter, as `make` does, else that of the environment."""
+    python = programs / "python"
+    pip = [sys._base_executable, "-m", "pip", "--python", python] if has_base_pip() else [python, "-m", "pip"]
+    return subprocess.run([*pip, *arguments], env=OUTSIDE, capture_output=True, text=True, check=False)
+
+
+def in_folder(folder: Path, *command: str | Path) -> str:
+    """Output of a command that runs outside of the checkout."""
+    done = subprocess.run(
+        command, cwd=folder, env=OUTSIDE | {"XDG_DATA_HOME": str(folder)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_pip_installs_the_wheel_with_its_console_script(installed: Path, tmp_path: Path) -> None:
+    where = Path(
+        in_folder(tmp_path, installed / "python", "-c", "import linna; print(linna.__file__)").strip()
+    )
+    assert installed.parent in where.parents and ROOT not in where.parents
+    assert "../../../bin/linna" in pip_of(installed, "show", "--files", "linna").stdout
+    linna = installed / "linna"
+    assert "usage: linna demo" in in_folder(tmp_path, linna, "demo", "--help")
+    in_folder(
+        tmp_path, linna, "orbit", "propagate", "selenita", "--days", "0.1", "--step", "60", "--out", "day.oem"
+    )
+    assert (tmp_path / "day.oem").is_file()
+    in_folder(tmp_path, linna, "mission", "write", "selenita", "--out", "mission.toml")
+    in_folder(tmp_path, linna, "detector", "info")
+
+
+SHORT = """
+name = "short"
+seed = 7
+[window]
+search = "none"
+duration_s = 60.0
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["anchored"]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
+    """The tour of the README on a short pass; the service answers on a free port."""
+    tour = re.findall(
+        r"^linna (?:demo|serve|plan|report) .*$", (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    assert [line.split()[1] for line in tour] == ["demo", "serve", "plan", "plan", "report"]
+    (tmp_path / "short.toml").write_text(SHORT)
+
+    def command(line: str, *more: str) -> list[str | Path]:
+        return [installed / "linna", *shlex.split(line)[1:], *more]
+
+    in_folder(tmp_path, *command(tour[0], "--scenario", "short.toml"))
+    port = free_port()
+    environment = OUTSIDE | {"XDG_DATA_HOME": str(tmp_path)}
+    server = subprocess.Popen(
+        command(tour[1], "--port", str(port)), cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL
+    )
+    try:
+        wait_for(lambda: server.poll() is not None or answers(port), "an answer of the service", 120.0)
+        assert server.poll() is None
+    finally:
+        server.terminate()
+        server.wait(60)
+    for line in tour[2:]:
+        in_folder(tmp_path, *command(line))
+    assert (tmp_path / "linna-demo" / "window.cltu").stat().st_size > 0
+    assert (tmp_path / "linna-demo" / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+def answers(port: int) -> bool:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/static/site.css", timeout=10) as answer:
+            return answer.status == 200 and b"{" in answer.read()
+    except OSError:
+        return False
 
 
 def test_the_project_has_its_legal_and_citation_files() -> None:
