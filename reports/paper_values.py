@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from reports.arrays import FloatArray
 from reports.values import (
     ByteArray,
     ClassScore,
     GalleryFrame,
-    HeadlineFigure,
     NavigationSeries,
+    ReportCommon,
     TimeSpan,
     TrackSeries,
 )
@@ -114,10 +114,9 @@ class Difference:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperReport:
+class PaperReport(ReportCommon):
     """Content of the document; what could not be made has its reason in ``not_available``."""
 
-    title: str
     identity: str
     quick: bool
     orbit: PaperOrbit | None = None
@@ -129,13 +128,3 @@ class PaperReport:
     detectors: tuple[DetectorResult, ...] = ()
     sessions: tuple[PaperSession, ...] = ()
     differences: tuple[Difference, ...] = ()
-    verdict: str = ""
-    verdict_level: str = ""
-    generated_for: str = ""
-    created_utc: str = ""
-    evidence_level: str = ""
-    headline: tuple[HeadlineFigure, ...] = ()
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    data_sources: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    not_available: Mapping[str, str] = field(default_factory=dict)

@@ -12,7 +12,7 @@ A report reads no clock: the same value gives the same octets.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -503,26 +503,38 @@ class AnchorRead:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PassReport:
-    """Content of the report of one pass.
+class ReportCommon:
+    """Content that every report has.
 
-    ``verdict`` is the sentence on the table of ``requirements``; ``verdict_level`` is "good", "caution", "bad" or ""
-    and sets the colour of the rule next to them. ``evidence_level`` is the evidence level of the
-    accuracy figures. ``not_available`` gives the reason why a section is missing; its keys are field names of this
-    class. ``configuration`` maps a group ("camera") to its settings.
+    ``verdict_level`` is "good", "caution", "bad" or "" and sets the colour of the rule next to the verdict.
+    ``evidence_level`` is the evidence level of the accuracy figures. ``not_available`` gives the reason why a section
+    is missing; its keys are field names of the report.
     """
 
     title: str
-    pass_id: str
+    _: KW_ONLY
     verdict: str = ""
     verdict_level: str = ""
-    requirements: tuple[Requirement, ...] = ()
     generated_for: str = ""
     created_utc: str = ""
     evidence_level: str = ""
     headline: tuple[HeadlineFigure, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    not_available: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassReport(ReportCommon):
+    """Content of the report of one pass.
+
+    ``verdict`` is the sentence on the table of ``requirements``. ``configuration`` maps a group ("camera") to its
+    settings.
+    """
+
+    pass_id: str
+    requirements: tuple[Requirement, ...] = ()
     span: TimeSpan | None = None
     accounting: FrameAccounting | None = None
     packets: PacketAccounting | None = None
@@ -542,8 +554,6 @@ class PassReport:
     truth_ledger: tuple[AnchorRead, ...] = ()
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     scenario_text: str = ""
-    remarks: tuple[str, ...] = ()
-    not_available: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -570,22 +580,11 @@ class CampaignPass:
 
 
 @dataclass(frozen=True, slots=True)
-class CampaignReport:
+class CampaignReport(ReportCommon):
     """Comparison of many passes: trend, and by build, altitude and illumination."""
 
-    title: str
     campaign_id: str
     passes: tuple[CampaignPass, ...] = ()
-    verdict: str = ""
-    verdict_level: str = ""
-    generated_for: str = ""
-    created_utc: str = ""
-    evidence_level: str = ""
-    headline: tuple[HeadlineFigure, ...] = ()
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    data_sources: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    not_available: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -652,10 +651,9 @@ class TrainingCurve:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DetectorReport:
+class DetectorReport(ReportCommon):
     """A detector judged on a data set: scores by class, curves, calibration, bias, what it costs."""
 
-    title: str
     model_id: str
     score: DetectorScore | None = None
     by_degradation: tuple[NamedScore, ...] = ()
@@ -667,17 +665,7 @@ class DetectorReport:
     cost: Mapping[str, str] = field(default_factory=dict)
     gallery: tuple[GalleryFrame, ...] = ()
     worst_frames: tuple[GalleryFrame, ...] = ()
-    verdict: str = ""
-    verdict_level: str = ""
-    generated_for: str = ""
-    created_utc: str = ""
-    evidence_level: str = ""
-    headline: tuple[HeadlineFigure, ...] = ()
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    data_sources: tuple[str, ...] = ()
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    not_available: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -719,10 +707,9 @@ class IntegrityCheck:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DatasetReport:
+class DatasetReport(ReportCommon):
     """A data set: how much, of what, from where, in which light, and whether it is whole."""
 
-    title: str
     dataset_id: str
     frames_by_part: Mapping[str, int] = field(default_factory=dict)
     classes: tuple[ClassCount, ...] = ()
@@ -731,17 +718,7 @@ class DatasetReport:
     terrain: TerrainMap | None = None
     integrity: tuple[IntegrityCheck, ...] = ()
     gallery: tuple[GalleryFrame, ...] = ()
-    verdict: str = ""
-    verdict_level: str = ""
-    generated_for: str = ""
-    created_utc: str = ""
-    evidence_level: str = ""
-    headline: tuple[HeadlineFigure, ...] = ()
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    data_sources: tuple[str, ...] = ()
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    not_available: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -788,10 +765,9 @@ class ChangedFrame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RegressionReport:
+class RegressionReport(ReportCommon):
     """A candidate build against a baseline over archived passes."""
 
-    title: str
     regression_id: str
     candidate: str = ""
     baseline: str = ""
@@ -799,13 +775,3 @@ class RegressionReport:
     candidate_passes: tuple[CampaignPass, ...] = ()
     baseline_passes: tuple[CampaignPass, ...] = ()
     changed_frames: tuple[ChangedFrame, ...] = ()
-    verdict: str = ""
-    verdict_level: str = ""
-    generated_for: str = ""
-    created_utc: str = ""
-    evidence_level: str = ""
-    headline: tuple[HeadlineFigure, ...] = ()
-    provenance: Mapping[str, str] = field(default_factory=dict)
-    data_sources: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    not_available: Mapping[str, str] = field(default_factory=dict)
