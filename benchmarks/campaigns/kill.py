@@ -44,10 +44,10 @@ from ground_service.access.service import add_user
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store import audit, repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker.integrity import verify
 from lunar.timescales import format_utc
+from tests.ground_service.archive_hash import archive_hash
 
 SPACECRAFT = 76
 CLIENTS = 4

@@ -36,8 +36,8 @@ from benchmarks.ground import mixed_downlink
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
+from tests.ground_service.archive_hash import archive_hash
 
 SPACECRAFT = 76
 SECTOR_OCTETS = 512

@@ -12,7 +12,7 @@ import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
-from ground_service.evaluation.store import reference_of
+from ground_service.evaluation.inputs import reference_of
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of
 from ground_service.missions.frames import camera_of, declared_frames

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.evaluation import report_store
+from ground_service.evaluation import store
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary, StoredReport
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -41,13 +41,13 @@ def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOv
 def get_report(ground: Ground, report_id: str) -> StoredReport:
     """Return a report."""
     with ground.database.reading() as connection:
-        return report_store.get_report(connection, report_id)
+        return store.get_report(connection, report_id)
 
 
 def newest_reports(ground: Ground, pass_ids: Sequence[int]) -> list[ReportSummary]:
     """Return verdict and main figures of the newest report of each of these passes that has one."""
     with ground.database.reading() as connection:
-        return [_summary(one) for one in report_store.newest_reports(connection, pass_ids)]
+        return [_summary(one) for one in store.newest_reports(connection, pass_ids)]
 
 
 def _summary(report: StoredReport) -> ReportSummary:
@@ -78,7 +78,7 @@ def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tu
     """
     with ground.database.reading() as connection:
         get_pass(connection, pass_id)
-        return report_store.list_reports(connection, pass_id, limit=limit, offset=offset)
+        return store.list_reports(connection, pass_id, limit=limit, offset=offset)
 
 
 @lru_cache(maxsize=64)

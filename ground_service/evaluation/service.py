@@ -13,10 +13,10 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
-from ground_service.evaluation import report_store as store
+from ground_service.evaluation import store
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
+from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.model import ChangedFigure, StoredReport
-from ground_service.evaluation.store import load_pass_inputs
 from ground_service.evaluation.surface import surface_map
 from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground

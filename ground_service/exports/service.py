@@ -21,8 +21,8 @@ from sqlalchemy import Connection
 
 from ground_service.errors import EvaluationError, storage_error
 from ground_service.evaluation.core import PassInputs, evaluate_pass
+from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.navigation.trajectory import format_tum
-from ground_service.evaluation.store import load_pass_inputs
 from ground_service.exports import messages
 from ground_service.exports.czml import format_czml
 from ground_service.exports.formats import FORMATS, Format

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ground_service.evaluation.detection.recall import expected_craters, match_detections
+from ground_service.evaluation.inputs import read_image
 from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.evaluation.navigation.drift import navigation_statistics
 from ground_service.evaluation.service import plain
-from ground_service.evaluation.store import read_image
 from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
 from ground_service.regression import store

@@ -27,8 +27,8 @@ from ground_service.errors import (
     public_text,
 )
 from ground_service.evaluation.preparation import align_pass
-from ground_service.evaluation.report_store import newest_report
 from ground_service.evaluation.service import make_report, pass_summary, reevaluate
+from ground_service.evaluation.store import newest_report
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.missions.rules import DEFAULT_RULES, Rule

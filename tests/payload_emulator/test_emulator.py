@@ -124,7 +124,7 @@ def test_the_dumps_are_listed_with_the_times_they_left(archive: tuple[dict[str, 
 def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
     archive: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
-    from ground_service.evaluation.store import load_pass_inputs
+    from ground_service.evaluation.inputs import load_pass_inputs
     from ground_service.passes.archive_import import import_archive
     from ground_service.timekeeping.recorrelation import in_force
     from ground_service.worker.follow_up import open_following

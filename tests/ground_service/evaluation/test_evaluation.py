@@ -15,8 +15,8 @@ from ground_service.evaluation.service import evaluate, make_report, pass_summar
 from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from reports.values import PassReport
+from tests.ground_service.archive_hash import archive_hash
 
 FRAMES = 40
 STEP_M = 24_536.0

@@ -15,8 +15,8 @@ from ground_service.ephemerides.attitudes import HEADER, load_attitudes
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.inputs import load_pass_inputs, orientation_of
 from ground_service.evaluation.service import evaluate
-from ground_service.evaluation.store import load_pass_inputs, orientation_of
 from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file

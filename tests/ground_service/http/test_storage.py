@@ -16,8 +16,8 @@ from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest
 from ground_service.settings import Settings
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.worker.jobs import run_job
+from tests.ground_service.archive_hash import archive_hash
 
 with warnings.catch_warnings():
     # The test client's next version wants another HTTP library.

@@ -18,8 +18,8 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.redecode import redecode
 from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
+from tests.ground_service.archive_hash import archive_hash
 from tmtc.dictionary import DICTIONARY
 
 KILLS = 4

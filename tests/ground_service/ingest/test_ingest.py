@@ -20,9 +20,9 @@ from ground_service.ingest import edge_store as edges
 from ground_service.ingest.edges import MIDDLE
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
+from tests.ground_service.archive_hash import archive_hash
 from tmtc.crc import append_crc
 from tmtc.downlink import encode_cadus
 

@@ -15,8 +15,8 @@ from ground_service.ground import Ground
 from ground_service.ingest import live as live_ingest
 from ground_service.ingest.live import Spool, WatchedFolder, follow_tcp
 from ground_service.ingest.service import ingest_file
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
+from tests.ground_service.archive_hash import archive_hash
 
 
 def hash_of(ground: Ground) -> str:

@@ -33,9 +33,9 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import Completeness
 from ground_service.passes.service import completeness, define_pass
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
+from tests.ground_service.archive_hash import archive_hash
 from tmtc.link import LinkSettings
 
 NS = 1_000_000_000

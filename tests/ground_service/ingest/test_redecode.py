@@ -19,8 +19,8 @@ from ground_service.ingest.store import store_batch
 from ground_service.passes.service import define_pass, events, parameter_series, state_series
 from ground_service.settings import Settings
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
+from tests.ground_service.archive_hash import archive_hash
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 

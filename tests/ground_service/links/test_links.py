@@ -18,8 +18,8 @@ from ground_service.ingest.service import ingest_file
 from ground_service.links import service, store
 from ground_service.links.stream import ACKNOWLEDGEMENT
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import all_vehicles
+from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.links.conftest import Station, declare, operated, until
 from tmtc.uplink import UplinkDecoder
 

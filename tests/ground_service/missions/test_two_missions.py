@@ -12,8 +12,8 @@ import pytest
 from ground_service.commanding.service import enter_command
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.evaluation.core import evaluate_pass
+from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import make_report
-from ground_service.evaluation.store import load_pass_inputs
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.frames import camera_of

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import select
 
 from ground_service.evaluation.core import evaluate_pass
-from ground_service.evaluation.store import filter_states, load_pass_inputs
+from ground_service.evaluation.inputs import filter_states, load_pass_inputs
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from sqlalchemy import delete
 
-from ground_service.evaluation.store import PassSpan
 from ground_service.ground import Ground
 from ground_service.ingest.store import store_samples
 from ground_service.passes import series
 from ground_service.passes.service import trend_series
+from ground_service.passes.span import PassSpan
 from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES, build_rollups
 from ground_service.store.vehicles import vehicle_id

@@ -18,10 +18,10 @@ from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest, ingest_file
 from ground_service.ingest.stream import DownlinkReader
 from ground_service.store import files, repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import dispatch
 from ground_service.worker.dispatch import ThreadDispatcher
+from tests.ground_service.archive_hash import archive_hash
 
 
 @pytest.fixture(scope="module")

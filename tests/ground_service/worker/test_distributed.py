@@ -20,7 +20,6 @@ from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.database import (
     empty_database,
     open_database,
@@ -32,6 +31,7 @@ from ground_service.store.vehicles import vehicle_id
 from ground_service.worker.app import run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import _lock_key, run_job
+from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.schema import described_schema
 
 SPACECRAFT = 76

@@ -22,13 +22,13 @@ from ground_service.ingest.store import results_of_vehicle
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store import repository
-from ground_service.store.canonical import archive_hash
 from ground_service.store.database import open_database, prepare_database
 from ground_service.store.files import FileArchive
 from ground_service.store.models import METADATA
 from ground_service.worker.exchange import export_database, import_database
 from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc
+from tests.ground_service.archive_hash import archive_hash
 from tmtc.downlink import decode
 
 NS = 1_000_000_000

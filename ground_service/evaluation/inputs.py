@@ -1,0 +1,446 @@
+"""What is stored about a pass, read into the plain arrays that the evaluation takes."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection
+
+from ground_service.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
+from ground_service.ephemerides.model import Ephemeris as EphemerisEntry
+from ground_service.ephemerides.store import covering_ephemerides, get_ephemeris
+from ground_service.errors import EvaluationError, InvalidInput
+from ground_service.evaluation.core import PassInputs
+from ground_service.evaluation.detection.fixes import IdentificationSamples
+from ground_service.evaluation.detection.landmarks import MappedCraters, mapped_craters
+from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.instruments import instrument_reports
+from ground_service.evaluation.navigation.baselines import StartState
+from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
+from ground_service.evaluation.verdict import Limits
+from ground_service.ground import Ground
+from ground_service.missions.frames import DeclaredFrames, camera_of, declared_frames
+from ground_service.missions.model import Camera, Mission
+from ground_service.missions.service import mission_of_pass
+from ground_service.passes import store as passes
+from ground_service.passes.model import PassRecord
+from ground_service.passes.packet_accounting import packet_accounting
+from ground_service.passes.samples import (
+    NavigationSamples,
+    OutcomeSamples,
+)
+from ground_service.passes.span import PassSpan, pass_span
+from ground_service.passes.store import code_labels, detection_samples, event_list
+from ground_service.store.codec import unpack_filter_states, unpack_identifications
+from ground_service.store.files import FileArchive
+from ground_service.store.vehicles import Vehicle, get_vehicle
+from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.datafolder import DataFolder
+from lunar.ephemeris_files import load_ephemeris
+from lunar.frames import Orientation
+from lunar.timescales import format_utc, parse_utc
+from reports.values import (
+    HousekeepingParameter,
+    InstrumentReport,
+)
+from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY
+from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
+from tmtc.stream import cut_packets
+
+_TRENDS = (
+    ("temperature_c", "°C"),
+    ("bus_voltage_v", "V"),
+    ("power_w", "W"),
+    ("memory_used_kib", "KiB"),
+    ("queue_depth", "packets"),
+    ("storage_used_permille", "‰"),
+)
+
+
+class ImageShelf(Mapping[int, NDArray[np.uint8]]):
+    """Archived images of a pass, read from the archive on demand."""
+
+    def __init__(self, files: FileArchive, sha256_by_frame: Mapping[int, str]) -> None:
+        self._files = files
+        self._sha256 = dict(sha256_by_frame)
+
+    def __getitem__(self, frame_number: int) -> NDArray[np.uint8]:
+        return read_image(self._files.get(self._sha256[frame_number]), f"frame {frame_number}")
+
+    def __contains__(self, frame_number: object) -> bool:
+        return frame_number in self._sha256
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._sha256)
+
+    def __len__(self) -> int:
+        return len(self._sha256)
+
+
+def read_image(octets: bytes, name: str) -> NDArray[np.uint8]:
+    """An 8-bit image (H, W) or (H, W, 3) from PNG octets.
+
+    Raises
+    ------
+    InvalidInput
+        If the octets are no such image.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(octets)) as image:
+            return np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"), dtype=np.uint8)
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise InvalidInput(name, "", "a PNG image", str(error)) from None
+
+
+def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassInputs:
+    """Everything that the evaluation of a pass needs, as stored now.
+
+    Raises
+    ------
+    NotFound
+        If there is no such pass.
+    """
+    with ground.database.reading() as connection:
+        record = passes.get_pass(connection, pass_id)
+        span = pass_span(connection, record)
+        manifest: dict[str, Any] = record.manifest
+        mission = mission_of_pass(connection, record.mission_id, record.manifest)
+        declared = declared_frames(mission.frames, ground.data)
+        viewing = viewing_of(mission.camera, attitude_table(ground.files, record), span)
+        vehicle = get_vehicle(connection, record.vehicle_id)
+        ephemeris = reference_of(connection, record)
+        return PassInputs(
+            pass_id=str(pass_id),
+            title=record.name,
+            start_utc_ns=record.start_utc_ns,
+            stop_utc_ns=record.stop_utc_ns,
+            packets=packet_accounting(ground.files, connection, record, span),
+            viewing=viewing,
+            orientation=declared.orientation,
+            reference=None if ephemeris is None else load_ephemeris(ground.files.path(ephemeris.sha256)),
+            catalogue=_catalogue(ground, record),
+            detections=detection_samples(connection, span),
+            navigation=navigation_samples(connection, span),
+            outcomes=outcome_samples(connection, span),
+            start_state=start_state_of(manifest),
+            filter_states=filter_states(connection, span),
+            identifications=identification_samples(connection, span),
+            landmarks=landmark_reports(connection, span),
+            instruments=reported_instruments(connection, span),
+            sun_known=manifest.get("light", "real") == "real",
+            burns=burns_of(manifest),
+            gravity=declared.gravity,
+            onboard_gravity=declared.onboard_gravity,
+            refused=_refused(declared, mission.camera),
+            reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
+            limits=Limits(**mission.requirements.model_dump()),
+            no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
+            cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
+            frames_expected=manifest.get("frames_expected"),
+            cadence_s=manifest.get("cadence_s"),
+            housekeeping=_housekeeping(connection, span),
+            events=event_list(connection, span),
+            images=ImageShelf(ground.files, passes.frame_files(connection, pass_id)),
+            provenance=_provenance(mission, declared, manifest, record, vehicle, ephemeris, span),
+            data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
+            evidence_level=mission.evidence.text,
+            configuration=_configuration(manifest, record),
+            scenario_text=str(manifest.get("scenario_toml", "")),
+            generated_for="",
+            created_utc=created_utc,
+        )
+
+
+def navigation_samples(connection: Connection, span: PassSpan) -> tuple[NavigationSamples, ...]:
+    """States of every estimator, in time order."""
+    names = (
+        "ticks", "estimator", "frame_number", "outcome", "latitude_deg", "longitude_deg", "altitude_m",
+        "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
+    )  # fmt: skip
+    columns = passes.sample_arrays(connection, span, "navigation_states", names)
+    outcomes = DICTIONARY.labels("navigation_state", "outcome")
+    return tuple(
+        NavigationSamples(
+            estimator=name,
+            frame_number=part["frame_number"],
+            utc_ns=span.utc_ns(part["ticks"]),
+            latitude_deg=part["latitude_deg"],
+            longitude_deg=part["longitude_deg"],
+            altitude_m=part["altitude_m"],
+            sigma_rtn_m=np.column_stack([part["sigma_r_m"], part["sigma_t_m"], part["sigma_n_m"]]),
+            nis=part["nis"],
+            matched=part["matched"],
+            outcome=code_labels(outcomes, part["outcome"]),
+        )
+        for name, part in _by_estimator(columns, "navigation_state")
+    )
+
+
+def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
+    """Return the estimates of the navigation filter with their covariances, in time order; None without any."""
+    rows = passes.samples(connection, span, "filter_states", ("ticks", "values", "innovation_degrees"))
+    if not rows["ticks"]:
+        return None
+    ticks, first = np.unique(np.array(rows["ticks"], dtype=np.int64), return_index=True)
+    state, covariance = unpack_filter_states([bytes(rows["values"][i]) for i in first.tolist()], SIZE)
+    degrees = [rows["innovation_degrees"][i] for i in first.tolist()]
+    return FilterStates(
+        span.utc_ns(ticks),
+        state,
+        covariance,
+        np.array([-1 if known is None else known for known in degrees], dtype=np.int64),
+    )
+
+
+def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
+    """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
+    rows = passes.samples(connection, span, "identifications", ("ticks", "items"))
+    if not rows["ticks"]:
+        return None
+    by_image = dict(zip(reversed(rows["ticks"]), reversed(rows["items"]), strict=True))
+    ticks = sorted(by_image)
+    items, offsets = unpack_identifications([bytes(by_image[tick]) for tick in ticks])
+    return IdentificationSamples(
+        utc_ns=np.repeat(span.utc_ns(ticks), np.diff(offsets)),
+        detection=items["detection"].astype(np.int64),
+        crater_id=items["crater_id"].astype(np.int64),
+    )
+
+
+def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
+    """Every report of a crater that the payload mapped itself, in time order, out of the packets."""
+    octets = passes.packet_octets(connection, span, APID_DETECTIONS)
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
+    return mapped_craters(tables.get("landmarks"))
+
+
+def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
+    """Return the statistics of the optional instruments of the payload, out of the packets."""
+    octets = passes.packet_octets(connection, span, APID_INSTRUMENTS)
+    names = tuple(one.name for one in instrument_telemetry())
+    return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets), only=names))
+
+
+def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:
+    """What every estimator made of every frame, in time order."""
+    names = (
+        "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
+    )  # fmt: skip
+    columns = passes.sample_arrays(connection, span, "frame_outcomes", names)
+    outcomes = DICTIONARY.labels("frame_outcome", "outcome")
+    triggers = DICTIONARY.labels("frame_outcome", "reset_trigger")
+    return tuple(
+        OutcomeSamples(
+            estimator=name,
+            frame_number=part["frame_number"],
+            utc_ns=span.utc_ns(part["ticks"]),
+            outcome=code_labels(outcomes, part["outcome"]),
+            reset_trigger=code_labels(triggers, part["reset_trigger"]),
+            candidate_pairs=part["candidate_pairs"],
+            anchor_reads=part["anchor_reads"],
+        )
+        for name, part in _by_estimator(columns, "frame_outcome")
+    )
+
+
+def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> Viewing:
+    """Return the pointing of the camera during a pass."""
+    message = attitudes.utc_ns
+    utc_ns = span.utc_ns(attitudes.image_ticks.tolist()) if message is None else message
+    order = np.argsort(utc_ns, kind="stable")
+    return Viewing(
+        camera_of(camera),
+        math.radians(camera.tilt_deg or 0.0),
+        math.radians(camera.yaw_deg or 0.0),
+        utc_ns[order],
+        attitudes.q_wxyz[order],
+        interpolated=message is not None,
+    )
+
+
+def attitude_table(files: FileArchive, record: PassRecord) -> AttitudeTable:
+    """Return the attitude of each frame of a pass from its archive."""
+    sha256 = record.attitude_sha256
+    return no_attitudes() if sha256 is None else load_attitudes(files.path(sha256))
+
+
+def orientation_of(mission: Mission, data: DataFolder) -> Orientation:
+    """Return the lunar orientation for the evaluation of a pass.
+
+    Raises
+    ------
+    EvaluationError
+        The mission does not state it, or it is not available on this machine.
+    """
+    declared = declared_frames(mission.frames, data)
+    if declared.orientation is None:
+        raise EvaluationError(declared.refused["orientation"])
+    return declared.orientation
+
+
+def _refused(declared: DeclaredFrames, camera: Camera) -> dict[str, str]:
+    missing = [name for name in ("pointing", "k1") if getattr(camera, name) is None]
+    refused = dict(declared.refused)
+    if missing:
+        words = {"pointing": "pointing", "k1": "lens"}
+        refused["camera"] = (
+            f"the mission description does not state the {' and '.join(words[name] for name in missing)} of the "
+            "camera: a nadir camera without distortion is assumed for frames without attitude"
+        )
+    return refused
+
+
+def _no_mission(spacecraft: int) -> str:
+    return (
+        f"no mission description of spacecraft {spacecraft} was registered when this pass was planned or defined. "
+        "Write one (linna mission write SCENARIO), enter it (linna mission add FILE), then define the pass again."
+    )
+
+
+def start_state_of(manifest: Mapping[str, Any]) -> StartState | None:
+    """The state that the estimators were started from, where the manifest names it."""
+    given = manifest.get("start_state")
+    if not given:
+        return None
+    return StartState(
+        utc_ns=parse_utc(given["utc"]),
+        position_icrf_m=np.array(given["position_icrf_m"], dtype=np.float64),
+        velocity_icrf_m_s=np.array(given["velocity_icrf_m_s"], dtype=np.float64),
+    )
+
+
+def burns_of(manifest: Mapping[str, Any]) -> tuple[CommandedBurn, ...]:
+    """The burns that were commanded during a pass, as the manifest names them."""
+    return tuple(
+        CommandedBurn(
+            parse_utc(burn["utc"]),
+            np.array(burn["delta_v_icrf_m_s"], dtype=np.float64),
+            float(burn["sigma_m_s"]),
+        )
+        for burn in manifest.get("burns", ())
+    )
+
+
+def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[str, dict[str, NDArray[Any]]]]:
+    """The columns of each estimator by name, one row per frame and time, in an order of content."""
+    names = DICTIONARY.labels(packet, "estimator")
+    keys = [column for name, column in columns.items() if name not in ("ticks", "frame_number", "estimator")]
+    order = np.lexsort([*keys, columns["frame_number"], columns["ticks"], columns["estimator"]])
+    identity = np.column_stack([columns[name][order] for name in ("estimator", "ticks", "frame_number")])
+    first = np.ones(len(order), dtype=np.bool_)
+    first[1:] = (np.diff(identity, axis=0) != 0).any(axis=1)
+    order = order[first]
+    parts = []
+    for code in np.unique(columns["estimator"]).tolist():
+        rows = order[columns["estimator"][order] == code]
+        parts.append(
+            (names.get(code, f"estimator {code}"), {name: column[rows] for name, column in columns.items()})
+        )
+    return parts
+
+
+def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:
+    names = ("ticks", *(name for name, _ in _TRENDS))
+    columns = passes.sample_arrays(connection, span, "housekeeping", names)
+    if len(columns["ticks"]) == 0:
+        return ()
+    utc_ns = span.utc_ns(columns["ticks"].tolist())
+    return tuple(
+        HousekeepingParameter(name, unit, utc_ns, columns[name].astype(np.float64)) for name, unit in _TRENDS
+    )
+
+
+def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
+    """Return the largest processor time of a step over the cadence, in percent of one core; None if unknown."""
+    octets = passes.packet_octets(connection, span, APID_PERFORMANCE)
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("performance",)).get("performance")
+    if table is None or not len(table) or not cadence_s:
+        return None
+    stages = [name for name in table.columns if name.startswith("cpu_") and name.endswith("_ms")]
+    total_ms = np.sum([np.asarray(table.columns[name], dtype=np.float64) for name in stages], axis=0)
+    known = total_ms[np.isfinite(total_ms)]
+    return float(known.max()) / (10.0 * cadence_s) if len(known) else None
+
+
+def reference_of(connection: Connection, record: PassRecord) -> EphemerisEntry | None:
+    if record.ephemeris_id is not None:
+        return get_ephemeris(connection, record.ephemeris_id)
+    covering = covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns)
+    return covering[0] if covering else None
+
+
+def _catalogue(ground: Ground, record: PassRecord) -> CraterCatalogue | None:
+    sha256 = record.catalogue_sha256
+    if sha256 is None:
+        return None
+    sources = [name for name in record.manifest.get("data_sources", ()) if "catalogue" in str(name)]
+    return replace(
+        load_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass"
+    )
+
+
+def _provenance(
+    mission: Mission,
+    declared: DeclaredFrames,
+    manifest: Mapping[str, Any],
+    record: PassRecord,
+    vehicle: Vehicle,
+    ephemeris: EphemerisEntry | None,
+    span: PassSpan,
+) -> dict[str, str]:
+    build = manifest.get("build") or {}
+    gravity = manifest.get("gravity") or {}
+    entries = {
+        "spacecraft": f"{vehicle.ccsds_id} ({vehicle.instance})",
+        "payload build": " ".join(str(build[key]) for key in ("name", "version") if key in build),
+        "detector model SHA-256": str(build.get("model_sha256", "")),
+        "parameters SHA-256": str(build.get("parameters_sha256", "")),
+        "scenario": str(manifest.get("scenario", "")),
+        "seed": str(manifest.get("seed", "")),
+        "light": str(manifest.get("light", "")),
+        "gravity of the truth": f"{gravity['truth']}, degree {gravity.get('degree', '?')}"
+        if "truth" in gravity
+        else "",
+        "mission description": (
+            "none registered"
+            if record.mission_id is None
+            else f"{mission.name}, revision {mission.revision[:16]}"
+        ),
+        "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
+        "dictionary": _dictionary_text(span.dictionary_version),
+        "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
+        "reference ephemeris": (
+            f"{ephemeris.object_name}, {ephemeris.frame}, SHA-256 {ephemeris.sha256[:16]}"
+            if ephemeris
+            else ""
+        ),
+        "crater catalogue SHA-256": str(record.catalogue_sha256 or "")[:16],
+        "archive": str(record.archive_digest or "")[:16],
+    }
+    return {name: value for name, value in entries.items() if value}
+
+
+def _dictionary_text(version: int) -> str:
+    if version != DICTIONARY.version:
+        return f"version {version}, until the archive is decoded again with version {DICTIONARY.version}"
+    return f"version {version}, {DICTIONARY.hash[:16]}"
+
+
+def _configuration(manifest: Mapping[str, Any], record: PassRecord) -> dict[str, dict[str, Any]]:
+    groups: dict[str, dict[str, Any]] = {}
+    if manifest.get("camera"):
+        groups["camera"] = dict(manifest["camera"])
+    groups["observation"] = {
+        "start_utc": format_utc(record.start_utc_ns),
+        "stop_utc": format_utc(record.stop_utc_ns),
+        **{key: manifest[key] for key in ("cadence_s", "frames_expected", "light") if key in manifest},
+    }
+    return {name: group for name, group in groups.items() if group}
