@@ -411,7 +411,7 @@ def _tracked(
     camera: PinholeCamera,
 ) -> tuple[IntArray, IntArray] | None:
     """Return believed pairs of detections and craters (indices into the map), None without any."""
-    pose = kalman.pose_of(prior.mean, frame.told_camera_from_mcmf, np.eye(3))
+    pose = kalman.pose_of(prior, frame.told_camera_from_mcmf, np.eye(3))
     altitude_m = max(float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M, 1_000.0)
     margin_px = min(3.5 * prior.position_sigma_m / altitude_m * camera.focal_px, 200.0)
     sighting = in_view(board, pose, camera, margin_px)

@@ -7,15 +7,25 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lunar.arrays import FloatArray
+from payload_emulator.flight.navigation.filter import AttitudeError
 from payload_emulator.flight.navigation.scalar import ScalarMeasurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeEstimate:
-    """Attitude of the camera at the time of a frame, with the standard deviation about each axis; None: unknown."""
+    """Attitude of the camera at the time of a frame; None: unknown.
+
+    Attributes
+    ----------
+    sigma_rad
+        Standard deviation about each axis.
+    error
+        How the error depends on that of the frame before; None: it is independent in each frame.
+    """
 
     camera_from_icrf: FloatArray | None
     sigma_rad: float | None = None
+    error: AttitudeError | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,9 @@ The gyroscopes carry the attitude from sample to sample, the star tracker correc
 with the gyroscopes alone and its uncertainty grows. Without a sample before, or after a gap in the samples, there is no
 attitude until the star tracker has a solution.
 
-The error is a small rotation delta in camera axes, true = exp([delta x]) estimate.
+The error is a small rotation delta in camera axes, true = exp([delta x]) estimate. It lasts from frame to frame: in an
+outage all of it, otherwise the part that the star tracker does not correct. Each attitude therefore states its
+correlation with that of the frame before.
 
 References
 ----------
@@ -14,7 +16,7 @@ Lefferts, Markley, Shuster (1982), Kalman filtering for spacecraft attitude esti
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,7 +28,7 @@ from lunar.frames import (
     rotation_vector_from_matrix,
 )
 from payload_emulator.flight.instruments import AttitudeEstimate, FlightInstrument, Knowledge, Reading
-from payload_emulator.flight.navigation.filter import corrected_covariance
+from payload_emulator.flight.navigation.filter import AttitudeError, corrected_covariance
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.instruments import ATTITUDE
 
@@ -90,6 +92,8 @@ class AttitudeState:
         On-board time of the last solution used; -1 before the first.
     refused
         Solutions refused since then.
+    memory
+        Derivatives of the errors by those at the frame before, shape (6, 6).
     """
 
     ticks: int
@@ -98,6 +102,7 @@ class AttitudeState:
     covariance: FloatArray
     tracked_ticks: int = -1
     refused: int = 0
+    memory: FloatArray = field(default_factory=lambda: np.eye(6))
 
 
 def start(parameters: StarTrackerParameters) -> AttitudeState:
@@ -111,13 +116,16 @@ def step(
     parameters: StarTrackerParameters, state: AttitudeState, samples: FloatArray, knowledge: Knowledge
 ) -> Reading:
     """Return the attitude at the frame."""
-    rows = []
+    rows, before = [], state.covariance
+    state = replace(state, memory=np.eye(6))
     for sample in samples:
         state = propagated(parameters, state, int(sample[0]), sample[6:9])
         state, row = corrected(parameters, state, sample[1], sample[2:6])
         rows.append({"sample_ticks": int(sample[0]), **row})
     attitude = attitude_of(parameters, state, knowledge.ticks)
     known = attitude.camera_from_icrf
+    if known is not None:
+        attitude = replace(attitude, error=attitude_error(state, before))
     frame: dict[str, object] = {
         ATTITUDE: (_NAN,) * 4 if known is None else quaternion_from_matrix(known),
         "attitude_sigma_deg": _NAN if attitude.sigma_rad is None else math.degrees(attitude.sigma_rad),
@@ -142,7 +150,8 @@ def propagated(
     covariance[_BIAS, _BIAS] += np.eye(3) * parameters.gyro_walk_rad_s_sqrt_s**2 * max(elapsed_s, 0.0)
     if state.camera_from_icrf is None or elapsed_s <= 0.0 or not np.isfinite(turn_rad).all():
         covariance[_ANGLE, :] = covariance[:, _ANGLE] = 0.0
-        return replace(state, ticks=ticks, camera_from_icrf=None, covariance=covariance)
+        memory = _without_angle(state.memory)
+        return replace(state, ticks=ticks, camera_from_icrf=None, covariance=covariance, memory=memory)
     rotation = matrix_from_rotation_vector(turn_rad - state.bias_rad_s * elapsed_s)
     transition = np.eye(6)
     transition[_ANGLE, _ANGLE] = rotation
@@ -150,7 +159,11 @@ def propagated(
     covariance = transition @ covariance @ transition.T
     covariance[_ANGLE, _ANGLE] += np.eye(3) * parameters.gyro_noise_rad_sqrt_s**2 * elapsed_s
     return replace(
-        state, ticks=ticks, camera_from_icrf=rotation @ state.camera_from_icrf, covariance=covariance
+        state,
+        ticks=ticks,
+        camera_from_icrf=rotation @ state.camera_from_icrf,
+        covariance=covariance,
+        memory=transition @ state.memory,
     )
 
 
@@ -171,7 +184,12 @@ def corrected(
         covariance[_ANGLE, _ANGLE] = noise
         # The first solution is the estimate: it has no prediction to differ from.
         started = replace(
-            state, camera_from_icrf=seen, covariance=covariance, tracked_ticks=state.ticks, refused=0
+            state,
+            camera_from_icrf=seen,
+            covariance=covariance,
+            tracked_ticks=state.ticks,
+            refused=0,
+            memory=_without_angle(state.memory),
         )
         return started, _row("used")
     design = np.eye(3, 6)
@@ -190,6 +208,7 @@ def corrected(
             covariance=corrected_covariance(state.covariance, design, gain, noise),
             tracked_ticks=state.ticks,
             refused=0,
+            memory=state.memory - gain @ (design @ state.memory),
         ),
         row,
     )
@@ -204,6 +223,28 @@ def attitude_of(parameters: StarTrackerParameters, state: AttitudeState, ticks: 
     if not sigma_rad <= parameters.largest_sigma_rad:
         return AttitudeEstimate(None)
     return AttitudeEstimate(state.camera_from_icrf, sigma_rad)
+
+
+def attitude_error(state: AttitudeState, before: FloatArray) -> AttitudeError:
+    """Return how the attitude error depends on that of the frame before, whose covariance (6, 6) is given.
+
+    With the joint covariance C = cov(error now, error then) = memory P(then), the best linear prediction of the error
+    now from the attitude error then is C_aa P_aa(then)^-1, and the rest is independent of it.
+    """
+    now, then = state.covariance[_ANGLE, _ANGLE], before[_ANGLE, _ANGLE]
+    if not then.any():
+        return AttitudeError(now, np.zeros((3, 3)), now)
+    joint = (state.memory @ before)[_ANGLE, _ANGLE]
+    memory: FloatArray = np.linalg.solve(then, joint.T).T
+    added = now - memory @ joint.T
+    return AttitudeError(now, memory, 0.5 * (added + added.T))
+
+
+def _without_angle(memory: FloatArray) -> FloatArray:
+    """Return the derivatives (6, 6) with an attitude error that is independent of former errors."""
+    memory = memory.copy()
+    memory[_ANGLE, :] = 0.0
+    return memory
 
 
 def _row(

@@ -144,12 +144,15 @@ class Observation:
         Attitude, shape (3, 3); None where the ADCS gave none: the frame is then coasted over.
     attitude_sigma_rad
         Standard deviation of this attitude, per axis; None: as in the parameters.
+    attitude_error
+        How the error of this attitude depends on that of the frame before; None: it is independent in each frame.
     """
 
     ticks: int
     found: Detections | None
     camera_from_icrf: FloatArray | None
     attitude_sigma_rad: float | None = None
+    attitude_error: kalman.AttitudeError | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,6 +270,7 @@ def step(
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
     state, decided = _entered(state, prior, observation, setup)
+    state = replace(state, estimate=kalman.with_attitude_error(state.estimate, observation.attitude_error))
     if found is None:
         return state, _report(state, setup, Outcome.no_image, mcmf_from_icrf, decided)
     if camera_from_icrf is None or not len(found):
@@ -274,7 +278,7 @@ def step(
     if parameters.relative.enabled:
         state, ties = tied(state, found, camera_from_icrf, mcmf_from_icrf, setup)
         decided = replace(decided, ties=ties)
-    pose = kalman.pose_of(state.estimate.mean, camera_from_icrf, mcmf_from_icrf)
+    pose = kalman.pose_of(state.estimate, camera_from_icrf, mcmf_from_icrf)
     search = search_around(state, pose, found, setup)
     state = replace(
         state,
@@ -403,7 +407,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
         tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
         return Search(prior, fix, tried if fix is None else fix.identification.candidates, expected)
     sighting = in_view(landmarks, pose, camera, search_margin_px(prior, camera, parameters.limits))
-    prior = prior.only_craters(sighting.index)
+    prior = prior.only_craters(np.append(sighting.index, kalman.TURN))
     sighting = look(landmarks, sighting.index, pose, camera, prior.shifts(sighting.index))
     if not len(sighting):
         return Search(prior, None, 0, 0)
@@ -448,14 +452,15 @@ def map_frame(
     The map gets the frame as corrected: the attitude turned by its estimated error, pixels without their bias.
     """
     parameters, landmarks, mean = setup.parameters, state.landmarks, state.estimate.mean
-    pose = kalman.pose_of(mean, camera_from_icrf, mcmf_from_icrf)
+    pose = kalman.pose_of(state.estimate, camera_from_icrf, mcmf_from_icrf)
     seen = in_view(landmarks, pose, setup.camera, parameters.limits.map_margin_px)
     listed = landmarks.ids[seen.index] < FIRST_LANDMARK_ID
-    used, turn_rad = _NO_CRATERS, mean[kalman.ATTITUDE]
+    used, turn_rad = _NO_CRATERS, mean[kalman.ATTITUDE] + kalman.turn_of(state.estimate)
     sigma_rad = math.hypot(parameters.errors.attitude_bias_rad, parameters.errors.attitude_noise_rad)
     if fix is not None:
         used = fix.identification.detection[landmarks.ids[fix.index] < FIRST_LANDMARK_ID]
-        turn_rad, sigma_rad = turn_rad + fix.update.attitude_rad, fix.update.attitude_sigma_rad
+        turn_rad = mean[kalman.ATTITUDE] + fix.update.attitude_rad
+        sigma_rad = fix.update.attitude_sigma_rad
     surface_m = state.surface_m
     if listed.any():
         places = landmarks.position_mcmf_m[seen.index[listed]]

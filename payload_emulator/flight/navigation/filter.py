@@ -4,14 +4,15 @@ The first 18 states are position and velocity (ICRF), empirical acceleration (ra
 bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. They are followed by three states
 for each crater that was used and is still in view: its offset from its catalogued position, east, north, up. A crater
 is observed several times on a pass with the same error, so its error is a state and not independent noise; the state is
-removed when the crater leaves the view. The attitude noise, one rotation for all detections of a frame, is a state
+removed when the crater leaves the view. The attitude error of a frame, one rotation for all its detections, is a state
 during an update: it is observable in a wide field of view, and the projection is too nonlinear over a degree to treat
-it as noise about the measured attitude.
+it as noise about the measured attitude. Where the source of the attitude states how much of the error remains from one
+frame to the next (`AttitudeError`), it is a state from frame to frame.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,8 +26,9 @@ SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 ATTITUDE, PIXEL, OFFSET, SCALE = slice(9, 12), slice(12, 14), slice(14, 17), 17
 ORBIT = slice(0, 9)
-# Stands among the craters of a state for the rotation that the attitude of this one frame is off by.
-_TURN = np.array([-2], dtype=np.int64)
+TURN: IntArray = np.array([-2], dtype=np.int64)
+"""Stands among the craters of a state for the rotation that the attitude of the frame is off by."""
+
 # Projection bends by the square of a move over the altitude: after one this small another iteration gains millimetres.
 _LINEAR_M = 10.0
 # The same for a turn: at the corner of the image 1e-3 rad bend by a twentieth of a pixel.
@@ -61,6 +63,25 @@ class CommonErrors:
     catalogue_offset_m: tuple[float, float, float] = (15.0, 15.0, 10.0)
     scale: float = 0.0
     scale_sigma: float = 5e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeError:
+    """Error of the attitude of a frame, a rotation vector e in camera axes: e = M e(frame before) + new part.
+
+    Attributes
+    ----------
+    covariance
+        Of e, shape (3, 3).
+    memory
+        M, shape (3, 3): identity where the error lasts, zero where it is independent in each frame.
+    added
+        Covariance of the new part, shape (3, 3): covariance - M covariance(frame before) M'.
+    """
+
+    covariance: FloatArray
+    memory: FloatArray
+    added: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,6 +227,32 @@ def widened(state: FilterState, sigma_position_m: float, sigma_velocity_m_s: flo
     return FilterState(state.ticks, state.mean, covariance, state.craters)
 
 
+def with_attitude_error(state: FilterState, error: AttitudeError | None) -> FilterState:
+    """Return the state with the attitude error of the present frame; None: it does not depend on former frames."""
+    turn = int(state.slots(TURN)[0])
+    if error is None:
+        return state if turn < 0 else state.only_craters(state.craters[state.craters != TURN[0]])
+    if turn < 0:
+        state = state.with_craters(TURN, np.zeros((1, 3)))
+        turn = int(state.slots(TURN)[0])
+        memory, added = np.zeros((3, 3)), error.covariance
+    else:
+        memory, added = error.memory, error.added
+    part = slice(turn, turn + 3)
+    mean, covariance = state.mean.copy(), state.covariance.copy()
+    mean[part] = memory @ mean[part]
+    covariance[part] = memory @ covariance[part]
+    covariance[:, part] = covariance[:, part] @ memory.T
+    covariance[part, part] += added
+    return FilterState(state.ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
+
+
+def turn_of(state: FilterState) -> FloatArray:
+    """Return the estimated attitude error of the frame, rotation vector (3,); zero where it is not a state."""
+    turn = int(state.slots(TURN)[0])
+    return np.zeros(3) if turn < 0 else state.mean[turn : turn + 3]
+
+
 def transition_to(
     state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
 ) -> tuple[FloatArray | None, FloatArray, FloatArray]:
@@ -228,13 +275,14 @@ def transition_to(
     return transition, mean, noise
 
 
-def pose_of(mean: FloatArray, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray) -> Pose:
+def pose_of(state: FilterState, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray) -> Pose:
     """Return the camera pose that a filter state stands for."""
+    mean = state.mean
     return Pose(
         mean[POSITION],
         camera_from_icrf,
         mcmf_from_icrf,
-        mean[ATTITUDE],
+        mean[ATTITUDE] + turn_of(state),
         mean[PIXEL],
         mean[OFFSET],
         float(mean[SCALE]),
@@ -253,7 +301,7 @@ def design_matrix(sighting: Sighting, state: FilterState) -> FloatArray:
     known = np.flatnonzero(slots >= 0)
     for axis in range(3):
         matrix[known, :, slots[known] + axis] = sighting.by_offset[known, :, axis]
-    turn = int(state.slots(_TURN)[0])
+    turn = int(state.slots(TURN)[0])
     if turn >= 0:
         matrix[:, :, turn : turn + 3] = sighting.by_attitude
     return matrix
@@ -280,11 +328,13 @@ def update(
     index, uv_px
         Craters (into the map) and where they were detected, shapes (n,) and (n, 2).
     variance_px2
-        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, comes from `errors`.
+        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, comes from `errors`
+        if the prior has no attitude error that depends on former frames.
     """
     count = 2 * index.size
-    prior = prior.with_craters(_TURN, np.full((1, 3), errors.attitude_noise_rad))
-    turn = int(prior.slots(_TURN)[0])
+    lasting = int(prior.slots(TURN)[0]) >= 0
+    prior = prior.with_craters(TURN, np.full((1, 3), errors.attitude_noise_rad))
+    turn = int(prior.slots(TURN)[0])
     noise: FloatArray = np.diag(np.repeat(variance_px2, 2))
     mean = prior.mean
     for step in range(iterations):
@@ -292,7 +342,7 @@ def update(
         sighting = look(
             landmarks,
             index,
-            _pose_with_turn(current, turn, camera_from_icrf, mcmf_from_icrf),
+            pose_of(current, camera_from_icrf, mcmf_from_icrf),
             camera,
             current.shifts(index),
         )
@@ -314,7 +364,7 @@ def update(
             break
     covariance = corrected_covariance(prior.covariance, design, gain, noise)
     state = FilterState(prior.ticks, mean, covariance, prior.craters)
-    pose = _pose_with_turn(state, turn, camera_from_icrf, mcmf_from_icrf)
+    pose = pose_of(state, camera_from_icrf, mcmf_from_icrf)
     after = look(landmarks, index, pose, camera, state.shifts(index))
     attitude = np.r_[ATTITUDE, turn : turn + 3]
     both = np.tile(np.eye(3), 2)
@@ -322,7 +372,7 @@ def update(
     if not state.finite:
         return None
     return Update(
-        state.only_craters(state.craters[state.craters != _TURN[0]]),
+        state if lasting else with_attitude_error(state, None),
         nis,
         mean_innovation,
         uv_px - after.uv_px,
@@ -351,10 +401,3 @@ def corrected_covariance(
     reduced[np.diag_indices_from(reduced)] += 1.0
     joined = reduced @ covariance @ reduced.T + gain @ noise @ gain.T
     return np.asarray(0.5 * (joined + joined.T), dtype=np.float64)
-
-
-def _pose_with_turn(
-    state: FilterState, turn: int, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray
-) -> Pose:
-    pose = pose_of(state.mean, camera_from_icrf, mcmf_from_icrf)
-    return replace(pose, attitude_rad=pose.attitude_rad + state.mean[turn : turn + 3])

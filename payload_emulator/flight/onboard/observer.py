@@ -277,7 +277,7 @@ class Observer:
         report = None
         if self._setup is not None and self._anchored is not None:
             observation = Observation(
-                self._telemetry.ticks, found, attitude.camera_from_icrf, attitude.sigma_rad
+                self._telemetry.ticks, found, attitude.camera_from_icrf, attitude.sigma_rad, attitude.error
             )
             try:
                 self._anchored, report = anchored.step(self._anchored, observation, self._setup)

@@ -209,7 +209,7 @@ def test_derivatives_stand_in_the_columns_of_their_states() -> None:
     landmarks, index = craters(), np.array([4, 1])
     state = prior_state(landmarks, index).with_craters(np.array([-2]), np.full((1, 3), 1e-4))
     state.mean[-3:] = 0.0
-    pose = kalman.pose_of(state.mean, CAMERA_FROM_ICRF, MCMF_FROM_ICRF)
+    pose = kalman.pose_of(state, CAMERA_FROM_ICRF, MCMF_FROM_ICRF)
     # Asked for in another order than the states hold them, with a crater that is none.
     asked = np.array([1, 4, 6])
     sighting = look(landmarks, asked, pose, CAMERA, state.shifts(asked))
@@ -383,3 +383,78 @@ def test_a_hundred_thousand_updates_leave_the_covariance_symmetric_and_positive(
             covariance = covariance + np.eye(size) * 1e8
     assert np.all(np.isfinite(covariance)) and least > 0.0
     assert lopsided == 0.0
+
+
+def shared(covariance: np.ndarray, *, lasting: bool) -> kalman.AttitudeError:
+    """An attitude error that is the same in the next frame, or has nothing to do with it."""
+    nothing = np.zeros((3, 3))
+    if lasting:
+        return kalman.AttitudeError(covariance, np.eye(3), nothing)
+    return kalman.AttitudeError(covariance, nothing, covariance)
+
+
+@pytest.mark.parametrize("lasting", [True, False])
+def test_an_attitude_error_that_lasts_is_one_unknown_for_two_frames(lasting: bool) -> None:
+    landmarks, index = craters(), np.arange(6)
+    prior = prior_state(landmarks, index)
+    errors = replace(ERRORS, attitude_noise_rad=3e-3)
+    turn = errors.attitude_noise_rad**2 * np.eye(3)
+    rng = np.random.default_rng(1)
+    uv = look(
+        landmarks, index, kalman.pose_of(prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF), CAMERA, prior.shifts(index)
+    ).uv_px
+    uv = uv + 0.3 * rng.standard_normal(uv.shape)
+    place = (CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks)
+    at_once = kalman.update(prior, *place, index, uv, np.full(6, 0.25), CAMERA, errors)
+    state = prior
+    for part in (index[:3], index[3:]):
+        state = kalman.with_attitude_error(state, shared(turn, lasting=lasting))
+        found = kalman.update(state, *place, part, uv[part], np.full(3, 0.25), CAMERA, errors)
+        assert found is not None
+        state = found.state
+    assert at_once is not None and state.craters[-1] == kalman.TURN[0]
+    sigma = np.sqrt(np.diag(at_once.state.covariance))
+    state = kalman.with_attitude_error(state, None)
+    away = (state.mean - at_once.state.mean) / sigma
+    ratio = np.sqrt(np.diag(state.covariance)) / sigma
+    if lasting:
+        # Only the points of linearisation differ.
+        assert np.abs(away).max() < 0.02
+        np.testing.assert_allclose(ratio, 1.0, atol=1e-3)
+    else:
+        assert np.abs(ratio - 1.0).max() > 0.02
+
+
+def test_an_attitude_error_is_carried_by_its_memory_with_all_its_correlations() -> None:
+    landmarks = craters()
+    rng = np.random.default_rng(3)
+    memory, root, other = rng.standard_normal((3, 3, 3))
+    first = kalman.with_attitude_error(
+        prior_state(landmarks, np.array([2])),
+        kalman.AttitudeError(root @ root.T, np.eye(3), np.zeros((3, 3))),
+    )
+    np.testing.assert_allclose(first.covariance[21:, 21:], root @ root.T)
+    assert not first.covariance[21:, :21].any() and not kalman.turn_of(first).any()
+    mixing = np.eye(24) + 0.1 * rng.standard_normal((24, 24))
+    mixed = replace(
+        first, mean=np.r_[first.mean[:21], 1.0, 2.0, 3.0], covariance=mixing @ first.covariance @ mixing.T
+    )
+    then = kalman.with_attitude_error(mixed, kalman.AttitudeError(root @ root.T, memory, other @ other.T))
+    transition, added = np.eye(24), np.zeros((24, 24))
+    transition[21:, 21:], added[21:, 21:] = memory, other @ other.T
+    np.testing.assert_allclose(then.mean, transition @ mixed.mean)
+    np.testing.assert_allclose(
+        then.covariance, transition @ mixed.covariance @ transition.T + added, rtol=1e-9, atol=1e-6
+    )
+    np.testing.assert_allclose(kalman.turn_of(then), memory @ [1.0, 2.0, 3.0])
+    without = kalman.with_attitude_error(then, None)
+    assert without.craters.tolist() == [2]
+    assert kalman.with_attitude_error(without, None) is without
+    np.testing.assert_allclose(without.covariance, mixed.covariance[:21, :21], rtol=1e-9, atol=1e-6)
+
+
+def test_the_estimated_attitude_error_turns_the_pose() -> None:
+    state = kalman.with_attitude_error(prior_state(craters(), np.array([2])), shared(np.eye(3), lasting=True))
+    state.mean[-3:] = [1e-3, 2e-3, 3e-3]
+    pose = kalman.pose_of(state, CAMERA_FROM_ICRF, MCMF_FROM_ICRF)
+    np.testing.assert_allclose(pose.attitude_rad, state.mean[9:12] + np.array([1e-3, 2e-3, 3e-3]))

@@ -214,3 +214,98 @@ def test_the_packet_is_part_of_version_5_of_the_dictionary() -> None:
     assert flight_instruments()["star_tracker"] is INSTRUMENT
     assert next(iter(flight_instruments())) == "star_tracker"  # attitude comes before its users
     assert dictionary_version(5).hash == "83b1140b2dd0db7a7aaeec719735041a2b70721743f70c983c8a5e603aaf0af4"
+
+
+def spread_of(state: Any) -> Any:
+    return state.covariance[:3, :3]
+
+
+def test_the_error_of_an_outage_lasts_from_frame_to_frame() -> None:
+    quiet = replace(PARAMETERS, gyro_bias_sigma_rad_s=0.0, gyro_walk_rad_s_sqrt_s=0.0)
+    state = propagated(quiet, start(quiet), 0, np.full(3, np.nan))
+    state = corrected(quiet, state, 1.0, quaternion(np.eye(3)))[0]
+    turn = np.array([0.01, -0.02, 0.005])
+    samples = np.array([[5.0 * k * SECOND, 0.0, *(np.nan,) * 4, *turn] for k in (1, 2, 3)])
+    reading = step(quiet, state, samples, Knowledge(15 * SECOND, AttitudeEstimate(None)))
+    assert reading.attitude is not None
+    error = reading.attitude.error
+    assert error is not None
+    # The error turns with the camera; new is the angular random walk of 15 s.
+    np.testing.assert_allclose(error.memory, matrix_from_rotation_vector(3.0 * turn), atol=1e-9)
+    np.testing.assert_allclose(error.added, quiet.gyro_noise_rad_sqrt_s**2 * 15.0 * np.eye(3), atol=1e-20)
+    np.testing.assert_allclose(error.covariance, spread_of(reading.state))
+    np.testing.assert_allclose(
+        error.memory @ spread_of(state) @ error.memory.T + error.added, error.covariance, rtol=1e-9
+    )
+
+
+def test_a_solution_of_the_star_tracker_leaves_the_share_that_it_does_not_correct() -> None:
+    quiet = replace(
+        PARAMETERS, gyro_bias_sigma_rad_s=0.0, gyro_walk_rad_s_sqrt_s=0.0, gyro_noise_rad_sqrt_s=0.0
+    )
+    state = propagated(quiet, start(quiet), 0, np.full(3, np.nan))
+    state = corrected(quiet, state, 1.0, quaternion(np.eye(3)))[0]
+    sample = np.array([[5.0 * SECOND, 1.0, *quaternion(np.eye(3)), *NO_TURN]])
+    reading = step(quiet, state, sample, Knowledge(5 * SECOND, AttitudeEstimate(None)))
+    assert reading.attitude is not None and reading.attitude.error is not None
+    error = reading.attitude.error
+    # Two solutions of equal noise: the mean of both has half the variance, and half the error of the first remains.
+    np.testing.assert_allclose(error.memory, 0.5 * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(error.covariance, 0.5 * spread_of(state), rtol=1e-9)
+    np.testing.assert_allclose(error.added, 0.25 * spread_of(state), rtol=1e-6)
+
+
+def test_the_first_attitude_and_one_after_a_new_start_have_no_memory() -> None:
+    first = np.array([[0.0, 1.0, *quaternion(np.eye(3)), *(np.nan,) * 3]])
+    reading = step(PARAMETERS, start(PARAMETERS), first, Knowledge(0, AttitudeEstimate(None)))
+    assert reading.attitude is not None and reading.attitude.error is not None
+    assert not reading.attitude.error.memory.any()
+    np.testing.assert_allclose(reading.attitude.error.added, spread_of(reading.state))
+    refusing = replace(reading.state, refused=PARAMETERS.refused_samples)
+    far = matrix_from_rotation_vector(np.array([0.1, 0.0, 0.0]))
+    again = step(
+        PARAMETERS,
+        refusing,
+        np.array([[5.0 * SECOND, 1.0, *quaternion(far), *NO_TURN]]),
+        Knowledge(5 * SECOND, AttitudeEstimate(None)),
+    )
+    assert again.attitude is not None and again.attitude.error is not None
+    np.testing.assert_allclose(again.attitude.error.memory, 0.0, atol=1e-12)
+    np.testing.assert_allclose(again.attitude.error.added, spread_of(again.state), rtol=1e-9)
+
+
+def test_the_stated_memory_is_that_of_simulated_errors() -> None:
+    """600 runs: three tracked frames, then three without a solution; errors now and then, and their joint spread."""
+    rng = np.random.default_rng(11)
+    sigma = np.array([PARAMETERS.cross_sigma_rad, PARAMETERS.cross_sigma_rad, PARAMETERS.roll_sigma_rad])
+    axes = tracker_axes()
+    errors = np.empty((600, 6, 3))
+    for run in range(len(errors)):
+        bias = PARAMETERS.gyro_bias_sigma_rad_s * rng.standard_normal(3)
+        state, stated = start(PARAMETERS), []
+        for frame in range(6):
+            rows = []
+            for k in (1, 2, 3):
+                seen = matrix_from_rotation_vector(axes.T @ (sigma * rng.standard_normal(3)))
+                walk = PARAMETERS.gyro_noise_rad_sqrt_s * math.sqrt(5.0) * rng.standard_normal(3)
+                solution = quaternion(seen) if frame < 3 else np.full(4, np.nan)
+                rows.append(
+                    [(15 * frame + 5 * k) * SECOND, float(frame < 3), *solution, *(5.0 * bias + walk)]
+                )
+            now = Knowledge(15 * (frame + 1) * SECOND, AttitudeEstimate(None))
+            reading = step(PARAMETERS, state, np.array(rows), now)
+            state = reading.state
+            assert reading.attitude is not None and reading.attitude.camera_from_icrf is not None
+            stated.append(reading.attitude.error)
+            errors[run, frame] = rotation_vector_from_matrix(reading.attitude.camera_from_icrf.T)
+    for frame in range(1, 6):
+        one = stated[frame]
+        assert one is not None
+        scale = np.sqrt(np.diag(one.covariance))
+        joint = errors[:, frame].T @ errors[:, frame - 1] / len(errors)
+        before = errors[:, frame - 1].T @ errors[:, frame - 1] / len(errors)
+        spread = np.sqrt(np.diag(before))
+        # Correlations of 600 runs are known to 0.04, three sigma.
+        np.testing.assert_allclose(
+            joint / np.outer(scale, spread), one.memory @ before / np.outer(scale, spread), atol=0.12
+        )

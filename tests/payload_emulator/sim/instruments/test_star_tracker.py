@@ -21,6 +21,7 @@ from lunar.frames import (
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
+from payload_emulator.flight.navigation import anchored
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.recording import load_record
 from payload_emulator.session.scenario import parse_scenario
@@ -239,7 +240,17 @@ def test_settings_that_make_no_sense_are_refused(lines: str, message: str) -> No
     assert str(refusal.value) == f"scenario: {message}"
 
 
-def test_a_pass_with_a_star_tracker_has_its_attitude_and_no_other(tmp_path: Path) -> None:
+def test_a_pass_with_a_star_tracker_has_its_attitude_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[anchored.Observation] = []
+    usual = anchored.step
+
+    def watched(state: Any, observation: anchored.Observation, setup: Any) -> Any:
+        given.append(observation)
+        return usual(state, observation, setup)
+
+    monkeypatch.setattr(anchored, "step", watched)
     settings = "[star_tracker]\noutages_per_hour = 0.0\nalignment_deg = 0.0\nsun_exclusion_deg = 0.0\n"
     summary = emulate(parse_scenario(SCENARIO + settings), DataFolder(), tmp_path / "pass")
     assert summary["truth_reads_after_start"] == 0
@@ -258,4 +269,7 @@ def test_a_pass_with_a_star_tracker_has_its_attitude_and_no_other(tmp_path: Path
     archived = np.array([[float(value) for value in row.split(",")] for row in rows])
     np.testing.assert_array_equal(archived[:, 1:], estimate)
     assert summary["outcomes"]["fixed"] >= 2
+    # The orbit filter learns how the attitude error depends on that of the frame before.
+    errors = [one.attitude_error for one in given]
+    assert len(errors) == 3 and errors[2] is not None and errors[2].memory.any()
     assert quaternion_from_matrix(np.eye(3))[0] == 1.0
