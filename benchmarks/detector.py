@@ -11,7 +11,7 @@ import json
 from typing import Any
 
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.training.model.bench import bench, beside, prototype_model
+from payload_emulator.training.model.bench import bench, compare_models, prototype_model
 
 PROTOTYPE = "prototype (small, stride 4, 64 channels, untrained)"
 PROTOTYPE_MS = 6.2
@@ -23,7 +23,7 @@ def main() -> dict[str, Any]:
     shipped = load_shipped_model()
     document: dict[str, Any] = {"detector": bench(shipped)}  # first: memory is this process's greatest so far
     if importlib.util.find_spec("torch") is not None and importlib.util.find_spec("onnx") is not None:
-        rows = beside({PROTOTYPE: prototype_model(), "shipped": shipped})
+        rows = compare_models({PROTOTYPE: prototype_model(), "shipped": shipped})
         document["beside"] = rows
         document["prototype_network_ms_elsewhere"] = PROTOTYPE_MS
         document["shipped_network_ms_there_by_ratio"] = PROTOTYPE_MS * rows["shipped"]["of_first"]

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from linna import __version__
-from linna.parser import BadUsage, LinnaParser, colored, colors_wanted
+from linna.parser import BadUsage, LinnaParser, colored, uses_colors
 
 # Threads of numerical libraries that spin while they wait make two busy cores ten times slower: wait passively.
 _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SLP_VECTORIZE": "1"}
@@ -79,7 +79,7 @@ def _run(arguments: Sequence[str]) -> int:
 
         complete(GROUPS)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(colored(_overview()) if colors_wanted() else _overview())
+        print(colored(_overview()) if uses_colors() else _overview())
         return 0 if arguments else 2
     if arguments[0] == "--version":
         print(f"linna {__version__}")

@@ -47,7 +47,7 @@ class LinnaParser(argparse.ArgumentParser):
     def format_help(self) -> str:
         """Return the help text, in colours if stdout is a terminal."""
         text = super().format_help()
-        return colored(text) if colors_wanted() else text
+        return colored(text) if uses_colors() else text
 
     def error(self, message: str) -> NoReturn:
         raise BadUsage(self.prog, message, self.format_usage())
@@ -63,7 +63,7 @@ class _Subcommands(argparse._SubParsersAction):  # type: ignore[type-arg]  # gen
         return super().add_parser(name, **options)
 
 
-def colors_wanted() -> bool:
+def uses_colors() -> bool:
     """True if stdout is a terminal that shows colours and the user has not switched them off."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 

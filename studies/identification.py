@@ -64,10 +64,10 @@ class StudyWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyFrame:
-    """A frame: true pose (MCMF stands in for ICRF), attitude as told, detections and the crater of each (-1: none)."""
+    """A frame: true pose (MCMF stands in for ICRF), measured attitude, detections and the crater of each (-1: none)."""
 
     pose: Pose
-    told_camera_from_mcmf: FloatArray
+    measured_camera_from_mcmf: FloatArray
     found: Detections
     crater: IntArray
     altitude_m: float
@@ -155,13 +155,13 @@ def draw_frame(
     rng: np.random.Generator,
     kind: str = "true",
 ) -> StudyFrame:
-    """Return a frame of a camera that points as told but for an error, image up to the north."""
+    """Return a frame of a camera that points as measured but for an error, image up to the north."""
     radius = float(np.linalg.norm(position_mcmf_m))
     latitude = math.asin(position_mcmf_m[2] / radius)
     longitude = math.atan2(position_mcmf_m[1], position_mcmf_m[0])
-    told = NADIR_NORTH_UP @ enu_from_mcmf(latitude, longitude)
+    measured = NADIR_NORTH_UP @ enu_from_mcmf(latitude, longitude)
     x, y, z = attitude_error_rad
-    turned = told - np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ told
+    turned = measured - np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ measured
     left, _, right = np.linalg.svd(turned)
     nothing = np.zeros(3)
     pose = Pose(position_mcmf_m, left @ right, np.eye(3), nothing, np.zeros(2), nothing)
@@ -183,9 +183,9 @@ def draw_frame(
         crater[:] = -1
     total = crater.size
     found = Detections(
-        uv[:, 0], uv[:, 1], size, rng.uniform(0.3, 1.0, total), np.full(total, model.told_sigma_px)
+        uv[:, 0], uv[:, 1], size, rng.uniform(0.3, 1.0, total), np.full(total, model.stated_sigma_px)
     )
-    return StudyFrame(pose, told, found, crater.astype(np.int64), radius - MOON_RADIUS_M)
+    return StudyFrame(pose, measured, found, crater.astype(np.int64), radius - MOON_RADIUS_M)
 
 
 def study_lost(
@@ -411,7 +411,7 @@ def _tracked(
     camera: PinholeCamera,
 ) -> tuple[IntArray, IntArray] | None:
     """Return believed pairs of detections and craters (indices into the map), None without any."""
-    pose = kalman.pose_of(prior, frame.told_camera_from_mcmf, np.eye(3))
+    pose = kalman.pose_of(prior, frame.measured_camera_from_mcmf, np.eye(3))
     altitude_m = max(float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M, 1_000.0)
     margin_px = min(3.5 * prior.position_sigma_m / altitude_m * camera.focal_px, 200.0)
     sighting = in_view(board, pose, camera, margin_px)
@@ -447,7 +447,7 @@ def _contradicts_truth(
     """Return whether the fix of these pairs claims what the truth rules out."""
     updated = kalman.update(
         prior.with_craters(crater, board.sigma_m[crater]),
-        frame.told_camera_from_mcmf,
+        frame.measured_camera_from_mcmf,
         np.eye(3),
         board,
         crater,

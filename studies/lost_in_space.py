@@ -142,7 +142,7 @@ def see_frames(
 ) -> SeenFrames:
     """Return what the detector finds in the given frames; the next is rendered while it works on this one."""
     attitudes, owners, found = [], [], []
-    world.terrain.hand_over()
+    world.terrain.release_thread()
     with ThreadPoolExecutor(max_workers=1) as renderer:
         # No more than a few frames lie ready at a time.
         waiting = [renderer.submit(expose_frame, world, int(number)) for number in numbers[:2]]
@@ -155,7 +155,7 @@ def see_frames(
             attitudes.append(exposure.camera_from_mcmf)
             owners.append(np.full(len(seen), row))
             found.append(seen)
-    world.terrain.hand_over()
+    world.terrain.release_thread()
     return SeenFrames(
         numbers,
         np.array(attitudes).reshape(-1, 3, 3),
@@ -164,7 +164,7 @@ def see_frames(
     )
 
 
-def save_seen(path: Path, seen: SeenFrames, key: str) -> None:
+def save_seen_frames(path: Path, seen: SeenFrames, key: str) -> None:
     """Save what was found, under a key that says of what."""
     found = seen.found
     with path.open("wb") as stream:
@@ -182,7 +182,7 @@ def save_seen(path: Path, seen: SeenFrames, key: str) -> None:
         )
 
 
-def load_seen(path: Path, key: str) -> SeenFrames:
+def load_seen_frames(path: Path, key: str) -> SeenFrames:
     """Return what was saved.
 
     Raises

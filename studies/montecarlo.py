@@ -75,7 +75,7 @@ class Kidnap:
 
     frame: int
     distance_m: float
-    told: bool
+    announced: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,11 +243,11 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
         found, truth = _detect(
             case, true_map, states[k, :3], camera_from_icrf, rotations[k], lasting, shifts_px[k], rng
         )
-        told = _turned(camera_from_icrf, tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3))
-        if case.kidnap is not None and case.kidnap.told and k == case.kidnap.frame:
+        measured = _turned(camera_from_icrf, tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3))
+        if case.kidnap is not None and case.kidnap.announced and k == case.kidnap.frame:
             state = anchored.widened(state, case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
         shown = bool(case.imaging[k])
-        observation = Observation(int(ticks[k]), found if shown else None, told)
+        observation = Observation(int(ticks[k]), found if shown else None, measured)
         state, report = anchored.step(state, observation, setup)
         rows.append(_row(state, report, states[k], truth if shown else truth[:0]))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
@@ -525,7 +525,7 @@ def _detect(
         uv[order, 1],
         diameter[order],
         np.ones(order.size),
-        np.full(order.size, detector.told_sigma_px),
+        np.full(order.size, detector.stated_sigma_px),
     )
     return found, craters.ids[truth[order]] * (truth[order] >= 0) - (truth[order] < 0)
 

@@ -218,7 +218,7 @@ def _finish(job: Job, name: str, wanted: Mapping[str, Any], result: Mapping[str,
     write_json(folder / f"{name}.json", {"made_from": dict(wanted), "result": dict(result)})
 
 
-def format_made(document: Mapping[str, Any]) -> str:
+def format_comparison(document: Mapping[str, Any]) -> str:
     """Both models on every test source as one table."""
     lines = [
         f"{'test source':18}{'frames':>7}{'':3}{'':14}{'P':>6}{'R':>6}{'F1':>6}{'':4}{'95 %':>12}"

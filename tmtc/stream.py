@@ -231,7 +231,7 @@ class _Cutter:
         trusted = length and (
             self.is_idle(p) or self.kernels.is_pus(self.octets, p, length, self.packet_type)
         )
-        if trusted and (e == stop or self.stands(e, stop)):
+        if trusted and (e == stop or self.is_packet_at(e, stop)):
             # the header is one and a packet follows where it says, so the damage is inside [p, e), whatever else may
             # be found in there, unless the length is wrong and right packets fill the end of that range
             q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
@@ -253,7 +253,7 @@ class _Cutter:
         if not length or not self.is_idle(p):
             return 0
         fill = self.octets[p + PRIMARY_HEADER_LENGTH : p + length]
-        return p + length if np.all(fill == fill[0]) and self.stands(p + length, stop) else 0
+        return p + length if np.all(fill == fill[0]) and self.is_packet_at(p + length, stop) else 0
 
     def kind_of(self, p: int) -> int:
         return _IDLE if self.is_idle(p) else _BAD
@@ -264,7 +264,7 @@ class _Cutter:
     def length_at(self, p: int, stop: int) -> int:
         return int(self.kernels.length_at(self.octets, p, stop, self.packet_type, self.longest))
 
-    def stands(self, p: int, stop: int) -> bool:
+    def is_packet_at(self, p: int, stop: int) -> bool:
         """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
         length = self.length_at(p, stop)
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
@@ -299,11 +299,11 @@ class _MixedCutter(_Cutter):
         found = self.mixed.unchecked_length(self.octets, *key, self.unchecked)
         return int(found) or super().length_at(p, stop)
 
-    def stands(self, p: int, stop: int) -> bool:
+    def is_packet_at(self, p: int, stop: int) -> bool:
         key = (p, stop, self.packet_type, self.longest, self.unchecked)
         if self.mixed.unchecked_length(self.octets, *key):
             return True
-        return super().stands(p, stop)
+        return super().is_packet_at(p, stop)
 
 
 class _UncheckedCutter:

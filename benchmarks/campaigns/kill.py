@@ -350,9 +350,9 @@ def load_runs(path: Path | None) -> list[Figures]:
 
 def save_runs(path: Path, runs: Sequence[Figures]) -> None:
     """Replace the state file at once."""
-    beside = path.with_name(path.name + ".new")
-    beside.write_text(json.dumps({"runs": runs}, indent=1))
-    os.replace(beside, path)
+    temporary = path.with_name(path.name + ".new")
+    temporary.write_text(json.dumps({"runs": runs}, indent=1))
+    os.replace(temporary, path)
 
 
 def main() -> int:

@@ -63,7 +63,7 @@ _TRENDS = (
 )
 
 
-class ImageShelf(Mapping[int, NDArray[np.uint8]]):
+class ArchivedImages(Mapping[int, NDArray[np.uint8]]):
     """Archived images of a pass, read from the archive on demand."""
 
     def __init__(self, files: FileArchive, sha256_by_frame: Mapping[int, str]) -> None:
@@ -148,7 +148,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             cadence_s=manifest.get("cadence_s"),
             housekeeping=_housekeeping(connection, span),
             events=event_list(connection, span),
-            images=ImageShelf(ground.files, passes.frame_files(connection, pass_id)),
+            images=ArchivedImages(ground.files, passes.frame_files(connection, pass_id)),
             provenance=_provenance(mission, declared, manifest, record, vehicle, ephemeris, span),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
             evidence_level=mission.evidence.text,

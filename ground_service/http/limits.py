@@ -243,7 +243,7 @@ class HeadersAndTags:
         wanted = Headers(scope=scope).get("if-none-match", "")
         held: dict[str, Any] = {"start": None, "body": []}
 
-        async def dressed(message: Message) -> None:
+        async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in SECURE_HEADERS.items():
@@ -277,4 +277,4 @@ class HeadersAndTags:
             await send(start)
             await send({"type": "http.response.body", "body": body})
 
-        await self._app(scope, receive, dressed)
+        await self._app(scope, receive, with_headers)

@@ -122,15 +122,15 @@ def execute(run: Run) -> dict[str, Any]:
                 raise
         with os.fdopen(reading) as stream:
             reading = -1
-            told = stream.read()
+            written = stream.read()
     finally:
         for descriptor in (reading, writing):
             if descriptor >= 0:
                 os.close(descriptor)
-    if not told:
+    if not written:
         lines = failure.decode(errors="replace").strip().splitlines() or ["no report"]
         raise SandboxRefused(f"the launcher failed: {lines[-1][:200]}")
-    report: dict[str, Any] = json.loads(told)
+    report: dict[str, Any] = json.loads(written)
     if "refused" in report:
         raise SandboxRefused(str(report["refused"]))
     if report.get("unconfined"):

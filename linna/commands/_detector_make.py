@@ -45,7 +45,7 @@ def _make(arguments: argparse.Namespace) -> int:
     need_torch()
     from payload_emulator.session.recipe import load_recipe
     from payload_emulator.training.data.feeder import TrainParameters
-    from studies.pipeline import Job, format_made, make_dataset, make_model
+    from studies.pipeline import Job, format_comparison, make_dataset, make_model
 
     if arguments.run is not None and arguments.dataset is None:
         raise UsageError("--run: expected the data set it was trained on (--dataset), found none")
@@ -73,5 +73,5 @@ def _make(arguments: argparse.Namespace) -> int:
     restart_for_training()  # after the rendering, whose processes would inherit the trainer's hunger for memory
     document = make_model(job, log, lambda frames: progress(frames, len(frames), "evaluate", "frames"))
     write_text(arguments.out / "figures.json", as_json(document))
-    emit(arguments, document, format_made(document))
+    emit(arguments, document, format_comparison(document))
     return 0

@@ -197,7 +197,7 @@ def _quantise(arguments: argparse.Namespace) -> int:
     from payload_emulator.errors import install_hint
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.evaluate.evaluate import evaluate
-    from payload_emulator.training.model.bench import beside
+    from payload_emulator.training.model.bench import compare_models
     from payload_emulator.training.model.quantise import quantise
 
     if importlib.util.find_spec("onnx") is None:
@@ -208,7 +208,7 @@ def _quantise(arguments: argparse.Namespace) -> int:
     unfinished = arguments.out.with_name(f".{arguments.out.name}.unfinished")
     unfinished.write_bytes(small)
     unfinished.replace(arguments.out)
-    times = beside({"float32": octets, "int8": small})
+    times = compare_models({"float32": octets, "int8": small})
     kept = ("precision", "recall", "f1", "loc_px")
     scores = {
         name: {key: figures["micro"][key] for key in kept}

@@ -42,13 +42,13 @@ def run(arguments: argparse.Namespace) -> int:
     )
     key = _key(format_scenario(scenario), numbers.tobytes(), detector.sha256)
     if arguments.detections is not None and arguments.detections.exists():
-        seen = study.load_seen(arguments.detections, key)
+        seen = study.load_seen_frames(arguments.detections, key)
     else:
         seen = study.see_frames(
             world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
         )
         if arguments.detections is not None:
-            study.save_seen(arguments.detections, seen, key)
+            study.save_seen_frames(arguments.detections, seen, key)
     log("map of the search")
     true, board = study.search_map(world, numbers, 1e3 * arguments.min_diameter_km)
     parameters = LostParameters(attitude_sigma_rad=math.radians(arguments.attitude_deg))

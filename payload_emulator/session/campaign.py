@@ -149,13 +149,13 @@ def fly_case(world: World, loaded: LoadedPayload, case: Case, seed: int) -> Resu
                 events.append((made_s, labels[values["event_id"]]))
             elif name == "detections" and values["image_quality"] == 0:
                 processed.append(second)
-    told = _detection(faults, case, events, spacecraft.payload.mode)
+    detected = _detection(faults, case, events, spacecraft.payload.mode)
     return Result(
         case.name,
         seed,
         _outcome(faults, case, processed, float((world.frame_utc_ns[-1] - world.frame_utc_ns[0]) / 1e9)),
-        told is not None,
-        float("nan") if told is None else told,
+        detected is not None,
+        float("nan") if detected is None else detected,
         int(world.frame_utc_ns.size),
         len(processed),
         len(spacecraft.resets),
@@ -172,8 +172,8 @@ def _detection(
         return None if mode is PayloadMode.safe else 0.0
     began_s = min(fault.at_s for fault in faults)
     # A clock that has jumped dates its own events wrongly: the order in which they came is what counts.
-    told = [made_s for made_s, event in events if event in case.events]
-    return max(told[0] - began_s, 0.0) if told else None
+    reported_s = [made_s for made_s, event in events if event in case.events]
+    return max(reported_s[0] - began_s, 0.0) if reported_s else None
 
 
 def _outcome(faults: tuple[Fault, ...], case: Case, processed: list[float], last_s: float) -> str:

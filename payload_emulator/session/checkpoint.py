@@ -204,12 +204,12 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     document = checkpoint.model_dump_json().encode()
     header = f"LINNA session state, version {VERSION}, SHA-256 {hashlib.sha256(document).hexdigest()}\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".new")
-    with beside.open("wb") as stream:
+    new_file = path.with_name(path.name + ".new")
+    with new_file.open("wb") as stream:
         stream.write(header.encode() + document)
         stream.flush()
         os.fsync(stream.fileno())
-    beside.replace(path)
+    new_file.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

@@ -58,7 +58,7 @@ from payload_emulator.session.world import (
     World,
     clock_ticks,
     expose_at,
-    flown_on,
+    extended_flight,
     open_world,
     sample_truth,
 )
@@ -196,7 +196,7 @@ class ContinuousSession:
                 self._fly(selector)
             finally:
                 self._save()
-                self._say({"kind": "end", "utc": format_utc(self.utc_ns)})
+                self._send_message({"kind": "end", "utc": format_utc(self.utc_ns)})
                 self._executor.shutdown(cancel_futures=True)
                 for server in self._servers():
                     server.close()
@@ -209,7 +209,7 @@ class ContinuousSession:
         while not self.stopping.is_set():
             if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
                 self._held = self.holds
-                self._say({**self._contact_message(), "kind": "finished"})
+                self._send_message({**self._contact_message(), "kind": "finished"})
                 while self._held and not self.stopping.is_set():
                     self._serve(selector, _POLL_S)
                 return
@@ -225,7 +225,7 @@ class ContinuousSession:
                 self._hold(selector)
             elif self._until_ns is not None and self.utc_ns >= self._until_ns:
                 self._until_ns, self.paused = None, True
-                self._say({"kind": "paused", "utc": format_utc(self.utc_ns)})
+                self._send_message({"kind": "paused", "utc": format_utc(self.utc_ns)})
 
     def _next_turn_ns(self) -> int:
         """Return the time of the next step: of the payload, of the link, or the longest step there is."""
@@ -283,7 +283,7 @@ class ContinuousSession:
     def _hold(self, selector: selectors.BaseSelector) -> None:
         """Let time stand still after a contact has begun or ended, until the console says `run`."""
         self._held = self.holds
-        self._say(self._contact_message())
+        self._send_message(self._contact_message())
         while self._held and not self.stopping.is_set():
             self._serve(selector, _POLL_S)
         if self.contact is None and self.spacecraft.payload.mode is not PayloadMode.observing:
@@ -307,7 +307,7 @@ class ContinuousSession:
         """Propagate the orbit and find the contacts of the coming hours."""
         world = self.world
         while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * _NS) + _NS * 600:
-            truth, burns = flown_on(world, CHUNK_S)
+            truth, burns = extended_flight(world, CHUNK_S)
             world = self.world = replace(world, truth=_pruned(truth), burns=(*world.burns, *burns))
             self._bench.world = world
         if self._planned_until_ns < self.utc_ns + round(_AHEAD_S * _NS / 2):
@@ -490,9 +490,9 @@ class ContinuousSession:
         *lines, rest = (self._words.get(connection, b"") + octets)[-4096:].split(b"\n")
         self._words[connection] = rest
         for line in lines:
-            self._obey(line.decode("utf-8", "replace").split())
+            self._execute(line.decode("utf-8", "replace").split())
 
-    def _obey(self, words: list[str]) -> None:
+    def _execute(self, words: list[str]) -> None:
         if words == ["run"]:
             self._held = self.paused = False
         elif words == ["pause"]:
@@ -500,7 +500,9 @@ class ContinuousSession:
         elif words == ["quit"]:
             self.stopping.set()
         elif words == ["state"]:
-            self._say({**self._contact_message(), "kind": "state", "paused": self.paused or self._held})
+            self._send_message(
+                {**self._contact_message(), "kind": "state", "paused": self.paused or self._held}
+            )
         elif len(words) == 2 and words[0] == "rate" and _number(words[1]) is not None:
             self.rate = _number(words[1]) or 0.0
         elif len(words) == 2 and words[0] == "until":
@@ -508,13 +510,13 @@ class ContinuousSession:
                 self._until_ns = parse_utc(words[1])
                 self._held = self.paused = False
             except LunarError as error:
-                self._say({"kind": "error", "text": str(error)})
+                self._send_message({"kind": "error", "text": str(error)})
         elif words:
             text = " ".join(words)[:80]
             expected = "expected run, pause, state, until UTC, rate X or quit"
-            self._say({"kind": "error", "text": f"{expected}, found {text!r}"})
+            self._send_message({"kind": "error", "text": f"{expected}, found {text!r}"})
 
-    def _say(self, message: dict[str, Any]) -> None:
+    def _send_message(self, message: dict[str, Any]) -> None:
         self.console.send(json.dumps(message).encode() + b"\n")
 
     # State
@@ -554,7 +556,7 @@ class ContinuousSession:
         self.utc_ns = self._planned_until_ns = state.utc_ns
         self.account = state.account
         state.link.put_on(self._receiver, self._transmitter)
-        self.spacecraft.go_on(state.utc_ns, state.resets, state.clock_error_ticks, state.begun)
+        self.spacecraft.resume(state.utc_ns, state.resets, state.clock_error_ticks, state.begun)
         start = self.world
         truth = Truth(
             lambda tdb_s: np.broadcast_to(state.state_icrf, (tdb_s.size, 6)).copy(),
@@ -562,7 +564,7 @@ class ContinuousSession:
             state.utc_ns,
             start.truth.orientation,
         )
-        longer, burns = flown_on(replace(start, truth=truth), CHUNK_S)
+        longer, burns = extended_flight(replace(start, truth=truth), CHUNK_S)
         self.world = replace(start, truth=longer, burns=burns)
 
 

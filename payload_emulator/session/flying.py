@@ -104,7 +104,7 @@ class CatalogueDetector:
         camera = world.camera
         corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
         places, sizes = _REDUCED_DETECTOR.detect(uv[seen], diameter_px[seen], corner, self._rng)
-        sigma = np.full(sizes.size, _REDUCED_DETECTOR.told_sigma_px)
+        sigma = np.full(sizes.size, _REDUCED_DETECTOR.stated_sigma_px)
         self._next = Detections(places[:, 0], places[:, 1], sizes, np.full(sizes.size, 0.9), sigma)
 
     def examine(

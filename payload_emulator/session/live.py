@@ -245,7 +245,7 @@ class LivePayload:
             self._fly()
         finally:
             self._downwards.land_all()
-            self._say({"kind": "end"})
+            self._send_message({"kind": "end"})
             self.close()
 
     def close(self) -> None:
@@ -289,7 +289,7 @@ class LivePayload:
                     flown = fly_moment(
                         self.world, self.spacecraft, operator, receiver, moment, exposure, by_hand
                     )
-                    self._tell(flown)
+                    self._send_frame(flown)
         finally:
             frames.close()
 
@@ -305,7 +305,7 @@ class LivePayload:
             world = continued(self.world, (stop_utc_ns - self.world.truth.stop_utc_ns) / _NS + CONTINUATION_S)
         except (LunarError, PayloadError) as error:
             world = None
-            self._say({"kind": "error", "text": f"no images from here on: {error}"})
+            self._send_message({"kind": "error", "text": f"no images from here on: {error}"})
         if world is not None:
             known = self.world.frame_utc_ns.size
             kept = world.frame_utc_ns[
@@ -377,9 +377,9 @@ class LivePayload:
         words = (self._words.get(connection, b"") + octets)[-_BUFFER_LIMIT:]
         *lines, self._words[connection] = words.split(b"\n")
         for line in lines:
-            self._obey(line.decode("utf-8", "replace").split())
+            self._execute(line.decode("utf-8", "replace").split())
 
-    def _obey(self, words: list[str]) -> None:
+    def _execute(self, words: list[str]) -> None:
         if words == ["pause"]:
             self.paused = True
         elif words == ["run"]:
@@ -393,7 +393,9 @@ class LivePayload:
             self.rate = float(words[1])
         elif words:
             text = " ".join(words)[:80]
-            self._say({"kind": "error", "text": f"expected pause, run, step, rate X or quit, found {text!r}"})
+            self._send_message(
+                {"kind": "error", "text": f"expected pause, run, step, rate X or quit, found {text!r}"}
+            )
 
     def _by_hand(self, moment: Moment) -> bytes:
         """Telecommands that came since the moment before; and the manual step where time was not continuous."""
@@ -412,7 +414,7 @@ class LivePayload:
             self._console_count = _CONSOLE_COUNTS | (self._console_count + 1) & (_CONSOLE_COUNTS - 1)
         return orders
 
-    def _tell(self, flown: Flown) -> None:
+    def _send_frame(self, flown: Flown) -> None:
         """Send the packets of a moment to those who listen, and the snapshot to those who watch."""
         if flown.packets:
             self._transmitter.send(flown.packets, flown.moment.utc_ns, clcw=flown.clcw)
@@ -423,9 +425,11 @@ class LivePayload:
             self._downwards.start(octets, self._way_s)
             self.sent += 1
         if self._servers["console"].clients:
-            self._say(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate, self.catalogue))
+            self._send_message(
+                snapshot(self.world, self.spacecraft, flown, self.paused, self.rate, self.catalogue)
+            )
 
-    def _say(self, message: dict[str, Any]) -> None:
+    def _send_message(self, message: dict[str, Any]) -> None:
         if "console" in self._servers:
             self._servers["console"].send(json.dumps(message).encode() + b"\n")
 

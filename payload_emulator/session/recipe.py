@@ -229,11 +229,11 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
     source = _read(path, where, Source, values)
     if not source.ephemeris:
         return source
-    beside = path.parent / source.ephemeris
+    in_folder = path.parent / source.ephemeris
     for key in ("step_s", "days"):
         if not getattr(source, key) > 0.0:
             raise DatasetError(f"{path}: {where}: {key}: expected more than 0, found {values[key]!r}")
-    return replace(source, ephemeris=str(beside)) if beside.exists() else source
+    return replace(source, ephemeris=str(in_folder)) if in_folder.exists() else source
 
 
 def _box(path: Path, where: str, item: object) -> dict[str, float]:

@@ -228,7 +228,7 @@ def replay(
     pairs: Iterable[tuple[StepInput, Image]] = zip(record.inputs, images, strict=True)
     weights = np.random.default_rng(0).standard_normal((YARDSTICK_SIZE, YARDSTICK_SIZE)).astype(np.float32)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
-        if board.tell(item) and item is not record.inputs[0]:
+        if board.enter_step(item) and item is not record.inputs[0]:
             payload = started()
         detector.reset()
         began = cpu_clock()
@@ -278,7 +278,7 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     if not text:
         raise RecordError(f"{archive}: expected frames, or a scenario to render them from, found neither")
     world = build_world(parse_scenario(str(text), source=f"scenario of {archive}"), data)
-    world.terrain.hand_over()
+    world.terrain.release_thread()
     absent = set(missing_frames(archive, record.inputs))
 
     def image_of(item: StepInput) -> Image:
@@ -323,7 +323,7 @@ class RecordedBoard(BareBoard):
     downlink: int = UNLIMITED
     asked_to_reset: bool = False
 
-    def tell(self, item: StepInput) -> bool:
+    def enter_step(self, item: StepInput) -> bool:
         """Take the place of the board in a step; whether the processor restarts before it."""
         self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
         if np.isfinite(item.sensors).all():

@@ -193,7 +193,7 @@ class Spacecraft:
         """Faults that have begun."""
         return set(self._begun)
 
-    def go_on(
+    def resume(
         self, utc_ns: int, resets: Sequence[int], clock_error_ticks: int, begun: Iterable[Fault]
     ) -> None:
         """Go on at a time with a board that has been kept; the payload starts as after a loss of power."""

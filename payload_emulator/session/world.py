@@ -216,7 +216,7 @@ def continued(world: World, duration_s: float) -> World | None:
     scenario = world.scenario
     if scenario.orbit.oem:
         return None
-    longer, burns = flown_on(world, duration_s)
+    longer, burns = extended_flight(world, duration_s)
     stop_utc_ns = longer.stop_utc_ns
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
     begin_utc_ns = int(world.frame_utc_ns[-1]) + 2 * interval_ns
@@ -235,7 +235,7 @@ def continued(world: World, duration_s: float) -> World | None:
     return replace(world, truth=longer, burns=(*world.burns, *burns), frame_utc_ns=frames)
 
 
-def flown_on(world: World, duration_s: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
+def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
     """Return the flight with `duration_s` added to its end, and the burns in the added time.
 
     Raises
@@ -304,7 +304,7 @@ def exposures(
     sample
         From time and true attitude of a frame to the samples before it; called in order of time.
     """
-    world.terrain.hand_over()
+    world.terrain.release_thread()
     try:
         with ThreadPoolExecutor(max_workers=1) as renderer, ThreadPoolExecutor(max_workers=1) as sensor:
 
@@ -322,7 +322,7 @@ def exposures(
                     pending.append(begin(number + 1))
                 yield pending.pop(0).result()
     finally:
-        world.terrain.hand_over()
+        world.terrain.release_thread()
 
 
 def orders_before(world: World, number: int) -> bytes:
@@ -480,12 +480,12 @@ def _fly_to_windows(
         if reach_days >= window.search_days:
             raise ScenarioError(
                 f"scenario {scenario.name}: window.search expected {window.passes} {window.direction} window(s) over "
-                f"{terrain.name} within {window.search_days} days, found {len(found)}; {_what_lacks(crossings, window)}"
+                f"{terrain.name} within {window.search_days} days, found {len(found)}; {_no_band(crossings, window)}"
             )
         reach_days = min(2.0 * reach_days, window.search_days)
 
 
-def _what_lacks(crossings: list[Crossing], window: WindowSection) -> str:
+def _no_band(crossings: list[Crossing], window: WindowSection) -> str:
     """Which latitudes lack terrain on the crossing that lacks the least of it."""
     band = f"latitudes {_degrees(window.latitude_band_deg)}"
     near = [one for one in crossings if one.in_reach and one.missing_rad.size]

@@ -54,7 +54,7 @@ class SimulatedDetector:
     log_diameter_sigma: float = 0.1
 
     @property
-    def told_sigma_px(self) -> float:
+    def stated_sigma_px(self) -> float:
         """Error of centres that the detector reports."""
         return self.sigma_px if self.claimed_sigma_px is None else self.claimed_sigma_px
 

@@ -87,9 +87,9 @@ def draw_lines(
     width = (1.4 if dashes is None else 1.2) * (0.75 if len(y) > _DENSE else 1.0)
     axes.plot(x, y, color=tint, linestyle=canvas.dashes(dashes), linewidth=canvas.pt(width))
     finite = np.isfinite(y)
-    beside = np.zeros(len(y) + 2, dtype=np.bool_)
-    beside[1:-1] = finite
-    alone = finite & ~beside[:-2] & ~beside[2:]
+    known = np.zeros(len(y) + 2, dtype=np.bool_)
+    known[1:-1] = finite
+    alone = finite & ~known[:-2] & ~known[2:]
     if alone.any():
         axes.plot(x[alone], y[alone], ".", color=tint, markersize=canvas.pt(4.0))
 

@@ -16,7 +16,13 @@ from lunar.datafolder import DataFolder
 from lunar.oem import save_oem
 from payload_emulator.session.continuous import CHUNK_S
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.world import World, flown_on, open_world, sample_truth, with_reference_error
+from payload_emulator.session.world import (
+    World,
+    extended_flight,
+    open_world,
+    sample_truth,
+    with_reference_error,
+)
 
 DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
@@ -42,7 +48,7 @@ class FlightDynamics:
         start = max(now_utc_ns - BEFORE_NS, scenario.epoch_utc_ns)
         stop = now_utc_ns + AHEAD_NS
         while self.world.truth.stop_utc_ns < stop + 600 * NS:
-            truth, burns = flown_on(self.world, CHUNK_S)
+            truth, burns = extended_flight(self.world, CHUNK_S)
             self.world = replace(self.world, truth=truth, burns=(*self.world.burns, *burns))
         flown = sample_truth(self.world.truth, np.array([start, stop], dtype=np.int64))
         day = (now_utc_ns - scenario.epoch_utc_ns) // DAY_NS

@@ -269,9 +269,9 @@ class MissionRun:
 
     def _save(self) -> None:
         self._progress.wall_s = round(self._wall_before_s + time.monotonic() - self._begun_s, 1)
-        beside = self._progress_file.with_name(self._progress_file.name + ".new")
-        beside.write_text(json.dumps(asdict(self._progress)))
-        beside.replace(self._progress_file)
+        new_file = self._progress_file.with_name(self._progress_file.name + ".new")
+        new_file.write_text(json.dumps(asdict(self._progress)))
+        new_file.replace(self._progress_file)
 
 
 __all__ = ["GroundError", "RunTerms", "run_mission"]

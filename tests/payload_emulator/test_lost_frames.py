@@ -47,15 +47,15 @@ def test_detections_come_back_as_they_were_kept_and_only_for_what_they_are_of(tm
         Detections(column, column + 1.0, column + 2.0, column / 5.0, column + 0.5),
     )
     path = tmp_path / "seen.npz"
-    study.save_seen(path, seen, "this scenario")
-    again = study.load_seen(path, "this scenario")
+    study.save_seen_frames(path, seen, "this scenario")
+    again = study.load_seen_frames(path, "this scenario")
     assert [len(again.of(row)) for row in range(3)] == [2, 0, 3]
     assert again.of(2).u_px.tolist() == [2.0, 3.0, 4.0]
     with pytest.raises(RecordError, match=r"expected detections of another, found those of this scenario"):
-        study.load_seen(path, "another")
+        study.load_seen_frames(path, "another")
     path.write_text("no such file")
     with pytest.raises(RecordError, match="expected saved detections"):
-        study.load_seen(path, "this scenario")
+        study.load_seen_frames(path, "this scenario")
 
 
 def test_a_place_two_kilometres_off_is_wrong_and_no_fix_is_neither_right_nor_wrong() -> None:

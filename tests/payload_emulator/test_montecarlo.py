@@ -153,7 +153,7 @@ def test_runs_over_any_node_fly_over_other_ground_at_the_same_latitudes(navigati
 def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(
     navigation_case: Any, seed: int
 ) -> None:
-    case = navigation_case(80, kidnap=Kidnap(50, 5_000.0, told=False), parameters=PARAMETERS)
+    case = navigation_case(80, kidnap=Kidnap(50, 5_000.0, announced=False), parameters=PARAMETERS)
     run = fly(case, seed)
     assert run.error_m[49] < 300.0
     assert run.error_m[50] > 4_000.0
@@ -164,7 +164,7 @@ def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(
 def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(
     navigation_case: Any, distance_m: float
 ) -> None:
-    case = navigation_case(40, kidnap=Kidnap(25, distance_m, told=True), parameters=PARAMETERS)
+    case = navigation_case(40, kidnap=Kidnap(25, distance_m, announced=True), parameters=PARAMETERS)
     run = fly(case, 4)
     assert np.all(run.error_m[29:] < 500.0)
 

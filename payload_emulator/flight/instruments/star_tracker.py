@@ -235,7 +235,7 @@ def attitude_error(state: AttitudeState, before: FloatArray) -> AttitudeError:
     if not then.any():
         return AttitudeError(now, np.zeros((3, 3)), now)
     joint = (state.memory @ before)[_ANGLE, _ANGLE]
-    memory: FloatArray = np.linalg.solve(then, joint.T).T
+    memory = np.asarray(np.linalg.solve(then, joint.T).T, dtype=np.float64)
     added = now - memory @ joint.T
     return AttitudeError(now, memory, 0.5 * (added + added.T))
 

@@ -94,12 +94,12 @@ def render_scene(scene: CyclesScene, settings: CyclesSettings, python: str = sys
     """
     with tempfile.TemporaryDirectory(prefix="linna-cycles-") as name:
         folder = Path(name)
-        told, exr, png, cost = (
+        scene_file, exr, png, cost = (
             folder / file for file in ("scene.npz", "out.exr", "picture.png", "cost.json")
         )
-        scene.save(told, settings)
+        scene.save(scene_file, settings)
         # -P: the worker's own folder must not hide Blender's modules of the same names.
-        _run([python, "-P", str(WORKER), str(told), str(exr), str(png), str(cost)], python)
+        _run([python, "-P", str(WORKER), str(scene_file), str(exr), str(png), str(cost)], python)
         missing = [path.name for path in (exr, png, cost) if not path.is_file()]
         if missing:
             raise RendererError(f"cycles: Blender ended without writing {', '.join(missing)}")

@@ -27,15 +27,15 @@ def main(scene_path: str, exr_path: str, png_path: str, cost_path: str) -> int:
     import numpy as np
 
     with np.load(scene_path) as file:
-        told = {name: file[name] for name in file.files}
+        scene_values = {name: file[name] for name in file.files}
     marks = [_seconds()]
     scene = bpy.context.scene
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
-    _set_up(bpy, scene, told)
-    _add_ground(bpy, scene, told)
-    _add_camera(bpy, scene, told)
-    _add_sun(bpy, scene, told)
+    _set_up(bpy, scene, scene_values)
+    _add_ground(bpy, scene, scene_values)
+    _add_camera(bpy, scene, scene_values)
+    _add_sun(bpy, scene, scene_values)
     marks.append(_seconds())
     scene.render.filepath = exr_path
     _file_format(scene, "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "RGBA", "32")
@@ -59,30 +59,30 @@ def _seconds() -> tuple[float, float]:
     return time.monotonic(), spent.user + spent.system
 
 
-def _set_up(bpy: Any, scene: Any, told: Any) -> None:
+def _set_up(bpy: Any, scene: Any, scene_values: Any) -> None:
     render, cycles, layer = scene.render, scene.cycles, scene.view_layers[0]
     render.engine = "CYCLES"
-    render.resolution_x, render.resolution_y = int(told["width_px"]), int(told["height_px"])
+    render.resolution_x, render.resolution_y = int(scene_values["width_px"]), int(scene_values["height_px"])
     render.resolution_percentage = 100
     render.film_transparent = True
     render.use_compositing = render.use_sequencer = False
-    if told["set_threads"] > 0:
-        render.threads_mode, render.threads = "FIXED", int(told["set_threads"])
+    if scene_values["set_threads"] > 0:
+        render.threads_mode, render.threads = "FIXED", int(scene_values["set_threads"])
     cycles.device = "CPU"
-    cycles.samples = int(told["set_samples"])
-    cycles.seed = int(told["set_seed"])
+    cycles.samples = int(scene_values["set_samples"])
+    cycles.seed = int(scene_values["set_seed"])
     cycles.use_adaptive_sampling = True
-    cycles.adaptive_threshold = float(told["set_noise_threshold"])
-    cycles.filter_width = float(told["set_filter_px"])
-    cycles.use_denoising = bool(told["set_denoise"])
+    cycles.adaptive_threshold = float(scene_values["set_noise_threshold"])
+    cycles.filter_width = float(scene_values["set_filter_px"])
+    cycles.use_denoising = bool(scene_values["set_denoise"])
     if cycles.use_denoising:
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-    cycles.max_bounces = cycles.diffuse_bounces = int(told["set_diffuse_bounces"])
+    cycles.max_bounces = cycles.diffuse_bounces = int(scene_values["set_diffuse_bounces"])
     cycles.glossy_bounces = 1
     # Micropolygons: the modifier says how many pixels each, these two by how much to multiply that.
     cycles.dicing_rate = 1.0
-    cycles.offscreen_dicing_scale = float(told["set_offscreen_dicing"])
+    cycles.offscreen_dicing_scale = float(scene_values["set_offscreen_dicing"])
     cycles.max_subdivisions = 12
     layer.use_pass_position = layer.use_pass_normal = layer.use_pass_diffuse_direct = True
     scene.world = bpy.data.worlds.new("vacuum")
@@ -91,7 +91,7 @@ def _set_up(bpy: Any, scene: Any, told: Any) -> None:
     scene.display_settings.display_device = "sRGB"
     scene.view_settings.view_transform = "Filmic"
     scene.view_settings.look = "None"
-    scene.view_settings.exposure = float(told["exposure_stops"])
+    scene.view_settings.exposure = float(scene_values["exposure_stops"])
 
 
 def _file_format(scene: Any, media: str, file_format: str, colours: str, depth: str) -> None:
@@ -105,10 +105,10 @@ def _file_format(scene: Any, media: str, file_format: str, colours: str, depth: 
         image.use_exr_interleave = True
 
 
-def _add_ground(bpy: Any, scene: Any, told: Any) -> None:
+def _add_ground(bpy: Any, scene: Any, scene_values: Any) -> None:
     import numpy as np
 
-    vertices, uv = told["vertices_km"], told["uv"]
+    vertices, uv = scene_values["vertices_km"], scene_values["uv"]
     rows, columns = vertices.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     # Counter-clockwise from above: the normals point up.
@@ -119,33 +119,35 @@ def _add_ground(bpy: Any, scene: Any, told: Any) -> None:
     layer = mesh.uv_layers.new(name="map")
     layer.data.foreach_set("uv", np.asarray(uv.reshape(-1, 2)[faces.ravel()], dtype=np.float32).ravel())
     mesh.update()
-    mesh.materials.append(_regolith(bpy, told))
+    mesh.materials.append(_regolith(bpy, scene_values))
     ground = bpy.data.objects.new("ground", mesh)
     scene.collection.objects.link(ground)
-    ground.cycles.shadow_terminator_offset = float(told["set_terminator_offset"])
-    ground.cycles.shadow_terminator_geometry_offset = float(told["set_geometry_offset"])
+    ground.cycles.shadow_terminator_offset = float(scene_values["set_terminator_offset"])
+    ground.cycles.shadow_terminator_geometry_offset = float(scene_values["set_geometry_offset"])
     modifier = ground.modifiers.new("dicing", "SUBSURF")
     modifier.subdivision_type = "SIMPLE"
     modifier.uv_smooth = "NONE"
     modifier.use_adaptive_subdivision = True
     modifier.adaptive_space = "PIXEL"
-    modifier.adaptive_pixel_size = float(told["set_pixels_per_polygon"])
+    modifier.adaptive_pixel_size = float(scene_values["set_pixels_per_polygon"])
 
 
-def _regolith(bpy: Any, told: Any) -> Any:
+def _regolith(bpy: Any, scene_values: Any) -> Any:
     material = bpy.data.materials.new("regolith")
     material.use_nodes = True
     material.displacement_method = "DISPLACEMENT"
     nodes, links = material.node_tree.nodes, material.node_tree.links
     surface = nodes["Principled BSDF"]
-    surface.inputs["Roughness"].default_value = float(told["set_roughness"])
-    surface.inputs["IOR"].default_value = float(told["specular_ior"])
-    links.new(_texture(bpy, nodes, "albedo", told["albedo"]).outputs["Color"], surface.inputs["Base Color"])
+    surface.inputs["Roughness"].default_value = float(scene_values["set_roughness"])
+    surface.inputs["IOR"].default_value = float(scene_values["specular_ior"])
+    links.new(
+        _texture(bpy, nodes, "albedo", scene_values["albedo"]).outputs["Color"], surface.inputs["Base Color"]
+    )
     relief = nodes.new("ShaderNodeDisplacement")
     relief.space = "OBJECT"
     relief.inputs["Midlevel"].default_value = 0.5
-    relief.inputs["Scale"].default_value = float(told["displacement_range_km"])
-    height = _texture(bpy, nodes, "height", told["displacement"])
+    relief.inputs["Scale"].default_value = float(scene_values["displacement_range_km"])
+    height = _texture(bpy, nodes, "height", scene_values["displacement"])
     links.new(height.outputs["Color"], relief.inputs["Height"])
     links.new(relief.outputs["Displacement"], nodes["Material Output"].inputs["Displacement"])
     return material
@@ -167,29 +169,29 @@ def _texture(bpy: Any, nodes: Any, name: str, values: Any) -> Any:
     return node
 
 
-def _add_camera(bpy: Any, scene: Any, told: Any) -> None:
+def _add_camera(bpy: Any, scene: Any, scene_values: Any) -> None:
     from mathutils import Matrix
 
     lens = bpy.data.cameras.new("camera")
     lens.type = "PERSP"
     lens.sensor_fit = "HORIZONTAL"
-    lens.angle = float(told["fov_rad"])
+    lens.angle = float(scene_values["fov_rad"])
     lens.clip_start, lens.clip_end = 0.01, 1.0e4
     camera = bpy.data.objects.new("camera", lens)
-    camera.matrix_world = Matrix(told["camera_to_world"].tolist())
+    camera.matrix_world = Matrix(scene_values["camera_to_world"].tolist())
     scene.collection.objects.link(camera)
     scene.camera = camera
 
 
-def _add_sun(bpy: Any, scene: Any, told: Any) -> None:
+def _add_sun(bpy: Any, scene: Any, scene_values: Any) -> None:
     from mathutils import Matrix
 
     lamp = bpy.data.lights.new("Sun", "SUN")
     # Irradiance of pi: a white Lambert surface under it has radiance 1.
     lamp.energy = math.pi
-    lamp.angle = float(told["sun_angle_rad"])
+    lamp.angle = float(scene_values["sun_angle_rad"])
     sun = bpy.data.objects.new("Sun", lamp)
-    sun.matrix_world = Matrix(told["sun_to_world"].tolist())
+    sun.matrix_world = Matrix(scene_values["sun_to_world"].tolist())
     scene.collection.objects.link(sun)
 
 

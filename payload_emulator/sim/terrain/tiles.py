@@ -351,7 +351,7 @@ class TiledTerrain(ABC):
             self._rim_tilt_m[part] = tilt
             self._measured[part] = True
 
-    def hand_over(self) -> None:
+    def release_thread(self) -> None:
         """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
         self._owner = None
 

@@ -63,8 +63,8 @@ def bias_overall(
     """
     azimuth = np.array([truth.sun_azimuth_image_rad for truth in truths])
     every = _bias(tallied, right(tallied, threshold), azimuth)
-    told = [row for row in by_octant if row["pairs"] >= FEWEST_PAIRS]
-    worst = max(told, key=lambda row: float(row["length_px"]), default=None)
+    judged = [row for row in by_octant if row["pairs"] >= FEWEST_PAIRS]
+    worst = max(judged, key=lambda row: float(row["length_px"]), default=None)
     return {
         **every,
         "worst_octant": None if worst is None else worst["octant"],
@@ -182,12 +182,12 @@ def against_rims(
         moved.append(replace(truth, u_px=place.u_px, v_px=place.v_px, diameter_px=place.diameter_px))
         known.append(frame.craters["id"][which])
     ids = np.unique(np.concatenate(known)) if known else np.zeros(0, np.int64)
-    beside = tally(moved, found)
-    fitted = beside.select(np.isin(beside.matched_id, ids), np.ones(beside.crater_id.size, bool))
+    displaced = tally(moved, found)
+    fitted = displaced.select(np.isin(displaced.matched_id, ids), np.ones(displaced.crater_id.size, bool))
     octants = bias_by_octant(fitted, threshold, truths)
     return {
         "catalogue": _distances(tally(truths, found), threshold, ids),
-        "refitted": _distances(beside, threshold, ids),
+        "refitted": _distances(displaced, threshold, ids),
         "bias_px_by_sun_octant": octants,
         "bias_px": bias_overall(fitted, threshold, truths, octants),
     }

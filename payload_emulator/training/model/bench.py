@@ -56,7 +56,9 @@ def bench(model_octets: bytes, threads: int = 1, frames: int = 100, seed: int = 
     }
 
 
-def beside(models: Mapping[str, bytes], rounds: int = 40, seed: int = 0) -> dict[str, dict[str, float]]:
+def compare_models(
+    models: Mapping[str, bytes], rounds: int = 40, seed: int = 0
+) -> dict[str, dict[str, float]]:
     """Time of each model's network and of whole detections, ms, taken in turn so that a neighbour hits all alike.
 
     Medians over `rounds` of one thread: `cpu_` is its processor time, the others by the clock. `of_first` is the

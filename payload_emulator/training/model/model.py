@@ -210,8 +210,8 @@ class ExportedCraterNet(nn.Module):
         with torch.no_grad():
             head.weight.copy_(whole.weight[kept])
             head.bias.copy_(whole.bias[kept])
-            told = len(kept) - heat_channels
-            head.bias[heat_channels : heat_channels + 4] += torch.tensor(geometry_shift)[:told]
+            geometry_channels = len(kept) - heat_channels
+            head.bias[heat_channels : heat_channels + 4] += torch.tensor(geometry_shift)[:geometry_channels]
         self.network.head = head
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

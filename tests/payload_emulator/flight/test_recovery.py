@@ -39,7 +39,7 @@ def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(
 def test_farther_than_any_widened_search_the_place_is_found_without_a_prior(
     navigation_case: Callable[..., NavigationCase],
 ) -> None:
-    case = navigation_case(FRAME + 24, kidnap=Kidnap(FRAME, 200e3, told=False), parameters=PARAMETERS)
+    case = navigation_case(FRAME + 24, kidnap=Kidnap(FRAME, 200e3, announced=False), parameters=PARAMETERS)
     # The part of the Moon about the track, so that a search takes moments.
     near = np.flatnonzero(np.abs(np.degrees(case.craters.latitude_rad) - about_deg(case)[0]) < 35.0)
     case = replace(case, craters=case.craters.select(near[turn_deg(case, near) < 25.0]))

@@ -61,5 +61,5 @@ def test_false_detections_have_their_share_and_lie_in_the_image(rng) -> None:
 
 
 def test_the_told_error_is_the_true_one_unless_stated() -> None:
-    assert SimulatedDetector(sigma_px=1.2).told_sigma_px == 1.2
-    assert SimulatedDetector(sigma_px=1.2, claimed_sigma_px=0.7).told_sigma_px == 0.7
+    assert SimulatedDetector(sigma_px=1.2).stated_sigma_px == 1.2
+    assert SimulatedDetector(sigma_px=1.2, claimed_sigma_px=0.7).stated_sigma_px == 0.7

@@ -18,7 +18,7 @@ from payload_emulator.training.data.feeder import TrainParameters
 from payload_emulator.training.evaluate import evaluate
 from payload_emulator.training.model import export, train
 from studies import pipeline
-from studies.pipeline import Job, format_made, make_dataset, make_model
+from studies.pipeline import Job, format_comparison, make_dataset, make_model
 
 TINY = TrainParameters(
     minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0
@@ -64,7 +64,7 @@ def test_both_models_lie_in_the_folder_with_their_figures_and_report(job, made):
     assert detector.metadata["git_revision"] == "abc"
     assert set(json.loads(detector.metadata["test_figures"])) == {"test"}
     assert "By Sun azimuth" in (job.out / "report-test.html").read_text(encoding="utf-8")
-    table = format_made(made)
+    table = format_comparison(made)
     assert "paper's design" in table and "evidence level 2 (procedural Moon, held out)" in table
 
 
