@@ -212,10 +212,11 @@ def _zipped(ground: Ground, files: Iterable[tuple[str, bytes]]) -> IO[bytes]:
     folder = ground.files.root
     with ExitStack() as unfinished:
         try:
-            stream = tempfile.SpooledTemporaryFile(
-                SPOOLED_OCTETS, dir=str(folder), prefix=unfinished_prefix(INCOMING)
+            stream = unfinished.enter_context(
+                tempfile.SpooledTemporaryFile(
+                    SPOOLED_OCTETS, dir=str(folder), prefix=unfinished_prefix(INCOMING)
+                )
             )
-            unfinished.push(stream)
             with zipfile.ZipFile(stream, "w") as archive:
                 for name, octets in files:
                     entry = zipfile.ZipInfo(name, _EPOCH_OF_ZIP)
