@@ -9,12 +9,8 @@ from contextlib import asynccontextmanager
 
 from anyio import to_thread
 from fastapi import FastAPI
-from starlette.concurrency import run_in_threadpool
 from starlette.routing import Route
 
-from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.commanding.service import note_timeouts
-from ground_service.errors import GroundError
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
@@ -25,9 +21,8 @@ from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.links.supervisor import LinkSupervisor
-from ground_service.planning.standing import needs_plan
 from ground_service.routers import OPERATIONS
-from ground_service.settings import Settings
+from ground_service.settings import Settings, start_tracing
 from ground_service.web.displays import FOLDER, displays
 from ground_service.web.documentation import documentation
 from ground_service.web.live import live
@@ -39,18 +34,9 @@ from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
-from ground_service.worker.upkeep import nightly_job_id, plan_job_id
+from ground_service.worker.scheduler import Scheduler
 
 log = logging.getLogger(__name__)
-
-DAY_NS = 86_400_000_000_000
-NIGHT_NS = 1_800_000_000_000
-"""The nightly job is entered at 00:30 UTC."""
-
-CATCH_UP_S = 60.0
-"""A service that was not running then enters it so long after its start."""
-
-SWEEP_S = 15.0
 
 SQLITE_THREADS = 4
 SERVER_THREADS = 20
@@ -92,16 +78,17 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             per_user=settings.sockets_per_user,
             total=settings.sockets,
         )
-        chores = [
-            asyncio.create_task(work)
-            for work in (_nights(app, settings), _sweeps(app), app.state.sockets.run())
-        ]
+        sockets = asyncio.create_task(app.state.sockets.run())
+        scheduler = Scheduler(
+            ground, app.state.dispatcher, app.state.follow_up.drain, settings.retention_days
+        )
+        scheduler.start()
         try:
             yield
         finally:
-            for chore in chores:
-                chore.cancel()
-            await asyncio.gather(*chores, return_exceptions=True)
+            sockets.cancel()
+            await asyncio.gather(sockets, return_exceptions=True)
+            await asyncio.to_thread(scheduler.stop)
             if supervisor is not None:
                 await asyncio.to_thread(supervisor.stop)
             await asyncio.to_thread(app.state.uploads.close)
@@ -127,7 +114,9 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     for one in (*routers, live, payload_console):
         app.include_router(one)
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
-    app.state.metrics = Metrics()
+    app.state.backups = settings.backups
+    app.state.metrics = Metrics(settings.backups)
+    start_tracing(settings)
     problems.install(app)
     _add_middleware(app, settings, budgets)
     return app
@@ -156,48 +145,3 @@ def shared_budgets(settings: Settings) -> SharedBudgets | None:
     if settings.rate_limit_per_s <= 0.0 or broker is None or not broker.startswith(("redis://", "rediss://")):
         return None
     return SharedBudgets(broker, settings.rate_limit_per_s)
-
-
-async def _nights(app: FastAPI, settings: Settings) -> None:
-    """Enter the nightly job once a day; it is one job however many servers and schedulers enter it."""
-    if settings.resolved_broker_url() is not None:
-        return  # the workers' scheduler does it
-    wait_s = CATCH_UP_S
-    while True:
-        left_s = (NIGHT_NS - utc_now_ns() % DAY_NS) % DAY_NS / 1e9
-        await asyncio.sleep(min(wait_s, left_s) + 1.0)
-        wait_s = DAY_NS / 1e9
-        if utc_now_ns() % DAY_NS < NIGHT_NS:
-            continue  # the last night's was before this day, and the next is to come
-        try:
-            await run_in_threadpool(
-                app.state.dispatcher.submit,
-                "nightly",
-                {"retention_days": settings.retention_days},
-                job_id=nightly_job_id(utc_now_ns()),
-            )
-        except GroundError:
-            log.exception("the nightly job could not be entered")
-
-
-def _plan(app: FastAPI) -> None:
-    """Enter the job of the plan once an hour of mission time, however many servers do."""
-    if needs_plan(app.state.ground):
-        app.state.dispatcher.submit("plan", {}, job_id=plan_job_id(mission_now_ns()))
-
-
-async def _sweeps(app: FastAPI) -> None:
-    """Take up, every now and then, jobs that something left unfinished, and note telecommands whose end is overdue."""
-    since = utc_now_ns() - DAY_NS
-    while True:
-        await asyncio.sleep(SWEEP_S)
-        try:
-            await run_in_threadpool(app.state.dispatcher.resume)
-            await run_in_threadpool(app.state.follow_up.drain)
-            await run_in_threadpool(_plan, app)
-            until = utc_now_ns()
-            for command in await run_in_threadpool(note_timeouts, app.state.ground, since, until):
-                log.warning("telecommand %d: its end is overdue", command, extra={"telecommand": command})
-            since = until
-        except GroundError as error:
-            log.warning("unfinished work could not be looked after: %s", error)

@@ -7,11 +7,13 @@ import logging
 from datetime import UTC, datetime
 from typing import Any
 
+from ground_service.tracing import trace_id
+
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
 
 
 class JsonFormatter(logging.Formatter):
-    """An entry as one JSON object: time, level, logger, message, what was passed as `extra`, and the trace if any."""
+    """An entry as one JSON object: time, level, logger, message, trace id, `extra` values, and the traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
         entry: dict[str, Any] = {
@@ -20,6 +22,8 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
+        if (trace := trace_id()) is not None:
+            entry["trace_id"] = trace
         entry.update({key: value for key, value in vars(record).items() if key not in _OWN})
         if record.exc_info:
             entry["trace"] = self.formatException(record.exc_info)

@@ -45,5 +45,6 @@ OPERATIONS = (
     Router("ground_service.automation.routes", "automation", "automation"),
     Router("ground_service.regression.routes", "regressions", "regressions"),
     Router("ground_service.access.routes", "access", "users"),
+    Router("ground_service.worker.status_routes", "status", "status"),
 )
 """Operations of the HTTP API."""

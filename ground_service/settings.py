@@ -14,6 +14,7 @@ from urllib.parse import quote
 from pydantic import BeforeValidator, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from ground_service import tracing
 from ground_service.errors import SettingsError
 
 
@@ -49,6 +50,10 @@ class Settings(BaseSettings):
         description="URL of the owner of the schema, used only by `linna db upgrade`, which then grants the role of "
         "LINNA_DATABASE_URL its rights; default: LINNA_DATABASE_URL",
     )
+    backup_role: str | None = Field(
+        default=None,
+        description="Database role for backups: `linna db upgrade` grants it the right to read all tables",
+    )
     allow_database_owner: bool = Field(
         default=False,
         description="Permit a database role that can change the schema or the audit log, for example on a laptop",
@@ -79,6 +84,15 @@ class Settings(BaseSettings):
     links: bool = Field(
         default=True,
         description="Operate the links of mission descriptions in `linna serve`; false where `linna link run` does",
+    )
+    traces: str | None = Field(
+        default=None,
+        pattern=r"^https?://",
+        description="URL of an OpenTelemetry collector (OTLP over HTTP) for traces, such as "
+        "http://collector:4318/v1/traces; needs the extra `traces`; default: none",
+    )
+    backups: Path | None = Field(
+        default=None, description="Folder of backups, whose age the metrics and the status state"
     )
     log_format: Literal["text", "json"] = Field(default="text", description="Form of the log on stderr")
     rate_limit_per_s: float = Field(
@@ -189,6 +203,20 @@ def load_settings(**given: object) -> Settings:
         first = error.errors()[0]
         name = "LINNA_" + "_".join(str(part) for part in first["loc"]).upper()
         raise SettingsError(name, first["msg"].lower(), repr(first.get("input"))) from None
+
+
+def start_tracing(settings: Settings) -> None:
+    """Send traces of this process to the collector of the settings, if they name one.
+
+    Raises
+    ------
+    SettingsError
+        If OpenTelemetry is not installed.
+    """
+    try:
+        tracing.configure(settings.traces)
+    except ImportError as error:
+        raise SettingsError("LINNA_TRACES", "the extra 'traces' to be installed", str(error)) from None
 
 
 def _secret(name: str, path: str) -> str:

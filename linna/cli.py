@@ -53,6 +53,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "command": ("command", "queue, release, uplink and verify telecommands"),
     "serve": ("serve", "run the HTTP server of the ground service"),
     "worker": ("worker", "run a job worker of the ground service"),
+    "scheduler": ("scheduler", "run the recurring work of a distributed ground service"),
     "runner": ("runner", "run payload builds for the ground service, in a separate container"),
     "db": ("db", "schema, backup, export and import of the database"),
     "verify": ("verify", "check the integrity of the archive: files, rows, packets, audit chain"),

@@ -143,6 +143,15 @@ def revoke_tokens(
     return int(connection.execute(query.values(revoked_utc_ns=now_utc_ns)).rowcount)
 
 
+def delete_ended_sessions(connection: Connection, now_utc_ns: int) -> int:
+    """Delete the tokens of browser sessions that have expired; return their number.
+
+    The audit log keeps the start of each session. Revoked sessions are deleted when they would have expired.
+    """
+    query = delete(TOKENS).where(TOKENS.c.parent_id.is_not(None), TOKENS.c.expires_utc_ns < now_utc_ns)
+    return int(connection.execute(query).rowcount)
+
+
 def note_use(connection: Connection, token_id: int, used_utc_ns: int) -> None:
     """Store the last use of a token, unless a later one is stored."""
     earlier = or_(TOKENS.c.used_utc_ns.is_(None), TOKENS.c.used_utc_ns < used_utc_ns)

@@ -41,6 +41,7 @@ from ground_service.planning.model import Imported, Plan, SearchResult, Window
 from ground_service.planning.request_model import RequestPlan, StandingRequest
 from ground_service.regression.model import Build, KeptArchive, Pruned, Regression, RegressionSummary
 from ground_service.timekeeping.model import Correlation, TimeReport
+from ground_service.worker.model import ServiceStatus
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 2.0
 
@@ -577,6 +578,10 @@ class Client(Connection):
         return self._post(AlarmDetail, f"/alarms/{alarm_id}/shelve", {"until": until, "comment": comment})
 
     # Jobs
+
+    def get_status(self) -> ServiceStatus:
+        """Return the condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""
+        return self._get(ServiceStatus, "/status")
 
     def list_jobs(self, *, kind: str | None = None) -> Listing[Job]:
         """List jobs, newest first."""

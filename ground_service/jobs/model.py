@@ -21,6 +21,7 @@ class Job(Entity):
     arguments: dict[str, Any]
     result: dict[str, Any] | None
     error: str | None
+    traceparent: str | None = Field(description="W3C trace context of the step that entered it")
     created: UtcTime
     started: UtcTime | None
     finished: UtcTime | None

@@ -13,6 +13,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from ground_service import tracing
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import JobChanged, publish
@@ -70,7 +71,7 @@ def add_job(
     if kind not in KINDS:
         raise InvalidInput("job", "kind", " or ".join(KINDS), kind)
     identity = job_id or uuid.uuid4().hex
-    if store.add_job(connection, identity, kind, arguments, utc_now_ns()):
+    if store.add_job(connection, identity, kind, arguments, utc_now_ns(), tracing.current()):
         publish(connection, JobChanged(id=identity, kind=kind, state="queued"))
     else:
         known = store.get_job(connection, identity)

@@ -17,7 +17,12 @@ FINISHED = ("done", "failed")
 
 
 def add_job(
-    connection: Connection, job_id: str, kind: str, arguments: Mapping[str, Any], now_utc_ns: int
+    connection: Connection,
+    job_id: str,
+    kind: str,
+    arguments: Mapping[str, Any],
+    now_utc_ns: int,
+    traceparent: str | None,
 ) -> bool:
     """Add a queued job; return False if the id exists."""
     added = repository.add_new(
@@ -29,6 +34,7 @@ def add_job(
         arguments=dict(arguments),
         progress=0.0,
         attempts=0,
+        traceparent=traceparent,
         created_utc_ns=now_utc_ns,
     )
     return added is not None

@@ -9,6 +9,7 @@ from sqlalchemy import Connection, RowMapping, func, or_, select, update
 
 from ground_service.links.model import ContactState, LinkState
 from ground_service.store import repository
+from ground_service.store.leases import renew_or_take
 from ground_service.store.states import change_if
 
 _LINKS, _CONTACTS, _TRANSMISSIONS = repository.LINKS, repository.CONTACTS, repository.TRANSMISSIONS
@@ -103,26 +104,19 @@ def acquire(
         send_done=0,
         changed_utc_ns=wall_utc_ns,
     )
-    free = or_(_LINKS.c.owner.is_(None), _LINKS.c.lease_utc_ns < wall_utc_ns)
-    taken = (
-        update(_LINKS)
-        .where(_LINKS.c.name == name, free)
-        .values(
-            owner=owner,
-            lease_utc_ns=until_utc_ns,
-            ccsds_id=ccsds_id,
-            instance=instance,
-            state="waiting",
-            reason=None,
-            changed_utc_ns=wall_utc_ns,
-        )
+    return renew_or_take(
+        connection,
+        _LINKS,
+        name,
+        owner,
+        now_utc_ns=wall_utc_ns,
+        until_utc_ns=until_utc_ns,
+        ccsds_id=ccsds_id,
+        instance=instance,
+        state="waiting",
+        reason=None,
+        changed_utc_ns=wall_utc_ns,
     )
-    renewed = (
-        update(_LINKS)
-        .where(_LINKS.c.name == name, _LINKS.c.owner == owner, _LINKS.c.lease_utc_ns >= wall_utc_ns)
-        .values(lease_utc_ns=until_utc_ns)
-    )
-    return connection.execute(renewed).rowcount == 1 or connection.execute(taken).rowcount == 1
 
 
 def release(connection: Connection, name: str, owner: str, wall_utc_ns: int) -> None:

@@ -569,11 +569,12 @@ JOBS = Table(
     column("attempts", Integer),
     optional("result", JSON),
     optional("error", Text),
+    optional("traceparent", String(55)),
     column("created_utc_ns", BigInteger),
     optional("started_utc_ns", BigInteger),
     optional("finished_utc_ns", BigInteger),
 )
-"""A piece of background work, visible from queued to its end."""
+"""A piece of background work, visible from queued to its end; `traceparent` is the step that entered it."""
 
 
 REPORTS = Table(
@@ -823,6 +824,16 @@ LINKS = Table(
 `lease_utc_ns` is the end of the lease of the owner, wall time. `heard_utc_ns` is the mission time of the last
 reception, `considered_utc_ns` the mission time up to which predicted contacts were compared with receptions.
 """
+
+
+LEASES = Table(
+    "leases",
+    METADATA,
+    key("name", String(64)),
+    optional("owner", String(96)),
+    column("lease_utc_ns", BigInteger),
+)
+"""Right of one process among many to do recurring work, until `lease_utc_ns` by the clock of the database."""
 
 
 CONTACTS = Table(

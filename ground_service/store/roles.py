@@ -7,7 +7,7 @@ privileges.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
@@ -56,6 +56,26 @@ def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
     yield f"GRANT USAGE, SELECT, UPDATE ON ALL SEQUENCES IN SCHEMA public TO {name}"
 
 
+def backup_statements(role: str, tables: list[str]) -> Iterator[str]:
+    """Yield SQL that lets a role read every table and nothing else, for backups.
+
+    Parameters
+    ----------
+    role
+        Name of an existing role.
+    tables
+        Names of all tables of the schema.
+    """
+    name = quoted(role)
+    yield "REVOKE ALL ON SCHEMA public FROM PUBLIC"
+    yield f"REVOKE ALL ON SCHEMA public FROM {name}"
+    yield f"GRANT USAGE ON SCHEMA public TO {name}"
+    yield f"REVOKE ALL ON ALL TABLES IN SCHEMA public FROM PUBLIC, {name}"
+    yield f"REVOKE ALL ON ALL SEQUENCES IN SCHEMA public FROM {name}"
+    for table in sorted(tables):
+        yield f"GRANT SELECT ON {quoted(table)} TO {name}"
+
+
 def grant_service(database: Database, role: str) -> None:
     """Grant a role the privileges of the service, as the owner of the schema; a repeated call changes nothing.
 
@@ -64,6 +84,21 @@ def grant_service(database: Database, role: str) -> None:
     DatabaseUnavailable
         There is no such role, or it is the owner.
     """
+    _grant(database, role, grant_statements)
+
+
+def grant_backup(database: Database, role: str) -> None:
+    """Grant a role the right to read all tables, as the owner of the schema; a repeated call changes nothing.
+
+    Raises
+    ------
+    DatabaseUnavailable
+        There is no such role, or it is the owner.
+    """
+    _grant(database, role, backup_statements)
+
+
+def _grant(database: Database, role: str, statements_of: Callable[[str, list[str]], Iterator[str]]) -> None:
     with database.writing() as connection:
         owner = connection.execute(text("SELECT current_user")).scalar_one()
         if owner == role:
@@ -79,7 +114,7 @@ def grant_service(database: Database, role: str) -> None:
         tables = connection.execute(
             text("SELECT tablename FROM pg_tables WHERE schemaname = 'public'")
         ).scalars()
-        for statement in grant_statements(role, list(tables)):
+        for statement in statements_of(role, list(tables)):
             connection.execute(text(statement))
 
 

@@ -29,10 +29,11 @@ BARE = frozenset(
         "audit",
         "audit_head",
         "row_digests",
+        "leases",
         *(one.name for one in models.SAMPLE_TABLES),
     }
 )
-"""Tables without digests: derived from raw files, or part of the audit chain."""
+"""Tables without digests: derived from raw files, part of the audit chain, or state of running processes."""
 
 WRITER_SETTING = "linna.writer"
 FUNCTION = "linna_row_digest"

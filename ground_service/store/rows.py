@@ -20,8 +20,8 @@ from ground_service.store import models
 
 BLOCK_ROWS = 5000
 
-KEPT_BY_THE_PROGRAM = frozenset({"row_digests"})
-"""Tables filled by triggers, which are not copied."""
+KEPT_BY_THE_PROGRAM = frozenset({"row_digests", "leases"})
+"""Tables filled by triggers, and the state of running processes, which are not copied."""
 
 MADE_WITH_THE_SCHEMA = frozenset({"audit_head"})
 """Tables with rows in an empty database; a copy replaces these rows."""

@@ -77,6 +77,8 @@ PAGES = (
     Page("/missions/{revision}", "mission", "Mission", "", "missions"),
     Page("/automation", "automation", "Automation", "Automation"),
     Page("/audit", "audit", "Audit log", "Audit"),
+    Page("/status", "status", "Status of the service", ""),
+    Page("/users", "users", "Users and tokens", ""),
     Page("/docs", "docs", "HTTP API", ""),
     Page("/licences", "licences", "Licences", ""),
 )

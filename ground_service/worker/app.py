@@ -7,27 +7,24 @@ twice without harm, that loses and doubles nothing.
 from __future__ import annotations
 
 import contextlib
+import json
 import logging.config
 import socket
 from typing import Any
 
 from celery import Celery
-from celery.schedules import crontab
 from celery.signals import setup_logging
 from kombu.exceptions import OperationalError
 
-from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, SettingsError
 from ground_service.ground import Ground, ground_from_settings
-from ground_service.jobs.service import enter_job
 from ground_service.logs import logging_config
-from ground_service.settings import Settings
+from ground_service.settings import Settings, start_tracing
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import run_job
-from ground_service.worker.upkeep import nightly_job_id
 
 RUN_JOB = "ground_service.run_job"
-NIGHTLY = "ground_service.nightly"
+JOB_HEADER = "linna-job"
 TIME_LIMIT_S = 1800
 RETRIES = 5
 QUEUE = "linna"
@@ -55,7 +52,6 @@ def make_app(settings: Settings) -> Celery:
         task_default_queue=QUEUE,
         worker_max_tasks_per_child=200,
         timezone="UTC",
-        beat_schedule={"nightly": {"task": NIGHTLY, "schedule": crontab(minute=30, hour=0)}},
     )
 
     @app.task(
@@ -67,13 +63,8 @@ def make_app(settings: Settings) -> Celery:
         max_retries=RETRIES,
     )
     def run(_task: Any, job_id: str) -> None:
+        start_tracing(settings)
         run_job(_ground_of(settings), job_id)
-
-    @app.task(name=NIGHTLY)
-    def night() -> None:
-        ground = _ground_of(settings)
-        arguments = {"retention_days": settings.retention_days}
-        run_job(ground, enter_job(ground, "nightly", arguments, job_id=nightly_job_id(utc_now_ns())))
 
     return app
 
@@ -86,11 +77,11 @@ def send_job(settings: Settings, job_id: str) -> None:
     kombu.exceptions.OperationalError
         If the broker cannot be reached.
     """
-    _app_of(settings).send_task(RUN_JOB, args=(job_id,), retry=False)
+    _app_of(settings).send_task(RUN_JOB, args=(job_id,), headers={JOB_HEADER: job_id}, retry=False)
 
 
-def queue_length(settings: Settings) -> int:
-    """Jobs that wait at the broker for a worker.
+def queued_jobs(settings: Settings) -> list[str]:
+    """Return the ids of the jobs that wait at a Redis broker for a worker, the next one last.
 
     Raises
     ------
@@ -100,7 +91,8 @@ def queue_length(settings: Settings) -> int:
     app = _app_of(settings)
     with app.connection_for_read() as connection:
         connection.ensure_connection(max_retries=1, timeout=5)
-        return int(connection.default_channel._size(QUEUE))
+        messages = connection.default_channel.client.lrange(QUEUE, 0, -1)
+    return [str(json.loads(message)["headers"].get(JOB_HEADER)) for message in messages]
 
 
 def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:
@@ -143,8 +135,8 @@ def _app_of(settings: Settings) -> Celery:
     return _apps[key]
 
 
-def run_worker(settings: Settings, concurrency: int = 1, *, beat: bool = False) -> None:
-    """Do jobs until stopped; with `beat` enter the scheduled ones, too (one worker of a deployment has to).
+def run_worker(settings: Settings, concurrency: int = 1) -> None:
+    """Do jobs until stopped.
 
     Raises
     ------
@@ -166,6 +158,4 @@ def run_worker(settings: Settings, concurrency: int = 1, *, beat: bool = False) 
         "--without-gossip",
         "--without-mingle",
     ]
-    if beat:
-        words += ["--beat", "--schedule", str(settings.home / "beat-schedule")]
     make_app(settings).worker_main(words)

@@ -117,22 +117,25 @@ class CeleryDispatcher:
             log.warning("job %s: the broker is away (%s); it will be sent again", job_id, error)
 
     def resume(self) -> None:
-        """Send unfinished jobs again when the queue is empty: a broker or a worker that was killed may have lost them.
+        """Send unfinished jobs that are not in the queue again: a killed broker or worker may have lost them.
 
         One that a worker is doing is done once all the same: `run_job` leaves it to that worker.
         """
         from kombu.exceptions import OperationalError
 
-        from ground_service.worker.app import queue_length
+        from ground_service.worker.app import queued_jobs
 
+        unfinished = unfinished_jobs(self._ground)
+        if not unfinished:
+            return
         try:
-            if queue_length(self._settings) > 0:
-                return
+            queued = set(queued_jobs(self._settings))
         except (OperationalError, OSError) as error:
             log.warning("the broker is away: %s", error)
             return
-        for identity in unfinished_jobs(self._ground):
-            self.start(identity)
+        for identity in unfinished:
+            if identity not in queued:
+                self.start(identity)
 
     def close(self) -> None:
         pass

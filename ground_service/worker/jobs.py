@@ -32,6 +32,7 @@ from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
 from ground_service.passes.archive_zip import import_zip
 from ground_service.planning.standing import plan_tick
+from ground_service.tracing import span
 from ground_service.worker.actions import run_actions
 from ground_service.worker.upkeep import nightly
 from lunar.errors import LunarError
@@ -49,14 +50,16 @@ Work = Callable[[Ground, Mapping[str, Any], str], dict[str, Any]]
 
 
 def _report(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    made = make_report(ground, int(arguments["pass_id"]), report_id=job_id, pdf=True)
+    with span("report", attributes={"linna.pass": int(arguments["pass_id"])}):
+        made = make_report(ground, int(arguments["pass_id"]), report_id=job_id, pdf=True)
     return {"report_id": made.report_id, "pass_id": made.pass_id}
 
 
 def _reevaluate(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     """Evaluate a pass again because of an event, and make a report if anything in it differs."""
     pass_id, event = int(arguments["pass_id"]), int(arguments["event"])
-    made = reevaluate(ground, pass_id, report_id=job_id, event=event)
+    with span("report", attributes={"linna.pass": pass_id}):
+        made = reevaluate(ground, pass_id, report_id=job_id, event=event)
     return {"report_id": None if made is None else made.report_id, "pass_id": pass_id, "event": event}
 
 
@@ -145,6 +148,17 @@ def run_job(ground: Ground, job_id: str) -> Job:
 
 
 def _run_alone(ground: Ground, job_id: str) -> Job:
+    with ground.database.reading() as connection:
+        job = store.get_job(connection, job_id)
+    if job.state in FINISHED:
+        return job
+    with span(f"job {job.kind}", parent=job.traceparent, attributes={"linna.job": job_id}) as further:
+        done = _attempt(ground, job_id)
+        further["linna.state"] = done.state
+        return done
+
+
+def _attempt(ground: Ground, job_id: str) -> Job:
     with ground.database.writing() as connection:
         job = store.get_job(connection, job_id)
         if job.state in FINISHED:

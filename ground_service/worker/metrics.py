@@ -6,6 +6,7 @@ import logging
 import re
 import time
 import uuid
+from pathlib import Path
 
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
@@ -20,16 +21,24 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ground_service.ground import Ground
-from ground_service.worker.store import count_work
+from ground_service.tracing import span
+from ground_service.worker.condition import read_condition
 
 BUCKETS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 30.0)
 
 
 class Metrics:
-    """The figures of one application."""
+    """The figures of one application.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    backups
+        Folder of backups; None: their age is unknown and not stated.
+    """
+
+    def __init__(self, backups: Path | None = None) -> None:
         self._registry = CollectorRegistry()
+        self._backups = backups
         self.requests = Counter(
             "linna_http_requests", "Requests answered", ("method", "route", "status"), registry=self._registry
         )
@@ -43,14 +52,39 @@ class Metrics:
         self._jobs = Gauge("linna_jobs", "Jobs by state", ("kind", "state"), registry=self._registry)
         self._ingests = Gauge("linna_ingests", "Ingests by state", ("state",), registry=self._registry)
         self._passes = Gauge("linna_passes", "Passes", registry=self._registry)
+        self._queue_age = self._gauge(
+            "linna_queue_age_seconds", "Age of the oldest job that waits; 0: none waits"
+        )
+        self._lag = self._gauge("linna_ingest_lag_seconds", "Age of the oldest unfinished ingest; 0: none")
+        self._free = self._gauge("linna_disk_free_bytes", "Free space of the archive's file system")
+        self._size = self._gauge("linna_disk_size_bytes", "Size of the archive's file system")
+        self._scheduler = self._gauge("linna_scheduler", "Processes that do the recurring work: 1 or 0")
+        self._backup = self._gauge("linna_backup_age_seconds", "Age of the newest backup", ("folder",))
+        self._correlation = self._gauge(
+            "linna_time_correlation_age_seconds",
+            "Time since the newest time correlation was made",
+            ("spacecraft_id", "instance"),
+        )
+
+    def _gauge(self, name: str, text: str, labels: tuple[str, ...] = ()) -> Gauge:
+        return Gauge(name, text, labels, registry=self._registry)
 
     def answer(self, ground: Ground) -> Response:
         """All figures, those of the work read from the database now."""
-        with ground.database.reading() as connection:
-            counts = count_work(connection)
+        now = read_condition(ground, self._backups)
+        counts = now.counts
         # A state that nothing is in any more has no row, and must not keep its last count.
-        self._jobs.clear()
-        self._ingests.clear()
+        for gauge in (self._jobs, self._ingests, self._backup, self._correlation):
+            gauge.clear()
+        self._queue_age.set(now.queue_age_s)
+        self._lag.set(now.ingest_lag_s)
+        self._free.set(now.disk_free)
+        self._size.set(now.disk_size)
+        self._scheduler.set(float(now.scheduler is not None))
+        if self._backups is not None and now.backup_age_s is not None:
+            self._backup.labels(str(self._backups)).set(now.backup_age_s)
+        for (number, instance), age_s in now.correlation_ages_s.items():
+            self._correlation.labels(str(number), instance).set(age_s)
         for (kind, state), count in counts.jobs.items():
             self._jobs.labels(kind, state).set(count)
         for state, count in counts.ingests.items():
@@ -92,22 +126,33 @@ class Watch:
                 MutableHeaders(scope=message)["X-Request-ID"] = request_id
             await send(message)
 
-        try:
-            await self._app(scope, receive, noted)
-        finally:
-            route = getattr(scope.get("route"), "path", "none")
-            took_s = time.perf_counter() - started
-            self._metrics.requests.labels(scope["method"], route, status).inc()
-            self._metrics.seconds.labels(scope["method"], route).observe(took_s)
-            if scope["path"] not in _UNLOGGED:
-                told = {
-                    "request_id": request_id,
-                    "method": scope["method"],
-                    "path": scope["path"],
-                    "route": route,
-                    "status": status,
-                    "ms": round(1e3 * took_s, 1),
-                    "caller": scope["state"].get("caller"),
-                    "address": (scope.get("client") or (None,))[0],
-                }
-                log.info("%s %s %d", scope["method"], scope["path"], status, extra=told)
+        with span(scope["method"], parent=Headers(scope=scope).get("traceparent")) as further:
+            try:
+                await self._app(scope, receive, noted)
+            finally:
+                took_s = time.perf_counter() - started
+                further.update(self._note(scope, status, took_s, request_id))
+
+    def _note(self, scope: Scope, status: int, took_s: float, request_id: str) -> dict[str, object]:
+        """Count and log a request; return the attributes of its span."""
+        route = getattr(scope.get("route"), "path", "none")
+        self._metrics.requests.labels(scope["method"], route, status).inc()
+        self._metrics.seconds.labels(scope["method"], route).observe(took_s)
+        if scope["path"] not in _UNLOGGED:
+            told = {
+                "request_id": request_id,
+                "method": scope["method"],
+                "path": scope["path"],
+                "route": route,
+                "status": status,
+                "ms": round(1e3 * took_s, 1),
+                "caller": scope["state"].get("caller"),
+                "address": (scope.get("client") or (None,))[0],
+            }
+            log.info("%s %s %d", scope["method"], scope["path"], status, extra=told)
+        return {
+            "name": f"{scope['method']} {route}",
+            "http.request.method": scope["method"],
+            "http.route": route,
+            "http.response.status_code": status,
+        }

@@ -1,7 +1,8 @@
 """What the service does by itself every night: trends with limit checks, and taking away what is no longer needed.
 
 The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
-(the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`.
+(the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`, tokens of
+expired browser sessions at once.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
-from ground_service.access.store import delete_answers
+from ground_service.access.store import delete_answers, delete_ended_sessions
 from ground_service.clock import utc_now_ns
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
@@ -78,12 +79,14 @@ def broken_limits(ground: Ground, vehicle: int) -> list[dict[str, Any]]:
 
 def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
     """Take away what is older than it is kept; how much of each kind that was."""
-    before = utc_now_ns() - retention_days * DAY_NS
+    now = utc_now_ns()
+    before = now - retention_days * DAY_NS
     with ground.database.writing() as connection:
         removed = {
             "events": events.delete_before(connection, before),
             "jobs": delete_finished(connection, before),
             "answers": delete_answers(connection, before),
+            "sessions": delete_ended_sessions(connection, now),
         }
     removed["files"] = ground.files.remove_leftovers() + remove_leftovers(ground.home, UNPACKING)
     return removed

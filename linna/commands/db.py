@@ -21,6 +21,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "grant", help="grant a database role the least privileges that the service needs"
     )
     granting.add_argument("--role", metavar="NAME", help="default: the user of $LINNA_DATABASE_URL")
+    granting.add_argument(
+        "--backup",
+        action="store_true",
+        help="grant only the right to read, for backups; --role defaults to $LINNA_BACKUP_ROLE",
+    )
     granting.add_argument("--print", action="store_true", help="print the SQL statements and do not run them")
     granting.set_defaults(handler=run_grant)
     downgrade = actions.add_parser("downgrade", help="delete every table and row of the database")
@@ -73,7 +78,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run_upgrade(arguments: argparse.Namespace) -> int:
     from ground_service.store.database import prepare_database, schema_revisions
-    from ground_service.store.roles import grant_service
+    from ground_service.store.roles import grant_backup, grant_service
 
     settings = settings_of(arguments)
     database = prepare_database(settings.resolved_migration_url(), upgrade=True)
@@ -81,28 +86,33 @@ def run_upgrade(arguments: argparse.Namespace) -> int:
         role = _service_role(settings)
         if role is not None:
             grant_service(database, role)
+        if settings.backup_role is not None:
+            grant_backup(database, settings.backup_role)
         return _show(arguments, *schema_revisions(database)[:2], database.label)
     finally:
         database.engine.dispose()
 
 
 def run_grant(arguments: argparse.Namespace) -> int:
+    from ground_service.store import roles
     from ground_service.store.database import prepare_database
     from ground_service.store.models import METADATA
-    from ground_service.store.roles import READ_ONLY, grant_service, grant_statements
     from linna.errors import UsageError
 
     settings = settings_of(arguments)
-    role = arguments.role or _service_role(settings)
+    purpose = "backups" if arguments.backup else "the service"
+    role = arguments.role or (settings.backup_role if arguments.backup else _service_role(settings))
     if role is None:
-        raise UsageError("--role: expected the database role of the service, found none")
+        raise UsageError(f"--role: expected the database role of {purpose}, found none")
+    statements_of = roles.backup_statements if arguments.backup else roles.grant_statements
+    grant = roles.grant_backup if arguments.backup else roles.grant_service
     if arguments.print:
-        statements = list(grant_statements(role, [*METADATA.tables, *READ_ONLY]))
+        statements = list(statements_of(role, [*METADATA.tables, *roles.READ_ONLY]))
         emit(arguments, {"role": role, "statements": statements}, text=";\n".join(statements) + ";")
         return 0
     database = prepare_database(settings.resolved_migration_url())
     try:
-        grant_service(database, role)
+        grant(database, role)
     finally:
         database.engine.dispose()
     emit(arguments, {"role": role, "database": database.label}, text=f"{database.label}: granted to {role}")

@@ -12,11 +12,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--concurrency", type=int, default=1, metavar="N", help="simultaneous jobs (default: 1)"
     )
     parser.add_argument(
-        "--beat",
-        action="store_true",
-        help="also enter the nightly job (required for exactly one worker of a deployment)",
-    )
-    parser.add_argument(
         "--check", action="store_true", help="exit 0 if the worker of this machine responds, otherwise 1"
     )
     add_service_options(parser)
@@ -29,7 +24,5 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.check:
         return 0 if worker_answers(settings_of(arguments)) else 1
-    run_worker(
-        settings_of(arguments, data=data_folder().root), max(arguments.concurrency, 1), beat=arguments.beat
-    )
+    run_worker(settings_of(arguments, data=data_folder().root), max(arguments.concurrency, 1))
     return 0

@@ -282,6 +282,7 @@ MATRIX = [
     ("DELETE", "/tokens/999", "admin"),
     ("GET", "/audit", "operator"),
     ("GET", "/audit/head", "operator"),
+    ("GET", "/status", "viewer"),
     ("GET", "/ephemerides", "viewer"),
     ("POST", "/ephemerides", "operator"),
     ("POST", "/telemetry", "operator"),
@@ -522,12 +523,13 @@ def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) ->
 def test_a_night_that_was_slept_through_is_made_up_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ground_service import app as application
+    from ground_service.worker import scheduler
     from ground_service.worker.upkeep import nightly_job_id
 
     noon = parse_utc("2029-08-07T12:00:00Z")
-    monkeypatch.setattr(application, "CATCH_UP_S", -1.0)
-    monkeypatch.setattr(application, "utc_now_ns", lambda: noon)
+    monkeypatch.setattr(scheduler, "CATCH_UP_S", -1.0)
+    monkeypatch.setattr(scheduler, "TICK_S", 0.05)
+    monkeypatch.setattr(scheduler, "utc_now_ns", lambda: noon)
     with TestClient(create_app(Settings(home=tmp_path))) as opened:
         path, until = f"{V1}/jobs/{nightly_job_id(noon)}", time.monotonic() + 60.0
         while opened.get(path).status_code == 404 and time.monotonic() < until:

@@ -32,7 +32,7 @@ SUMMARY_VERBS = {
 }  # fmt: skip
 TAGS = {
     "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "links", "missions", "passes",
-    "planning", "regression", "reports", "requests", "telecommands", "telemetry", "time",
+    "planning", "regression", "reports", "requests", "status", "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 

@@ -219,6 +219,7 @@ def upgrade() -> None:
         sa.Column("attempts", sa.Integer(), nullable=False),
         sa.Column("result", sa.JSON(), nullable=True),
         sa.Column("error", sa.Text(), nullable=True),
+        sa.Column("traceparent", sa.String(length=55), nullable=True),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("started_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("finished_utc_ns", sa.BigInteger(), nullable=True),
@@ -762,6 +763,13 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("name", name=op.f("pk_links")),
     )
     op.create_table(
+        "leases",
+        sa.Column("name", sa.String(length=64), nullable=False),
+        sa.Column("owner", sa.String(length=96), nullable=True),
+        sa.Column("lease_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("name", name=op.f("pk_leases")),
+    )
+    op.create_table(
         "contacts",
         sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
         sa.Column("link", sa.String(length=64), nullable=False),
@@ -933,6 +941,7 @@ def upgrade() -> None:
 def downgrade() -> None:
     op.drop_table("transmissions")
     op.drop_table("contacts")
+    op.drop_table("leases")
     op.drop_table("links")
     op.drop_table("automation_actions")
     op.drop_table("windows")

@@ -22,16 +22,18 @@ from ground_service.worker.upkeep import tidy
 from linna import cli
 
 SERVICE = "linna_service"
+BACKUP = "linna_backup"
 OWNER = "linna_owner"
 
 
 @dataclass(frozen=True)
 class Roles:
-    """URLs of one database as its superuser, the owner of the schema, and the service."""
+    """URLs of one database as its superuser, the owner of the schema, the service, and backups."""
 
     superuser: str
     owner: str
     service: str
+    backup: str
 
 
 @pytest.fixture(scope="module")
@@ -40,22 +42,23 @@ def roles(new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
     database = make_url(superuser).database
     engine = create_engine(superuser, isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:
-        for name in (OWNER, SERVICE):
+        for name in (OWNER, SERVICE, BACKUP):
             connection.execute(text(f"CREATE ROLE {name} LOGIN"))
         connection.execute(text(f"ALTER DATABASE {database} OWNER TO {OWNER}"))
         connection.execute(text(f"ALTER SCHEMA public OWNER TO {OWNER}"))
     urls = [
         make_url(superuser).set(username=name).render_as_string(hide_password=False)
-        for name in (OWNER, SERVICE)
+        for name in (OWNER, SERVICE, BACKUP)
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LINNA_DATABASE_URL", urls[1])
         patch.setenv("LINNA_MIGRATION_DATABASE_URL", urls[0])
+        patch.setenv("LINNA_BACKUP_ROLE", BACKUP)
         assert cli.run(["db", "upgrade"]) == 0
     yield Roles(superuser, *urls)
     # Roles belong to the server, which other modules share.
     with engine.connect() as connection:
-        for name in (SERVICE, OWNER):
+        for name in (SERVICE, BACKUP, OWNER):
             connection.execute(text(f"REASSIGN OWNED BY {name} TO CURRENT_USER"))
             connection.execute(text(f"DROP OWNED BY {name}"))
             connection.execute(text(f"DROP ROLE {name}"))
@@ -97,6 +100,68 @@ def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> Non
         engine.dispose()
     # insufficient_privilege, and nothing else, such as a name that is not there.
     assert getattr(error.value.orig, "sqlstate", None) == "42501"
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('a', 'admin', 'active', 0)",
+        "UPDATE users SET role = 'admin'",
+        "DELETE FROM jobs",
+        "TRUNCATE packets",
+        "DROP TABLE packets",
+        "CREATE TABLE mine (a int)",
+        "SELECT nextval('users_id_seq')",
+        "SET ROLE linna_service",
+        "COPY (SELECT 1) TO PROGRAM 'true'",
+    ],
+)
+def test_the_role_of_the_backup_cannot_write(roles: Roles, statement: str) -> None:
+    engine = create_engine(roles.backup, isolation_level="AUTOCOMMIT")
+    try:
+        with pytest.raises(DBAPIError) as error, engine.connect() as connection:
+            connection.execute(text(statement))
+    finally:
+        engine.dispose()
+    assert getattr(error.value.orig, "sqlstate", None) == "42501"
+
+
+def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(
+    roles: Roles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LINNA_DATABASE_URL", roles.owner)
+    monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
+    assert cli.run(["user", "add", "bea", "--role", "viewer"]) == 0
+    monkeypatch.setenv("LINNA_DATABASE_URL", roles.backup)
+    assert cli.run(["db", "backup", "--out", str(tmp_path / "saved")]) == 0
+    monkeypatch.delenv("LINNA_DATABASE_URL")
+    monkeypatch.setenv("LINNA_HOME", str(tmp_path / "new"))
+    assert cli.run(["db", "restore", str(tmp_path / "saved")]) == 0
+    capsys.readouterr()
+    assert cli.run(["user", "list"]) == 0
+    assert "bea" in capsys.readouterr().out
+
+
+def test_granting_for_backups_takes_away_what_is_too_much(
+    roles: Roles, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    owner = create_engine(roles.owner, isolation_level="AUTOCOMMIT")
+    with owner.connect() as connection:
+        connection.execute(text(f"GRANT ALL ON ALL TABLES IN SCHEMA public TO {BACKUP}"))
+    monkeypatch.setenv("LINNA_DATABASE_URL", roles.service)
+    monkeypatch.setenv("LINNA_MIGRATION_DATABASE_URL", roles.owner)
+    assert cli.run(["db", "grant", "--backup"]) == 2
+    assert "role of backups, found none" in capsys.readouterr().err
+    assert cli.run(["db", "grant", "--backup", "--role", BACKUP]) == 0
+    with owner.connect() as connection:
+        rights = connection.execute(
+            text(
+                "SELECT DISTINCT privilege_type FROM information_schema.role_table_grants WHERE grantee = :name"
+            ),
+            {"name": BACKUP},
+        )
+        assert set(rights.scalars()) == {"SELECT"}
+    owner.dispose()
 
 
 def test_the_service_does_its_work_with_its_role(

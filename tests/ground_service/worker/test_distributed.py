@@ -173,7 +173,7 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     """The queue is emptied as if the broker had been killed; a job that somebody is doing is left to him."""
     import redis
 
-    from ground_service.worker.app import queue_length
+    from ground_service.worker.app import queued_jobs
 
     ground = ground_on_postgres
     settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
@@ -181,16 +181,17 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     lost = dispatcher.submit("report", {"pass_id": 4712})
     with redis.Redis.from_url(redis_url) as broker:
         broker.delete(*broker.scan_iter())
-    assert queue_length(settings) == 0
+    assert queued_jobs(settings) == []
     key = _lock_key(lost)
     with ground.database.alone(key) as mine, ground.database.alone(key) as second:
         assert (mine, second) == (True, False)
         assert run_job(ground, lost).state == "queued"
+    dispatcher.submit("report", {"pass_id": 4713})  # the queue is in use again
     dispatcher.resume()
-    waiting = queue_length(settings)
-    assert waiting >= 1
+    waiting = queued_jobs(settings)
+    assert waiting.count(lost) == 1
     dispatcher.resume()  # it waits already: nothing is added
-    assert queue_length(settings) == waiting
+    assert queued_jobs(settings) == waiting
     assert run_job(ground, lost).error == "pass 4712: not found"
 
 

@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ground_service.access import service as users
 from ground_service.access.service import audit
+from ground_service.clock import utc_now_ns
 from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
@@ -69,10 +71,27 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
         ground.files.root.mkdir(exist_ok=True)
         (ground.files.root / name).write_bytes(b"")
     os.utime(ground.files.root / ".incoming-old", (0, 0))
-    assert tidy(ground, 90) == {"events": 2, "jobs": 0, "answers": 1, "files": 1}
+    assert tidy(ground, 90) == {"events": 2, "jobs": 0, "answers": 1, "sessions": 0, "files": 1}
     assert [item.number for item in read_events(ground.database, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.page(connection, repository.AUDIT).total == 1
+
+
+def test_expired_sessions_are_deleted_and_tokens_are_kept(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = users.add_user(ground, "ann", "operator", days_valid=0.001)
+    old, _ = users.start_session(ground, token)
+    later = utc_now_ns() + DAY_NS
+    for module in ("ground_service.access.service", "ground_service.worker.upkeep"):
+        monkeypatch.setattr(f"{module}.utc_now_ns", lambda: later)
+    new, _ = users.start_session(ground, users.add_token(ground, "ann"))
+    tokens = {one.id for one in users.list_tokens(ground)}
+    assert tidy(ground, 90)["sessions"] == 1
+    assert tidy(ground, 90)["sessions"] == 0
+    # The expired token of the user remains listed; the new session and its token are in force.
+    assert len(tokens) == 4 and len({one.id for one in users.list_tokens(ground)}) == 3
+    assert users.token_valid(ground, new) and not users.token_valid(ground, old)
 
 
 def test_answers_are_kept_until_telemetry_is_new(

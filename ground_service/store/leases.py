@@ -1,0 +1,85 @@
+"""Leases: the right of one process among many to do something, which ends by itself if the process is killed.
+
+A table with leases has the columns `name` (key), `owner` and `lease_utc_ns`, the end of the lease.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Connection, Table, or_, select, text, update
+
+from ground_service.clock import utc_now_ns
+from ground_service.store import repository
+
+_LEASES = repository.LEASES
+
+
+def renew_or_take(
+    connection: Connection,
+    table: Table,
+    name: str,
+    owner: str,
+    *,
+    now_utc_ns: int,
+    until_utc_ns: int,
+    **taken: Any,
+) -> bool:
+    """Renew the lease of `owner`, or take one that is free or has ended; return whether `owner` has it now.
+
+    Parameters
+    ----------
+    taken
+        Columns that are set when the lease is taken, not when it is renewed.
+    """
+    rows = table.c
+    renewal = (
+        update(table)
+        .where(rows.name == name, rows.owner == owner, rows.lease_utc_ns >= now_utc_ns)
+        .values(lease_utc_ns=until_utc_ns)
+    )
+    free = or_(rows.owner.is_(None), rows.lease_utc_ns < now_utc_ns)
+    taking = (
+        update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)
+    )
+    return connection.execute(renewal).rowcount == 1 or connection.execute(taking).rowcount == 1
+
+
+def acquire(connection: Connection, name: str, owner: str, duration_ns: int) -> bool:
+    """Take or renew a lease of the table `leases`; return whether `owner` has it.
+
+    Processes compare the end of the lease with the clock of the database, so that hosts with different clocks agree.
+    """
+    now = database_now_ns(connection)
+    if _held_by_another(connection, name, owner, now):
+        return False
+    repository.add_new(connection, _LEASES, name=name, owner=None, lease_utc_ns=0)
+    return renew_or_take(connection, _LEASES, name, owner, now_utc_ns=now, until_utc_ns=now + duration_ns)
+
+
+def release(connection: Connection, name: str, owner: str) -> None:
+    """Give a lease back, so that another process need not wait for its end."""
+    mine = (_LEASES.c.name == name, _LEASES.c.owner == owner)
+    connection.execute(update(_LEASES).where(*mine).values(owner=None, lease_utc_ns=0))
+
+
+def owner_of(connection: Connection, name: str) -> str | None:
+    """Return the process that has a lease now; None without any."""
+    row = connection.execute(select(_LEASES).where(_LEASES.c.name == name)).mappings().first()
+    if row is None or row["lease_utc_ns"] < database_now_ns(connection):
+        return None
+    return None if row["owner"] is None else str(row["owner"])
+
+
+def database_now_ns(connection: Connection) -> int:
+    """Return the time of the database server; that of this machine with SQLite."""
+    if connection.dialect.name != "postgresql":
+        return utc_now_ns()
+    query = text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")
+    return 1000 * int(connection.execute(query).scalar_one())
+
+
+def _held_by_another(connection: Connection, name: str, owner: str, now_utc_ns: int) -> bool:
+    """Return whether another process has a lease, without a write."""
+    row = connection.execute(select(_LEASES).where(_LEASES.c.name == name)).mappings().first()
+    return row is not None and row["owner"] not in (None, owner) and row["lease_utc_ns"] >= now_utc_ns

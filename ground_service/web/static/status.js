@@ -1,0 +1,53 @@
+import { get } from "./api.js";
+import { byId, element, lengthText, show, table, timeText, trouble } from "./page.js";
+
+const PERIOD_MS = 15000;
+const gibibytes = (octets) => `${(octets / 2 ** 30).toFixed(1)} GiB`;
+const counts = (states) =>
+  Object.entries(states)
+    .map(([state, count]) => `${count} ${state}`)
+    .join(", ") || "none";
+
+function draw(status) {
+  byId("asked").textContent = `At ${timeText(status.time)}; the page asks again every ${PERIOD_MS / 1000} s.`;
+  show(
+    "complaints",
+    status.complaints.length
+      ? element("ul", {}, status.complaints.map((text) => element("li", {}, text)))
+      : element("p", {}, "Nothing."),
+  );
+  const rows = [
+    ["Jobs", counts(status.jobs)],
+    ["Oldest job that waits", status.queue_age_s ? lengthText(status.queue_age_s) : "none waits"],
+    ["Ingests", counts(status.ingests)],
+    ["Oldest unfinished ingest", status.ingest_lag_s ? lengthText(status.ingest_lag_s) : "none"],
+    ["Free disk space of the archive", `${gibibytes(status.disk_free_octets)} of ${gibibytes(status.disk_octets)}`],
+    ["Newest backup", status.backup_age_s === null ? "unknown" : `${lengthText(status.backup_age_s)} ago`],
+    ["Recurring work is done by", status.scheduler ?? "no process"],
+  ];
+  show("figures", table("Figures", [["Figure", (row) => row[0]], ["Value", (row) => row[1]]], rows, ""));
+  show(
+    "correlations",
+    table(
+      "Time correlations",
+      [
+        ["Spacecraft", (row) => String(row.spacecraft_id), "num"],
+        ["Instance", (row) => row.instance],
+        ["Made", (row) => `${lengthText(row.age_s)} ago`],
+      ],
+      status.correlations,
+      "No time correlation.",
+    ),
+  );
+}
+
+async function load() {
+  try {
+    draw(await get("status"));
+  } catch (error) {
+    if (error.status !== 401) trouble(error);
+  }
+}
+
+load();
+setInterval(load, PERIOD_MS);

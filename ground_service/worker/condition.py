@@ -1,0 +1,122 @@
+"""Condition of a deployment: waiting work, disk, backups, time correlations, scheduler."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from ground_service.clock import utc_now_ns
+from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.store import leases
+from ground_service.worker.backup import MANIFEST
+from ground_service.worker.model import CorrelationAge, ServiceStatus
+from ground_service.worker.scheduler import LEASE
+from ground_service.worker.store import WorkCounts, count_work, newest_correlations
+from lunar.timescales import parse_utc
+
+QUEUE_AGE_LIMIT_S = 900.0
+INGEST_LAG_LIMIT_S = 600.0
+DISK_FREE_LIMIT = 0.1
+BACKUP_AGE_LIMIT_S = 93_600.0
+CORRELATION_AGE_LIMIT_S = 172_800.0
+"""Limits above (share of free disk: below) which somebody has to act, as in deploy/prometheus/linna.rules.yml."""
+
+FLIGHT = "flight"
+"""Instance of a spacecraft whose time correlation has to be kept; others are simulations and replays."""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """Condition of a deployment now; ages in seconds, sizes in octets."""
+
+    counts: WorkCounts
+    queue_age_s: float
+    ingest_lag_s: float
+    disk_free: int
+    disk_size: int
+    backup_age_s: float | None
+    correlation_ages_s: dict[tuple[int, str], float]
+    scheduler: str | None
+
+
+def read_condition(ground: Ground, backups: Path | None) -> Condition:
+    """Return the condition of a deployment; the age of its newest backup is unknown without a folder of backups."""
+    with ground.database.reading() as connection:
+        counts = count_work(connection)
+        correlations = newest_correlations(connection)
+        scheduler = leases.owner_of(connection, LEASE)
+    now = utc_now_ns()
+    disk = shutil.disk_usage(ground.home)
+
+    def age_s(utc_ns: int | None) -> float:
+        return 0.0 if utc_ns is None else max((now - utc_ns) / 1e9, 0.0)
+
+    newest = None if backups is None else newest_backup_utc_ns(backups)
+    return Condition(
+        counts,
+        age_s(counts.oldest_job_utc_ns),
+        age_s(counts.oldest_ingest_utc_ns),
+        disk.free,
+        disk.total,
+        None if newest is None else age_s(newest),
+        {vehicle: age_s(utc_ns) for vehicle, utc_ns in correlations.items()},
+        scheduler,
+    )
+
+
+def complaints(found: Condition) -> list[str]:
+    """Return what an operator has to look after, in plain sentences."""
+    said = []
+    if found.scheduler is None:
+        said.append("No process does the recurring work.")
+    if found.queue_age_s > QUEUE_AGE_LIMIT_S:
+        said.append(f"A job has waited for {found.queue_age_s:.0f} s.")
+    if found.ingest_lag_s > INGEST_LAG_LIMIT_S:
+        said.append(f"An ingest has been unfinished for {found.ingest_lag_s:.0f} s.")
+    if found.disk_free < DISK_FREE_LIMIT * found.disk_size:
+        said.append(f"{found.disk_free / found.disk_size:.0%} of the disk of the archive are free.")
+    if found.backup_age_s is not None and found.backup_age_s > BACKUP_AGE_LIMIT_S:
+        said.append(f"The newest backup is {found.backup_age_s / 3600.0:.0f} h old.")
+    for (number, instance), age_s in sorted(found.correlation_ages_s.items()):
+        if instance == FLIGHT and age_s > CORRELATION_AGE_LIMIT_S:
+            said.append(f"The time correlation of spacecraft {number} is {age_s / 3600.0:.0f} h old.")
+    return said
+
+
+def service_status(ground: Ground, backups: Path | None) -> ServiceStatus:
+    """Return the condition of the deployment for pages and programs."""
+    found = read_condition(ground, backups)
+    jobs: Counter[str] = Counter()
+    for (_, state), count in found.counts.jobs.items():
+        jobs[state] += count
+    return ServiceStatus(
+        time=UtcTime(utc_now_ns()),
+        complaints=complaints(found),
+        jobs=dict(jobs),
+        ingests=found.counts.ingests,
+        queue_age_s=found.queue_age_s,
+        ingest_lag_s=found.ingest_lag_s,
+        disk_free_octets=found.disk_free,
+        disk_octets=found.disk_size,
+        backup_age_s=found.backup_age_s,
+        scheduler=found.scheduler,
+        correlations=[
+            CorrelationAge(spacecraft_id=number, instance=instance, age_s=age_s)
+            for (number, instance), age_s in sorted(found.correlation_ages_s.items())
+        ],
+    )
+
+
+def newest_backup_utc_ns(folder: Path) -> int | None:
+    """Return when the newest complete backup in a folder was made; None without any."""
+    made = []
+    for manifest in folder.glob(f"*/{MANIFEST}"):
+        try:
+            made.append(parse_utc(json.loads(manifest.read_text(encoding="utf-8"))["made_utc"]))
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # not a backup, or one that is being deleted
+    return max(made, default=None)

@@ -1,0 +1,134 @@
+"""Recurring work of a deployment, done by the one process that has the lease `scheduler`.
+
+Every API process and every `linna scheduler` takes part. If the process with the lease is killed, another one continues
+after `LEASE_NS`. All work may be done twice without harm: a process that was stopped for longer than its lease, and the
+next one, can briefly act at the same time.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from ground_service.clock import mission_now_ns, utc_now_ns
+from ground_service.commanding.service import note_timeouts
+from ground_service.errors import GroundError
+from ground_service.ground import Ground
+from ground_service.jobs.dispatcher import Dispatcher
+from ground_service.links.supervisor import process_name
+from ground_service.planning.standing import needs_plan
+from ground_service.store import leases
+from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
+
+log = logging.getLogger(__name__)
+
+LEASE = "scheduler"
+LEASE_NS = 30_000_000_000
+TICK_S = 10.0
+"""Interval of the work; the work of a killed process is continued after `LEASE_NS` and at most one interval."""
+
+NIGHT_NS = 1_800_000_000_000
+"""The nightly job is entered at 00:30 UTC."""
+
+CATCH_UP_S = 60.0
+"""A process that was not running then enters it so long after its start."""
+
+
+class Scheduler:
+    """Recurring work in a thread of this process, while it has the lease.
+
+    Parameters
+    ----------
+    drain
+        Function that handles events that other processes have left.
+    """
+
+    def __init__(
+        self, ground: Ground, dispatcher: Dispatcher, drain: Callable[[], object], retention_days: int
+    ) -> None:
+        self.owner = process_name()
+        self._ground, self._dispatcher, self._drain = ground, dispatcher, drain
+        self._retention_days = retention_days
+        self._catch_up_s = time.monotonic() + CATCH_UP_S
+        self._night: str | None = None
+        self._since_utc_ns: int | None = None
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self.run, name="scheduler", daemon=True)
+
+    def start(self) -> None:
+        """Work in a thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread, and give the lease back."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def run(self, stopping: threading.Event | None = None, first_s: float | None = None) -> None:
+        """Work in this thread until stopped, for the first time after `first_s` (default: one interval)."""
+        stop = stopping or self._stopping
+        wait_s = TICK_S if first_s is None else first_s
+        while not stop.wait(wait_s):
+            wait_s = TICK_S
+            try:
+                self.tick()
+            except GroundError as error:
+                log.warning("recurring work could not be done: %s", error)
+            except Exception:  # outermost loop of the thread
+                log.exception("recurring work could not be done")
+        self._release()
+
+    def tick(self) -> bool:
+        """Do the work that is due if this process has the lease or gets it now; return whether it has."""
+        with self._ground.database.writing() as connection:
+            mine = leases.acquire(connection, LEASE, self.owner, LEASE_NS)
+        if not mine:
+            self._since_utc_ns = None
+            return False
+        if self._since_utc_ns is None:
+            log.info("this process does the recurring work", extra={"owner": self.owner})
+        self._dispatcher.resume()
+        self._drain()
+        self._note_timeouts()
+        self._enter_plan()
+        self._enter_night()
+        return True
+
+    def _note_timeouts(self) -> None:
+        until = utc_now_ns()
+        since = until - DAY_NS if self._since_utc_ns is None else self._since_utc_ns
+        for command in note_timeouts(self._ground, since, until):
+            log.warning("telecommand %d: its end is overdue", command, extra={"telecommand": command})
+        self._since_utc_ns = until
+
+    def _enter_plan(self) -> None:
+        """Enter the job of the plan once an hour of mission time."""
+        if needs_plan(self._ground):
+            self._dispatcher.submit("plan", {}, job_id=plan_job_id(mission_now_ns()))
+
+    def _enter_night(self) -> None:
+        """Enter the nightly job once a day; it is one job however many processes enter it."""
+        now = utc_now_ns()
+        identity = nightly_job_id(now)
+        late = time.monotonic() < self._catch_up_s and now % DAY_NS > NIGHT_NS + LEASE_NS
+        if now % DAY_NS < NIGHT_NS or identity == self._night or late:
+            return
+        arguments = {"retention_days": self._retention_days}
+        self._dispatcher.submit("nightly", arguments, job_id=identity)
+        self._night = identity
+
+    def _release(self) -> None:
+        try:
+            with self._ground.database.writing() as connection:
+                leases.release(connection, LEASE, self.owner)
+        except GroundError as error:
+            log.warning("the lease of the recurring work ends by itself: %s", error)
+
+
+def has_scheduler(ground: Ground) -> bool:
+    """Return whether a process of the deployment has the lease of the recurring work now."""
+    with ground.database.reading() as connection:
+        return leases.owner_of(connection, LEASE) is not None

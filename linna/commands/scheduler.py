@@ -1,0 +1,50 @@
+"""`linna scheduler`: recurring work of a distributed ground service."""
+
+from __future__ import annotations
+
+import argparse
+
+from linna.commands._ground import add_service_options, settings_of
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Enter the nightly job and the jobs of the plan, send lost jobs again, and note overdue telecommands. "
+        "One process of a deployment does this, by a lease in the database; each API process takes part as well."
+    )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="exit 0 if a process of the deployment has the lease, otherwise 1",
+    )
+    add_service_options(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import logging.config
+    import signal
+    import threading
+
+    from ground_service.ground import ground_from_settings
+    from ground_service.logs import logging_config
+    from ground_service.worker.dispatch import dispatcher_for
+    from ground_service.worker.follow_up import follow_in_process
+    from ground_service.worker.scheduler import Scheduler, has_scheduler
+    from linna.data import data_folder
+
+    settings = settings_of(arguments, data=data_folder().root)
+    with ground_from_settings(settings) as ground:
+        if arguments.check:
+            return 0 if has_scheduler(ground) else 1
+        logging.config.dictConfig(logging_config(settings.log_format))
+        stopping = threading.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stopping.set())
+        dispatcher = dispatcher_for(ground, settings)
+        follow_up = follow_in_process(ground, dispatcher.start)
+        try:
+            Scheduler(ground, dispatcher, follow_up.drain, settings.retention_days).run(stopping, first_s=0.0)
+        finally:
+            dispatcher.close()
+    return 0

@@ -1,0 +1,354 @@
+"""Alert rules and dashboard name metrics that exist; alerts fire; a request and its job have one trace."""
+
+import json
+import logging
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+
+from ground_service import tracing
+from ground_service.app import create_app
+from ground_service.clock import utc_now_ns
+from ground_service.errors import SettingsError
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.jobs.service import enter_job, get_job
+from ground_service.logs import JsonFormatter
+from ground_service.passes.archive_import import import_archive
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.worker import condition
+from ground_service.worker.backup import backup
+from ground_service.worker.condition import newest_backup_utc_ns, read_condition
+from ground_service.worker.jobs import run_job
+from ground_service.worker.store import WorkCounts
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+RULES = DEPLOY / "prometheus" / "linna.rules.yml"
+DASHBOARD = DEPLOY / "grafana" / "linna.json"
+NAME = re.compile(r"\blinna_[a-z_]+\b")
+SELECTOR = re.compile(r"\b(linna_[a-z_]+)\{([^}]*)\}")
+S = 1_000_000_000
+
+
+def alerts() -> list[dict[str, Any]]:
+    return [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
+
+
+def panels() -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(DASHBOARD.read_text())["panels"]
+    return found
+
+
+def expressions() -> list[str]:
+    drawn = [target["expr"] for panel in panels() for target in panel["targets"]]
+    return [rule["expr"] for rule in alerts()] + drawn
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> dict[str, set[str]]:
+    """Names of all samples of /metrics, with the names of their labels."""
+    folder = tmp_path_factory.mktemp("observed")
+    with open_ground(folder / "home") as ground:
+        vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
+        enter_job(ground, "report", {"pass_id": 1})
+        assert vehicle is not None
+        add_correlation(ground, vehicle, utc_now_ns())
+        backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
+    settings = Settings(home=folder / "home", backups=folder / "backups")
+    with TestClient(create_app(settings, inline_jobs=True)) as client:
+        client.get("/api/v1/passes")
+        text = client.get("/metrics").text
+    return {
+        sample.name: set(sample.labels)
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
+    with ground.database.writing() as connection:
+        repository.add(
+            connection,
+            repository.CORRELATIONS,
+            vehicle_id=vehicle,
+            method="test",
+            start_ticks=0,
+            stop_ticks=1,
+            reference_ticks=0,
+            reference_utc_ns=0,
+            drift_ppb=0.0,
+            points=2,
+            created_utc_ns=created_utc_ns,
+        )
+
+
+def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str, set[str]]) -> None:
+    for expression in expressions():
+        named = set(NAME.findall(expression))
+        assert named or "up{" in expression, expression
+        assert named <= set(samples), expression
+        for name, selector in SELECTOR.findall(expression):
+            assert set(re.findall(r"(\w+)[=!]", selector)) <= samples[name], expression
+        for grouped in re.findall(r"\bby \(([^)]*)\)", expression):
+            labels = {label.strip() for label in grouped.split(",")}
+            assert labels <= set().union(*(samples[name] for name in named)), expression
+
+
+def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples: dict[str, set[str]]) -> None:
+    used = {name for expression in expressions() for name in NAME.findall(expression)}
+    families = {re.sub(r"_(bucket|count|sum|created|total)$", "", name) for name in samples}
+    assert families == {re.sub(r"_(bucket|total)$", "", name) for name in used}
+
+
+def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
+    names = [rule["alert"] for rule in alerts()]
+    assert len(set(names)) == len(names) >= 10
+    for rule in alerts():
+        assert rule["labels"]["severity"] in ("page", "ticket")
+        assert set(rule["annotations"]) == {"summary", "action"}
+
+
+def test_the_panels_of_the_dashboard_do_not_overlap() -> None:
+    covered: set[tuple[int, int]] = set()
+    for panel in panels():
+        place = panel["gridPos"]
+        cells = {(place["x"] + x, place["y"] + y) for x in range(place["w"]) for y in range(place["h"])}
+        assert not cells & covered and max(x for x, _ in cells) < 24
+        covered |= cells
+    assert len({panel["id"] for panel in panels()}) == len(panels())
+
+
+def test_the_limits_of_the_status_are_those_of_the_alerts() -> None:
+    limits = {
+        rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])]
+        for rule in alerts()
+    }
+    assert limits["LinnaQueueOld"] == [condition.QUEUE_AGE_LIMIT_S]
+    assert limits["LinnaIngestLag"] == [condition.INGEST_LAG_LIMIT_S]
+    assert limits["LinnaDiskFull"] == [condition.DISK_FREE_LIMIT]
+    assert limits["LinnaBackupOld"] == [condition.BACKUP_AGE_LIMIT_S]
+    assert limits["LinnaTimeCorrelationOld"] == [condition.CORRELATION_AGE_LIMIT_S]
+    assert f'instance="{condition.FLIGHT}"' in RULES.read_text()
+
+
+GOOD = condition.Condition(WorkCounts({}, {}, 0, None, None), 0.0, 0.0, 50, 100, None, {}, "somebody")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"scheduler": None}, "No process does the recurring work."),
+        ({"queue_age_s": 901.0}, "A job has waited for 901 s."),
+        ({"ingest_lag_s": 601.0}, "An ingest has been unfinished for 601 s."),
+        ({"disk_free": 9}, "9% of the disk of the archive are free."),
+        ({"backup_age_s": 97_200.0}, "The newest backup is 27 h old."),
+        (
+            {"correlation_ages_s": {(76, "flight"): 180_000.0, (76, "replay"): 1e9}},
+            "The time correlation of spacecraft 76 is 50 h old.",
+        ),
+    ],
+)
+def test_the_status_names_what_has_to_be_looked_after(change: dict[str, Any], said: str) -> None:
+    assert condition.complaints(GOOD) == []
+    assert condition.complaints(replace(GOOD, **change)) == [said]
+    at_the_limit = {"queue_age_s": 900.0, "ingest_lag_s": 600.0, "disk_free": 10, "backup_age_s": 93_600.0}
+    assert condition.complaints(replace(GOOD, **at_the_limit)) == []
+
+
+FIRING = {
+    "LinnaNoScheduler": ("linna_scheduler", "1x5 0x20", "20m"),
+    "LinnaQueueOld": ("linna_queue_age_seconds", "0+60x40", "40m"),
+    "LinnaIngestLag": ("linna_ingest_lag_seconds", "0+60x40", "40m"),
+    "LinnaJobsFailed": ('linna_jobs{state="failed",kind="report"}', "2x20 3x20", "40m"),
+    "LinnaTimeCorrelationOld": (
+        'linna_time_correlation_age_seconds{spacecraft_id="76",instance="flight"}',
+        "172000+60x120",
+        "120m",
+    ),
+}
+
+
+def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
+    program = shutil.which("promtool")
+    if program is None:
+        pytest.skip("promtool is not installed")
+    checked = subprocess.run(
+        [program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False
+    )
+    assert checked.returncode == 0, checked.stderr
+    healthy = [
+        {"series": 'up{job="linna"}', "values": "1x200"},
+        {"series": "linna_scheduler", "values": "1x200"},
+        {"series": "linna_backup_age_seconds", "values": "3600x200"},
+        {"series": "linna_queue_age_seconds", "values": "30x200"},
+        {"series": "linna_disk_free_bytes", "values": "50x200"},
+        {"series": "linna_disk_size_bytes", "values": "100x200"},
+        {"series": 'linna_jobs{state="failed",kind="report"}', "values": "2x200"},
+    ]
+    names = [rule["alert"] for rule in alerts()]
+    tests: list[dict[str, Any]] = [
+        {
+            "interval": "1m",
+            "input_series": healthy,
+            "promql_expr_test": [
+                {"expr": 'count(ALERTS{alertstate="firing"}) or vector(0)', "eval_time": "3h",
+                 "exp_samples": [{"labels": "{}", "value": 0}]}
+            ],
+        }
+    ]  # fmt: skip
+    for name, (series, values, at) in FIRING.items():
+        assert name in names
+        others = [one for one in healthy if one["series"] != series]
+        tests.append(
+            {
+                "interval": "1m",
+                "input_series": [*others, {"series": series, "values": values}],
+                "promql_expr_test": [
+                    {
+                        "expr": f'count by (alertname) (ALERTS{{alertstate="firing",alertname=~"{name}"}})',
+                        "eval_time": at,
+                        "exp_samples": [{"labels": f'{{alertname="{name}"}}', "value": 1}],
+                    }
+                ],
+            }
+        )
+    document = {"rule_files": [str(RULES)], "evaluation_interval": "1m", "tests": tests}
+    (tmp_path / "tests.yml").write_text(yaml.safe_dump(document))
+    done = subprocess.run(
+        [program, "test", "rules", str(tmp_path / "tests.yml")], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass: Any) -> None:
+    idle = read_condition(either, None)
+    assert (idle.queue_age_s, idle.ingest_lag_s, idle.backup_age_s) == (0.0, 0.0, None)
+    assert 0 < idle.disk_free <= idle.disk_size and idle.scheduler is None
+    vehicle = ingest_file(either, synthetic_pass.folder / "downlink.cadu").vehicle_id
+    assert vehicle is not None
+    # A finished ingest does not wait. The jobs of the other ages are older than the test.
+    assert read_condition(either, None).ingest_lag_s == 0.0
+    waiting, done = (enter_job(either, "plan", {}) for _ in range(2))
+    run_job(either, done)
+    now, jobs, ingests = utc_now_ns(), repository.JOBS, repository.INGESTS
+    with either.database.writing() as connection:
+        connection.execute(jobs.update().where(jobs.c.id == waiting).values(created_utc_ns=now - 1000 * S))
+        connection.execute(jobs.update().where(jobs.c.id == done).values(created_utc_ns=now - 9000 * S))
+        connection.execute(ingests.update().values(state="running", received_utc_ns=now - 2000 * S))
+        connection.execute(repository.CORRELATIONS.delete())
+    add_correlation(either, vehicle, now - 5000 * S)
+    add_correlation(either, vehicle, now - 4000 * S)
+    seen = read_condition(either, None)
+    assert 1000.0 <= seen.queue_age_s < 2000.0 <= seen.ingest_lag_s < 3000.0
+    ((key, age_s),) = seen.correlation_ages_s.items()
+    assert key == (76, "flight") and 4000.0 <= age_s < 5000.0
+
+
+def test_the_newest_complete_backup_counts(ground: Ground, tmp_path: Path) -> None:
+    assert newest_backup_utc_ns(tmp_path / "none") is None
+    for name, made in (("a", 3000 * S), ("b", 2000 * S)):
+        backup(ground, tmp_path / "backups" / name, now_utc_ns=made)
+    (tmp_path / "backups" / "c").mkdir()
+    (tmp_path / "backups" / "c" / "backup.json").write_text('{"made_utc"')
+    assert newest_backup_utc_ns(tmp_path / "backups") == 3000 * S
+
+
+class Lines(logging.Handler):
+    """Log entries as they are written."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.entries: list[dict[str, Any]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.entries.append(json.loads(JsonFormatter().format(record)))
+
+
+@pytest.fixture
+def lines() -> Iterator[Lines]:
+    handler = Lines()
+    loggers = [logging.getLogger(name) for name in ("ground_service", "ground_service.worker")]
+    levels = [logger.level for logger in loggers]
+    loggers[0].addHandler(handler)
+    for logger in loggers:
+        logger.setLevel(logging.INFO)
+    yield handler
+    loggers[0].removeHandler(handler)
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
+
+
+TRACE = "4bf92f3577b34da6a3ce929d0e0e4736"
+PARENT = f"00-{TRACE}-00f067aa0ba902b7-01"
+
+
+def test_the_log_of_a_request_and_of_its_job_have_the_trace_of_the_caller(
+    tmp_path: Path, synthetic_pass: Any, lines: Lines
+) -> None:
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
+        pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)  # type: ignore[attr-defined]
+        lines.entries.clear()
+        asked = client.post(f"/api/v1/passes/{pass_id}/reports", headers={"traceparent": PARENT})
+        assert asked.status_code in (201, 202), asked.text
+        client.get("/api/v1/passes", headers={"traceparent": "00-" + 32 * "0" + "-00f067aa0ba902b7-01"})
+        client.get("/api/v1/passes")
+    told = {entry["message"].split(" (")[0].split()[0]: entry.get("trace_id") for entry in lines.entries}
+    assert told["POST"] == told["job"] == TRACE
+    mine = [entry["trace_id"] for entry in lines.entries if entry["message"].startswith("GET")]
+    assert (
+        len(set(mine)) == 2 and TRACE not in mine and all(re.fullmatch("[0-9a-f]{32}", one) for one in mine)
+    )
+
+
+def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Ground) -> None:
+    assert tracing.current() is None
+    with tracing.span("request", parent=PARENT):
+        job = enter_job(ground, "plan", {})
+        inner = tracing.current()
+    assert tracing.current() is None
+    stored = get_job(ground, job).traceparent
+    assert stored == inner != PARENT and tracing.trace_id_of(stored) == TRACE
+
+
+def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, synthetic_pass: Any) -> None:
+    memory = pytest.importorskip("opentelemetry.sdk.trace.export.in_memory_span_exporter")
+    exporter = memory.InMemorySpanExporter()
+    tracing.configure(None, exporter=exporter)
+    try:
+        with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
+            pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)  # type: ignore[attr-defined]
+            exporter.clear()
+            client.post(f"/api/v1/passes/{pass_id}/reports", headers={"traceparent": PARENT})
+    finally:
+        tracing.stop()
+    spans = {one.name: one for one in exporter.get_finished_spans()}
+    request = spans["POST /api/v1/passes/{pass_id}/reports"]
+    job, report = spans["job report"], spans["report"]
+    assert f"{request.parent.span_id:016x}" == PARENT.split("-")[2]
+    assert job.parent.span_id == request.context.span_id and report.parent.span_id == job.context.span_id
+    assert {f"{one.context.trace_id:032x}" for one in (request, job, report)} == {TRACE}
+    assert request.attributes["http.response.status_code"] in (201, 202)
+    assert (job.attributes["linna.state"], report.attributes["linna.pass"]) == ("done", pass_id)
+
+
+def test_traces_without_the_library_are_refused_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
+    with pytest.raises(SettingsError, match="LINNA_TRACES: expected the extra 'traces'"):
+        create_app(Settings(home=tmp_path, traces="http://127.0.0.1:4318/v1/traces"))

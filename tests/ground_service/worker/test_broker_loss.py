@@ -1,0 +1,107 @@
+"""No job is lost when the broker is killed and comes back empty: jobs are rows of the database first."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ground_service.ground import open_ground
+from ground_service.jobs.service import get_job, unfinished_jobs
+from ground_service.settings import Settings
+from ground_service.store.database import prepare_database
+from ground_service.worker.app import queued_jobs
+from ground_service.worker.dispatch import dispatcher_for
+from ground_service.worker.scheduler import Scheduler
+from tests.ground_service.conftest import free_port, wait_for
+
+
+class Broker:
+    """A Redis server that keeps nothing on disk."""
+
+    def __init__(self, folder: Path, port: int) -> None:
+        words = [
+            "--port",
+            str(port),
+            "--bind",
+            "127.0.0.1",
+            "--dir",
+            str(folder),
+            "--save",
+            "",
+            "--appendonly",
+            "no",
+        ]
+        self.process = subprocess.Popen(["redis-server", *words], stdout=subprocess.DEVNULL)
+        self.url = f"redis://127.0.0.1:{port}/0"
+        import redis
+
+        def answers() -> bool:
+            try:
+                with redis.Redis.from_url(self.url) as client:
+                    return bool(client.ping())
+            except redis.RedisError:
+                return False
+
+        wait_for(answers, "redis-server")
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+
+@pytest.fixture
+def start_broker(tmp_path: Path) -> Iterator[Callable[[], Broker]]:
+    if shutil.which("redis-server") is None:
+        pytest.skip("redis-server is not installed")
+    port, started = free_port(), []
+
+    def start() -> Broker:
+        started.append(Broker(tmp_path, port))
+        return started[-1]
+
+    yield start
+    for broker in started:
+        broker.process.kill()
+        broker.process.wait()
+
+
+def test_jobs_survive_a_broker_that_is_killed(
+    new_postgres_database: Callable[[], str], start_broker: Callable[[], Broker], tmp_path: Path
+) -> None:
+    url = new_postgres_database()
+    prepare_database(url, upgrade=True).engine.dispose()
+    broker = start_broker()
+    settings = Settings(home=tmp_path / "home", database_url=url, broker_url=broker.url)
+    with open_ground(settings.home, database_url=url) as ground:
+        dispatcher = dispatcher_for(ground, settings)
+        jobs = [dispatcher.submit("plan", {}) for _ in range(5)]
+        assert sorted(queued_jobs(settings)) == sorted(jobs)
+        broker.kill()
+        jobs.append(dispatcher.submit("plan", {}))  # accepted while there is no broker
+        start_broker()
+        jobs.append(dispatcher.submit("plan", {}))  # the queue is not empty
+        assert queued_jobs(settings) == jobs[-1:]
+        Scheduler(ground, dispatcher, lambda: None, 90).tick()
+        assert sorted(queued_jobs(settings)) == sorted(jobs)
+        environment = {
+            **os.environ,
+            "LINNA_HOME": str(settings.home),
+            "LINNA_DATABASE_URL": url,
+            "LINNA_BROKER_URL": broker.url,
+            "LINNA_ALLOW_DATABASE_OWNER": "true",
+        }
+        with (tmp_path / "worker.log").open("wb") as log:
+            worker = subprocess.Popen(
+                [sys.executable, "-m", "linna", "worker"], env=environment, stdout=log, stderr=log
+            )
+            try:
+                wait_for(lambda: not unfinished_jobs(ground), "every job", 180.0)
+            finally:
+                worker.terminate()
+                worker.wait(60)
+        assert {(get_job(ground, job).state, get_job(ground, job).attempts) for job in jobs} == {("done", 1)}

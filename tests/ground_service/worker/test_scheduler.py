@@ -1,0 +1,187 @@
+"""Recurring work: one process has the lease, and another one continues when it is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from ground_service.ground import Ground, open_ground
+from ground_service.store import leases
+from ground_service.store.database import prepare_database
+from ground_service.worker import scheduler as scheduling
+from ground_service.worker.scheduler import LEASE, LEASE_NS, Scheduler, has_scheduler
+from ground_service.worker.upkeep import DAY_NS, nightly_job_id
+from linna import cli
+from lunar.timescales import parse_utc
+from tests.ground_service.conftest import wait_for
+
+
+class Recorder:
+    """A dispatcher that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.resumed = 0
+        self.submitted: list[str | None] = []
+
+    def resume(self) -> None:
+        self.resumed += 1
+
+    def submit(self, kind: str, arguments: object, *, job_id: str | None = None) -> str:
+        assert kind == "nightly"
+        self.submitted.append(job_id)
+        return str(job_id)
+
+    def start(self, job_id: str) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def make(ground: Ground) -> tuple[Scheduler, Recorder]:
+    recorder = Recorder()
+    return Scheduler(ground, recorder, lambda: None, 90), recorder
+
+
+@pytest.fixture(autouse=True)
+def by_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A time at which no nightly job is entered."""
+    monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T00:10:00Z"))
+
+
+def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    (first, work_1), (second, work_2) = make(either), make(either)
+    assert not has_scheduler(either)
+    assert first.tick() and not second.tick() and first.tick() and has_scheduler(either)
+    assert (work_1.resumed, work_2.resumed) == (2, 0)
+    now = leases.database_now_ns
+    monkeypatch.setattr(leases, "database_now_ns", lambda connection: now(connection) + LEASE_NS // 2)
+    assert not second.tick()
+    monkeypatch.setattr(leases, "database_now_ns", lambda connection: now(connection) + 2 * LEASE_NS)
+    assert not has_scheduler(either)
+    assert second.tick() and not first.tick()
+    assert (work_1.resumed, work_2.resumed) == (2, 1)
+
+
+def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduling, "TICK_S", 0.01)
+    (first, work), (second, _) = make(ground), make(ground)
+    first.start()
+    wait_for(lambda: work.resumed > 0, "the first scheduler")
+    assert not second.tick()
+    first.stop()
+    assert second.tick()
+
+
+def test_a_lease_is_not_given_back_by_somebody_else(either: Ground) -> None:
+    with either.database.writing() as connection:
+        assert leases.acquire(connection, "x", "ann", LEASE_NS)
+        leases.release(connection, "x", "ben")
+        assert leases.owner_of(connection, "x") == "ann"
+        assert not leases.acquire(connection, "x", "ben", LEASE_NS)
+        assert leases.acquire(connection, "y", "ben", LEASE_NS)
+
+
+def test_the_nightly_job_is_entered_once_after_half_past_midnight(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, work = make(ground)
+    midnight = parse_utc("2029-08-07T00:00:00Z")
+    for minute, entered in ((29, 0), (30, 1), (31, 1), (1439, 1), (1440 + 29, 1), (1440 + 30, 2)):
+        now = midnight + minute * 60_000_000_000
+        monkeypatch.setattr(scheduling, "utc_now_ns", lambda now=now: now)
+        one.tick()
+        assert len(work.submitted) == entered, minute
+    assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
+
+
+def test_a_night_that_was_missed_is_made_up_for_after_a_while(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T12:00:00Z"))
+    one, work = make(ground)
+    one.tick()
+    assert work.submitted == []
+    monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
+    other, work = make(ground)
+    with ground.database.writing() as connection:
+        leases.release(connection, LEASE, one.owner)
+    other.tick()
+    assert len(work.submitted) == 1
+
+
+def test_the_command_has_the_lease_until_it_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "home"
+    monkeypatch.setenv("LINNA_HOME", str(home))
+    with open_ground(home) as ground:
+        assert cli.run(["scheduler", "--check"]) == 1
+        process = subprocess.Popen([sys.executable, "-m", "linna", "scheduler"])
+        try:
+            wait_for(lambda: has_scheduler(ground), "the scheduler", 120.0)
+            assert cli.run(["scheduler", "--check"]) == 0
+            process.terminate()
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
+            process.wait()
+        assert not has_scheduler(ground)
+
+
+PROCESS = """
+    import sys
+    from pathlib import Path
+    from ground_service.ground import open_ground
+    from ground_service.store import repository
+    from ground_service.worker import scheduler as scheduling
+    from ground_service.worker.upkeep import DAY_NS
+
+    scheduling.TICK_S, scheduling.LEASE_NS = 0.05, int(sys.argv[4])
+    scheduling.utc_now_ns = lambda: 20 * DAY_NS
+    ground = open_ground(Path(sys.argv[1]), database_url=sys.argv[2])
+
+    class Recorder:
+        def resume(self):
+            with ground.database.reading() as connection:
+                lease = repository.find(connection, repository.LEASES, name=scheduling.LEASE)
+            if lease["owner"] == one.owner:
+                with open(sys.argv[3], "a") as lines:
+                    lines.write(f"{one.owner} {lease['lease_utc_ns']}\\n")
+
+    one = scheduling.Scheduler(ground, Recorder(), lambda: None, 90)
+    one.run()
+"""
+
+
+def test_processes_on_postgresql_have_the_lease_one_after_the_other(
+    new_postgres_database: Callable[[], str], tmp_path: Path
+) -> None:
+    """The one with the lease is killed, twice; each next one begins after the end of the lease before."""
+    url, lines, lease_ns = new_postgres_database(), tmp_path / "lines", 700_000_000
+    prepare_database(url, upgrade=True).engine.dispose()
+    command = [sys.executable, "-c", textwrap.dedent(PROCESS), str(tmp_path / "home"), url, str(lines)]
+    processes = [subprocess.Popen([*command, str(lease_ns)]) for _ in range(3)]
+
+    def seen() -> list[tuple[str, int]]:
+        found = lines.read_text().splitlines() if lines.exists() else []
+        return [(owner, int(until)) for owner, until in (line.split() for line in found)]
+
+    killed: list[str] = []
+    try:
+        for _ in range(3):
+            wait_for(lambda: any(owner not in killed for owner, _ in seen()), "the next scheduler", 120.0)
+            owner = next(owner for owner, _ in reversed(seen()) if owner not in killed)
+            killed.append(owner)
+            os.kill(int(owner.split(":")[1]), signal.SIGKILL)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert len(set(killed)) == 3
+    for (before, ended), (after, until) in pairwise(sorted(seen(), key=lambda one: one[1])):
+        assert before == after or until - lease_ns > ended
