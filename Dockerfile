@@ -15,8 +15,9 @@ FROM ${PYTHON_IMAGE} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/linna
 WORKDIR /src
-COPY requirements/runtime.txt requirements/postgres.txt requirements/parquet.txt requirements/
-RUN /opt/linna/bin/pip install -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt
+COPY requirements/hashed requirements
+RUN /opt/linna/bin/pip install --require-hashes -r requirements/runtime.txt -r requirements/postgres.txt \
+    -r requirements/parquet.txt -r requirements/traces.txt
 COPY pyproject.toml README.md LICENSE ./
 COPY lunar lunar
 COPY tmtc tmtc
@@ -32,7 +33,8 @@ RUN /opt/linna/bin/pip install --no-deps .
 FROM ${PYTHON_IMAGE}
 LABEL org.opencontainers.image.title="linna" org.opencontainers.image.licenses="Apache-2.0"
 RUN groupadd --gid 10001 linna && useradd --uid 10001 --gid linna --create-home linna \
-    && mkdir /var/lib/linna /exchange && chown linna:linna /var/lib/linna /exchange && chmod 2770 /exchange
+    && mkdir /var/lib/linna /exchange /backup && chown linna:linna /var/lib/linna /exchange /backup \
+    && chmod 2770 /exchange && chmod 700 /backup
 COPY --from=build /opt/linna /opt/linna
 COPY --from=displays /displays/openmct /opt/linna/share/openmct
 ENV PATH=/opt/linna/bin:$PATH \

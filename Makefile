@@ -18,7 +18,10 @@ DEMO_OUT    ?= linna-demo
 SAMPLE ?= 60
 SEED   ?= 1
 
-.PHONY: demo test check openmct docs links sbom package bench mutation up install install-dev clean
+# What is shipped: installed with hashes, audited, listed with licences.
+SHIPPED := $(foreach name,runtime postgres parquet traces terrain exports,requirements/$(name).txt)
+
+.PHONY: demo test check openmct docs links sbom licences package bench mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -32,6 +35,7 @@ check: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(PYTHON) -m pip --python $(BIN)/python check
 	$(BIN)/python -m pytest -q tests/test_dependencies.py
+	$(BIN)/python deploy/audit.py $(SHIPPED)
 
 # The documentation site with executed notebooks; `linna serve` shows it at /help.
 docs: $(VENV)/.dev
@@ -54,6 +58,10 @@ sbom: $(VENV)/.dev
 	mkdir -p dist
 	$(BIN)/python -m cyclonedx_py requirements requirements/runtime.txt --pyproject pyproject.toml --of JSON -o dist/linna.cdx.json
 
+# Licences of everything that is shipped; fails if one is GPL or AGPL.
+licences: $(VENV)/.dev
+	$(BIN)/python deploy/licences.py $(SHIPPED)
+
 # Wheel and source distribution.
 package: $(VENV)/.dev
 	$(BIN)/python -m build --outdir dist
@@ -74,17 +82,17 @@ install-dev: $(VENV)/.dev
 $(BIN)/python:
 	$(PYTHON) -m venv $(if $(BASE_PIP),--without-pip) $(VENV)
 
-$(VENV)/.runtime: requirements/runtime.txt pyproject.toml | $(BIN)/python
-	$(PIP) --no-compile -r requirements/runtime.txt
+$(VENV)/.runtime: requirements/hashed/runtime.txt pyproject.toml | $(BIN)/python
+	$(PIP) --no-compile --require-hashes -r requirements/hashed/runtime.txt
 	$(PIP) --no-deps --editable .
 	touch $@
 
-$(VENV)/.terrain: requirements/terrain.txt $(VENV)/.runtime
-	$(PIP) --no-compile -r requirements/terrain.txt
+$(VENV)/.terrain: requirements/hashed/terrain.txt $(VENV)/.runtime
+	$(PIP) --no-compile --require-hashes --no-deps -r requirements/hashed/terrain.txt
 	touch $@
 
-$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/exports.txt requirements/docs.txt $(VENV)/.runtime $(VENV)/.terrain
-	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/docs.txt -r requirements/dev.txt
+$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/traces.txt requirements/exports.txt requirements/docs.txt $(VENV)/.runtime $(VENV)/.terrain
+	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/traces.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/docs.txt -r requirements/dev.txt
 	touch $@
 
 $(VENV)/.bench: requirements/bench.txt $(VENV)/.dev

@@ -17,6 +17,15 @@ secret() {
 secret database_superuser_password ''
 secret database_owner_password "${LINNA_DB_OWNER_PASSWORD:-}"
 secret database_password "${LINNA_DB_PASSWORD:-}"
+secret database_backup_password "${LINNA_DB_BACKUP_PASSWORD:-}"
 secret broker_password "${LINNA_REDIS_PASSWORD:-}"
 secret admin_token "${LINNA_ADMIN_TOKEN:-}"
+# Without a certificate of a certification authority, the proxy gets one that it signs itself, for this name.
+if [ ! -s "$folder/tls_certificate" ] || [ ! -s "$folder/tls_key" ]; then
+  name="${LINNA_HOST_NAME:-localhost}"
+  rm -f "$folder/tls_certificate" "$folder/tls_key"
+  openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=$name" \
+    -addext "subjectAltName=DNS:$name,IP:127.0.0.1" -keyout "$folder/tls_key" -out "$folder/tls_certificate" 2>/dev/null
+  chmod 444 "$folder/tls_certificate" "$folder/tls_key"
+fi
 echo "secrets are in $folder; the token of the user admin is in $folder/admin_token"

@@ -1,16 +1,32 @@
 """What the project stands on: pinned, installed as pinned, under licences that a product can carry."""
 
+import importlib.util
+import json
 import re
+import threading
 import tomllib
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def script(name: str) -> ModuleType:
+    """Return a script of the folder deploy as a module."""
+    found = importlib.util.spec_from_file_location(name, ROOT / "deploy" / f"{name}.py")
+    assert found is not None and found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+audit, licences = script("audit"), script("licences")
 NORMAL = re.compile(r"[-_.]+")
-COPYLEFT = re.compile(r"\b(A?GPL|GNU (Affero )?General Public)", re.IGNORECASE)
-WEAK = re.compile(r"LGPL|Lesser|Library General", re.IGNORECASE)
 
 
 def name_of(text: str) -> str:
@@ -23,7 +39,11 @@ def pins(name: str) -> dict[str, str]:
     return {name_of(entry): entry for entry in entries if entry}
 
 
-RUNTIME = {**pins("runtime"), **pins("postgres"), **pins("terrain")}
+RUNTIME = {
+    name: pin
+    for file in ("runtime", "postgres", "parquet", "terrain", "exports", "traces")
+    for name, pin in pins(file).items()
+}
 EVERYTHING = {**RUNTIME, **pins("train"), **pins("dev")}
 
 
@@ -35,7 +55,13 @@ def test_every_declared_dependency_has_its_pin() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {name_of(text) for text in project["dependencies"]} <= set(pins("runtime"))
     extras = project["optional-dependencies"]
-    for extra, file in (("terrain", "terrain"), ("postgres", "postgres"), ("docs", "docs")):
+    for extra, file in (
+        ("terrain", "terrain"),
+        ("postgres", "postgres"),
+        ("parquet", "parquet"),
+        ("traces", "traces"),
+        ("docs", "docs"),
+    ):
         known = {**pins("runtime"), **pins(file)}
         assert {name_of(text) for text in extras[extra]} <= set(known)
 
@@ -44,8 +70,93 @@ def test_every_declared_dependency_has_its_pin() -> None:
 def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
     found = metadata.distribution(name)
     assert RUNTIME[name].endswith(f"=={found.version}")
-    about = found.metadata
-    told = [about.get("License-Expression") or "", (about.get("License") or "")[:200]]
-    told += [line for line in about.get_all("Classifier") or [] if line.startswith("License")]
-    copyleft = [text for text in told if COPYLEFT.search(text) and not WEAK.search(text)]
-    assert not copyleft, f"{name}: {copyleft}"
+    stated = licences.licences_of(name)
+    assert stated and not licences.is_copyleft(stated), f"{name}: {stated}"
+
+
+@pytest.mark.parametrize("name", ["runtime", "postgres", "parquet", "traces", "terrain"])
+def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
+    text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
+    entries = {name_of(line): line.split() for line in text.splitlines() if line and not line.startswith("#")}
+    assert {key: words[0].partition("==")[2] for key, words in entries.items()} == {
+        key: pin.partition("==")[2] for key, pin in pins(name).items()
+    }
+    for words in entries.values():
+        assert len(words) > 1 and all(re.fullmatch("--hash=sha256:[0-9a-f]{64}", word) for word in words[1:])
+
+
+def test_what_is_installed_for_users_is_installed_with_hashes() -> None:
+    installed = re.findall(r"pip install (.*(?:\\\n.*)*)", (ROOT / "Dockerfile").read_text())
+    assert [line.startswith("--require-hashes") or "--no-deps ." in line for line in installed] == [
+        True,
+        True,
+    ]
+    rules = (ROOT / "Makefile").read_text()
+    for name in ("runtime", "terrain"):
+        assert re.search(rf"--require-hashes .*-r requirements/hashed/{name}\.txt", rules)
+
+
+def test_the_gpl_is_found_and_the_lgpl_permitted() -> None:
+    for text in (
+        "GPL-3.0-only",
+        "AGPL-3.0",
+        "GNU General Public License v2 (GPLv2)",
+        "GNU Affero General Public License",
+    ):
+        assert licences.is_copyleft(["MIT", text]), text
+    for text in ("LGPL-3.0", "GNU Lesser General Public License v3", "MIT", "BSD-3-Clause", "MPL-2.0"):
+        assert not licences.is_copyleft([text]), text
+
+
+class Osv(BaseHTTPRequestHandler):
+    """A database in which version 1.0 of the package bad has a vulnerability."""
+
+    def do_POST(self) -> None:
+        given = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        bad = {"package": {"name": "bad", "ecosystem": "PyPI"}, "version": "1.0"}
+        results = [{"vulns": [{"id": "OSV-1"}]} if query == bad else {} for query in given["queries"]]
+        body = json.dumps({"results": results}).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None: ...
+
+
+@pytest.fixture
+def osv() -> Iterator[str]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Osv) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+        thread.join()
+
+
+def test_the_audit_finds_a_known_vulnerability(
+    osv: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "a.txt"
+    file.write_text("# packages\nbad==1.1\ngood==1.0 \\\n    --hash=sha256:00\n")
+    assert audit.main([str(file), "--url", osv]) == 0
+    assert "2 packages, 0 with known" in capsys.readouterr().out
+    file.write_text("bad==1.0\ngood==1.0\n")
+    assert audit.main([str(file), "--url", osv]) == 1
+    assert "bad 1.0: OSV-1" in capsys.readouterr().err
+
+
+def test_the_audit_reports_a_database_that_cannot_be_reached(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.txt").write_text("bad==1.0\n")
+    words = [str(tmp_path / "a.txt"), "--url", "http://127.0.0.1:1/"]
+    assert audit.main(words) == 0
+    assert "NOT CHECKED" in capsys.readouterr().err
+    assert audit.main([*words, "--strict"]) == 2
+
+
+def test_the_audit_is_part_of_make_check() -> None:
+    rules = (ROOT / "Makefile").read_text()
+    check = rules[rules.index("check:") : rules.index("# The documentation site")]
+    assert "deploy/audit.py $(SHIPPED)" in check

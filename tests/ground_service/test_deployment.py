@@ -21,9 +21,11 @@ SECRETS = (
     "database_superuser_password",
     "database_owner_password",
     "database_password",
+    "database_backup_password",
     "broker_password",
     "admin_token",
 )
+CERTIFICATE = ("tls_certificate", "tls_key")
 EXACT = re.compile(r"[a-z]+:\d+\.\d+(\.\d+)?-[a-z-]+")
 
 
@@ -44,7 +46,7 @@ def test_every_service_is_confined(name: str) -> None:
     assert not any("docker.sock" in volume for volume in service["volumes"])
 
 
-@pytest.mark.parametrize("name", sorted(set(SERVICES) - {"migrate"}))
+@pytest.mark.parametrize("name", sorted(set(SERVICES) - {"migrate", "backup"}))
 def test_every_service_that_stays_is_watched_and_comes_back(name: str) -> None:
     service = SERVICES[name]
     assert service["restart"] == "unless-stopped"
@@ -59,7 +61,7 @@ def test_nothing_starts_before_what_it_needs() -> None:
 
 
 def test_images_are_exact_versions() -> None:
-    for name in ("db", "broker"):
+    for name in ("db", "broker", "proxy"):
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
     for name in ("PYTHON_IMAGE", "NODE_IMAGE"):
         given = default_of(SERVICES["api"]["build"]["args"][name])
@@ -89,29 +91,61 @@ def test_the_lock_file_of_the_displays_names_the_public_registry_and_checksums()
         )
 
 
-def test_only_the_interface_is_reached_from_outside_and_from_this_machine_alone() -> None:
-    assert [name for name in SERVICES if "ports" in SERVICES[name]] == ["api"]
-    assert all(port.startswith("127.0.0.1:") for port in SERVICES["api"]["ports"])
-    assert COMPOSE["networks"]["inner"] == {"internal": True}
-    assert all(SERVICES[name]["networks"] == ["inner"] for name in SERVICES if name not in ("api", "runner"))
+def test_only_the_proxy_is_reached_from_outside_and_by_default_from_this_machine_alone() -> None:
+    assert [name for name in SERVICES if "ports" in SERVICES[name]] == ["proxy"]
+    assert [default_of(port) for port in SERVICES["proxy"]["ports"]] == ["127.0.0.1:8443:8443"]
+
+
+def test_a_service_is_in_the_networks_that_it_needs_and_no_others() -> None:
+    members = {
+        network: {name for name in SERVICES if network in SERVICES[name].get("networks", [])}
+        for network in COMPOSE["networks"]
+    }
+    assert members == {
+        "edge": {"proxy"},
+        "front": {"proxy", "api"},
+        "data": {"db", "migrate", "api", "worker", "scheduler", "backup"},
+        "queue": {"broker", "api", "worker", "scheduler"},
+        "egress": {"api", "worker"},
+    }
+    inner = {name for name, options in COMPOSE["networks"].items() if (options or {}).get("internal")}
+    assert inner == {"front", "data", "queue"}
+
+
+def test_the_api_believes_the_proxy_and_nobody_else() -> None:
+    (subnet,) = (entry["subnet"] for entry in COMPOSE["networks"]["front"]["ipam"]["config"])
+    assert SERVICES["api"]["environment"]["LINNA_TRUSTED_PROXIES"] == subnet
+    assert not default_of(subnet).endswith("/0")
+
+
+def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None:
+    backup = SERVICES["backup"]
+    assert backup["profiles"] == ["backup"] and backup["restart"] == "no"
+    assert "archive:/var/lib/linna:ro" in backup["volumes"]
+    assert backup["environment"]["LINNA_DATABASE_URL"].startswith("postgresql+psycopg://linna_backup@")
+    assert SERVICES["migrate"]["environment"]["LINNA_BACKUP_ROLE"] == "linna_backup"
 
 
 def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environment() -> None:
-    assert set(COMPOSE["secrets"]) == set(SECRETS)
+    assert set(COMPOSE["secrets"]) == {*SECRETS, *CERTIFICATE}
     for name, secret in COMPOSE["secrets"].items():
         # A file: contents of variables cannot be given to a container with a read-only root.
         assert secret == {"file": f"${{LINNA_SECRETS_DIR:-./secrets}}/{name}"}
     text = (ROOT / "docker-compose.yml").read_text()
     assert not re.search(r"\$\{?LINNA_[A-Z_]*(PASSWORD|TOKEN)", text)
     holders = {
-        name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])} for name in SECRETS
+        name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])}
+        for name in COMPOSE["secrets"]
     }
     assert holders == {
         "database_superuser_password": {"db"},
         "database_owner_password": {"db", "migrate"},
         "database_password": {"db", "migrate", "api", "worker", "scheduler"},
-        "broker_password": {"broker", "migrate", "api", "worker", "scheduler"},
+        "database_backup_password": {"db", "backup"},
+        "broker_password": {"broker", "api", "worker", "scheduler"},
         "admin_token": {"migrate"},
+        "tls_certificate": {"proxy"},
+        "tls_key": {"proxy"},
     }
     for service in SERVICES.values():
         for name, value in service.get("environment", {}).items():
@@ -125,11 +159,11 @@ def test_the_service_is_not_the_owner_of_its_schema() -> None:
     for name in ("api", "worker", "scheduler"):
         environment = SERVICES[name]["environment"]
         assert environment["LINNA_DATABASE_URL"].startswith("postgresql+psycopg://linna@")
-        assert not {key for key in environment if "MIGRATION" in key or "ALLOW" in key}
+        assert not {key for key in environment if "MIGRATION" in key or "ALLOW_DATABASE_OWNER" in key}
     owner = SERVICES["migrate"]["environment"]["LINNA_MIGRATION_DATABASE_URL"]
     assert owner.startswith("postgresql+psycopg://linna_owner@")
     roles = (ROOT / "deploy/postgres-roles.sh").read_text()
-    assert roles.count("LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION") == 2
+    assert roles.count("LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION") == 3
     assert "ALTER SCHEMA public OWNER TO linna_owner" in roles
 
 
@@ -144,9 +178,12 @@ def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     assert runner["memswap_limit"] == runner["mem_limit"]
     (exchange,) = re.findall(r"chmod (\d+) /exchange", DOCKERFILE)
     assert int(exchange, 8) & 0o007 == 0
-    for name in ("worker", "scheduler"):
-        assert "exchange:/exchange" in SERVICES[name]["volumes"]
-        assert SERVICES[name]["environment"]["LINNA_RUNNER_EXCHANGE"] == "/exchange"
+    assert "exchange:/exchange" in SERVICES["worker"]["volumes"]
+    assert SERVICES["worker"]["environment"]["LINNA_RUNNER_EXCHANGE"] == "/exchange"
+    assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {
+        "worker",
+        "runner",
+    }
 
 
 def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept(tmp_path: Path) -> None:
@@ -159,17 +196,17 @@ def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept
     }
     subprocess.run(script, check=True, env=environment, capture_output=True)
     made = {path.name: path.read_text() for path in folder.iterdir()}
-    assert set(made) == set(SECRETS) and made["admin_token"] == "given" * 5
+    assert set(made) == {*SECRETS, *CERTIFICATE} and made["admin_token"] == "given" * 5
     drawn = [made[name] for name in SECRETS if name != "admin_token"]
-    assert len(set(drawn)) == 4 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
+    assert len(set(drawn)) == 5 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
     assert folder.stat().st_mode & 0o077 == 0
     subprocess.run(script, check=True, env={**environment, "LINNA_ADMIN_TOKEN": "other"}, capture_output=True)
     assert {path.name: path.read_text() for path in folder.iterdir()} == made
 
 
-def test_one_scheduler_and_workers_without_one() -> None:
-    assert [name for name in SERVICES if "--beat" in SERVICES[name].get("command", [])] == ["scheduler"]
-    assert "scale" not in SERVICES["scheduler"] and default_of(SERVICES["worker"]["scale"]) == "2"
+def test_there_is_a_second_worker_and_a_second_scheduler() -> None:
+    assert SERVICES["scheduler"]["scale"] == 2 and default_of(SERVICES["worker"]["scale"]) == "2"
+    assert SERVICES["scheduler"]["command"] == ["scheduler"]
 
 
 def test_the_image_runs_as_nobody_in_particular() -> None:

@@ -1,0 +1,219 @@
+"""Point-in-time recovery with the scripts of the compose file: every table is deleted, then restored to a second."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+
+from ground_service.access import service as users
+from ground_service.ground import Ground, open_ground
+from ground_service.store import audit
+from ground_service.store.database import empty_database, open_database, prepare_database
+from tests.ground_service.conftest import free_port
+
+SYSTEM = "/usr/sbin:/usr/bin:/sbin:/bin"
+DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
+
+
+class Server:
+    """A PostgreSQL server with the options of deploy/postgres.sh and the archive of its log in `wal`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.wal, self.data, self.port = folder, folder / "wal", folder / "data", free_port()
+        self.bin = sorted(Path("/usr/lib/postgresql").glob("*/bin"))[-1]
+        self.user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
+        self.url = f"postgresql+psycopg://linna@127.0.0.1:{self.port}/linna"
+        self.scripts = folder / "scripts"
+        shutil.copytree(DEPLOY, self.scripts)
+        self.scripts.chmod(0o755)
+
+    def run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+        environment = {"PATH": f"{self.bin}:{SYSTEM}", "LINNA_WAL": str(self.wal)}
+        return subprocess.run(
+            [*self.user, *words], check=check, cwd=self.folder, env=environment, text=True,
+            capture_output=True,
+        )  # fmt: skip
+
+    def start(self) -> None:
+        script = (self.scripts / "postgres.sh").read_text()
+        options = re.findall(r"-c (\w+)=('[^']*'|\S+)", script)
+        assert [name for name, _ in options] == [
+            "wal_level",
+            "archive_mode",
+            "archive_timeout",
+            "archive_command",
+        ]
+        lines = [f"{name} = {value}" for name, value in options]
+        own = [
+            f"port = {self.port}",
+            f"unix_socket_directories = '{self.folder}'",
+            "listen_addresses = '127.0.0.1'",
+        ]
+        settings = "\n".join([*lines, *own]).replace("/linna/", f"{self.scripts}/")
+        (self.data / "archive.conf").write_text(settings + "\n")
+        with (self.data / "postgresql.conf").open("a") as configuration:
+            configuration.write("include_if_exists 'archive.conf'\n")
+        log = str(self.folder / "log")
+        # Output to the log, so that no pipe stays open.
+        command = [
+            *self.user,
+            str(self.bin / "pg_ctl"),
+            "-D",
+            str(self.data),
+            "-w",
+            "-t",
+            "120",
+            "-l",
+            log,
+            "start",
+        ]
+        environment = {"PATH": SYSTEM, "LINNA_WAL": str(self.wal)}
+        started = subprocess.run(
+            command, cwd=self.folder, env=environment, stdout=subprocess.DEVNULL, check=False
+        )
+        assert started.returncode == 0, Path(log).read_text()
+
+    def stop(self) -> None:
+        self.run(str(self.bin / "pg_ctl"), "-D", str(self.data), "-m", "immediate", "-w", "stop", check=False)
+
+    def script(self, name: str, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+        return self.run("sh", str(self.scripts / name), *words, check=check)
+
+    def base_backup(self) -> str:
+        place = ["--host", "127.0.0.1", "--port", str(self.port), "--username", "linna"]
+        return self.script("base-backup.sh", *place).stdout.strip()
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    if not sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
+        pytest.skip("PostgreSQL is not installed")
+    folder = Path(tempfile.mkdtemp(prefix="linna-recovery-"))
+    made = Server(folder)
+    if made.user:
+        shutil.chown(folder, "postgres", "postgres")
+    try:
+        made.run("mkdir", str(made.wal))
+        made.run(
+            str(made.bin / "initdb"),
+            "-D",
+            str(made.data),
+            "-U",
+            "linna",
+            "-A",
+            "trust",
+            "-E",
+            "UTF8",
+            "--no-sync",
+        )
+        made.start()
+        made.run(str(made.bin / "createdb"), "-h", "127.0.0.1", "-p", str(made.port), "-U", "linna", "linna")
+        yield made
+    finally:
+        made.stop()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def server_time(ground: Ground) -> datetime:
+    with ground.database.reading() as connection:
+        found: datetime = connection.execute(text("SELECT clock_timestamp()")).scalar_one()
+    return found.astimezone(UTC)
+
+
+def next_second(ground: Ground) -> datetime:
+    """Return the next full second, when it has passed."""
+    chosen = server_time(ground).replace(microsecond=0) + timedelta(seconds=1)
+    until = time.monotonic() + 60.0
+    while server_time(ground) <= chosen:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return chosen
+
+
+def archive_all(ground: Ground) -> None:
+    """Have the log so far archived, and wait until it is."""
+    with ground.database.writing() as connection:
+        segment = connection.execute(text("SELECT pg_walfile_name(pg_switch_wal())")).scalar_one()
+    until = time.monotonic() + 120.0
+    while True:
+        with ground.database.reading() as connection:
+            last = connection.execute(text("SELECT last_archived_wal FROM pg_stat_archiver")).scalar()
+        if last is not None and not last.endswith(".backup") and last >= segment:
+            return
+        assert time.monotonic() < until, f"{segment} was not archived; the last is {last}"
+        time.sleep(0.1)
+
+
+def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: Path) -> None:
+    prepare_database(server.url, upgrade=True).engine.dispose()
+    with open_ground(tmp_path / "home", database_url=server.url) as ground:
+        users.add_user(ground, "in-the-backup", "viewer")
+        base = server.base_backup()
+        next_second(ground)
+        users.add_user(ground, "before", "viewer")
+        chosen = next_second(ground)
+        users.add_user(ground, "after", "viewer")
+        empty_database(open_database(server.url))
+        archive_all(ground)
+    server.stop()
+    shutil.rmtree(server.data)  # the disk of the database is lost, the archive is not
+    target = chosen.strftime("%Y-%m-%d %H:%M:%S+00")
+    assert Path(base).name in server.script("restore-to.sh", str(server.data), target).stdout
+    server.start()
+    with open_ground(tmp_path / "home", database_url=server.url) as ground:
+        until = time.monotonic() + 120.0
+        while True:
+            with ground.database.reading() as connection:
+                if not connection.execute(text("SELECT pg_is_in_recovery()")).scalar():
+                    break
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        assert [one.name for one in users.list_users(ground)] == ["before", "in-the-backup"]
+        with ground.database.reading() as connection:
+            assert list(audit.broken_entries(connection)) == []
+        users.add_user(ground, "afterwards", "viewer")  # the service continues, on a new timeline
+
+
+def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
+    server.base_backup()
+    before = (datetime.now(UTC) - timedelta(hours=1)).strftime("%Y-%m-%d %H:%M:%S+00")
+    refused = server.script("restore-to.sh", str(server.folder / "new"), before, check=False)
+    assert refused.returncode == 2 and "expected a base backup before" in refused.stderr
+    refused = server.script("restore-to.sh", str(server.data), before, check=False)
+    assert refused.returncode == 2 and "expected an empty folder" in refused.stderr
+
+
+def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server) -> None:
+    made = []
+    for _ in range(3):
+        made.append(Path(server.base_backup()))
+        time.sleep(1.1)  # names of backups have seconds
+    assert sorted(path.name for path in (server.wal / "base").iterdir()) == [one.name for one in made[1:]]
+    (first,) = re.findall(r"\(file (\w+)\)", (made[1] / "backup_label").read_text().splitlines()[0])
+    kept = sorted(path.name for path in server.wal.iterdir() if re.fullmatch("[0-9A-F]{24}", path.name))
+    assert all(name >= first for name in kept)
+
+
+def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "one").write_bytes(b"1")
+    (tmp_path / "two").write_bytes(b"2")
+    (tmp_path / "wal").mkdir()
+    environment = {"PATH": os.environ["PATH"], "LINNA_WAL": str(tmp_path / "wal")}
+
+    def archive(name: str) -> int:
+        command = ["sh", str(DEPLOY / "wal-archive.sh"), str(tmp_path / name), "0001"]
+        return subprocess.run(command, env=environment, check=False).returncode
+
+    assert archive("one") == 0 and archive("one") == 0 and archive("two") != 0
+    assert (tmp_path / "wal/0001").read_bytes() == b"1"
+    assert [path.name for path in (tmp_path / "wal").iterdir()] == ["0001"]
