@@ -1,0 +1,150 @@
+"""The Kustomize base: valid by the schemas of Kubernetes, confined, and in agreement with itself and the program."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+
+from ground_service.settings import Settings
+from linna.cli import GROUPS
+
+BASE = Path(__file__).resolve().parents[2] / "deploy" / "kubernetes"
+KUSTOMIZATION: dict[str, Any] = yaml.safe_load((BASE / "kustomization.yaml").read_text())
+RESOURCES: list[dict[str, Any]] = [
+    document
+    for name in KUSTOMIZATION["resources"]
+    for document in yaml.safe_load_all((BASE / name).read_text())
+]
+VERSIONS = ("1.31.0", "1.37.0")
+
+
+def name_of(resource: dict[str, Any]) -> str:
+    return f"{resource['kind']} {resource['metadata']['name']}"
+
+
+def pod_of(resource: dict[str, Any]) -> dict[str, Any] | None:
+    spec = resource.get("spec", {})
+    template = spec.get("jobTemplate", {}).get("spec", {}).get("template") or spec.get("template")
+    return None if template is None else template["spec"]
+
+
+PODS = {name_of(one): pod for one in RESOURCES if (pod := pod_of(one)) is not None}
+
+
+def test_every_file_is_part_of_the_base() -> None:
+    assert {path.name for path in BASE.glob("*.yaml")} == {*KUSTOMIZATION["resources"], "kustomization.yaml"}
+    names = [name_of(one) for one in RESOURCES]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("resource", RESOURCES, ids=name_of)
+def test_a_resource_is_valid(resource: dict[str, Any], version: str) -> None:
+    kubernetes_validate.validate(resource, version, strict=True)
+
+
+def test_an_unknown_key_is_noticed() -> None:
+    (changed,) = (copy.deepcopy(one) for one in RESOURCES if name_of(one) == "Deployment linna-api")
+    changed["spec"]["replica"] = 2
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(changed, VERSIONS[-1], strict=True)
+
+
+@pytest.mark.parametrize("name", sorted(PODS))
+def test_a_pod_meets_the_restricted_standard_and_has_limits(name: str) -> None:
+    pod = PODS[name]
+    assert pod["automountServiceAccountToken"] is False
+    assert pod["securityContext"]["runAsNonRoot"] and pod["securityContext"]["runAsUser"] >= 10_000
+    assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert not {"hostNetwork", "hostPID", "hostIPC"} & set(pod)
+    for volume in pod["volumes"]:
+        assert set(volume) <= {"name", "persistentVolumeClaim", "emptyDir", "secret"}
+    for container in pod["containers"]:
+        assert container["securityContext"] == {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        }
+        assert container["resources"]["limits"]["memory"] and container["resources"]["requests"]["cpu"]
+        mounted = {mount["name"] for mount in container["volumeMounts"]}
+        assert mounted == {volume["name"] for volume in pod["volumes"]}
+
+
+def test_what_stays_is_watched_spread_and_survives_the_loss_of_a_node() -> None:
+    budgets = {
+        tuple(one["spec"]["selector"]["matchLabels"].items()): one["spec"]["minAvailable"]
+        for one in RESOURCES
+        if one["kind"] == "PodDisruptionBudget"
+    }
+    stays = [one for one in RESOURCES if one["kind"] == "Deployment"]
+    assert len(stays) == 3
+    for one in stays:
+        selector, template = one["spec"]["selector"]["matchLabels"], one["spec"]["template"]
+        assert template["metadata"]["labels"] == selector
+        assert one["spec"]["replicas"] >= 2 and budgets[tuple(selector.items())] == 1
+        assert "livenessProbe" in template["spec"]["containers"][0]
+        assert template["spec"]["topologySpreadConstraints"][0]["labelSelector"]["matchLabels"] == selector
+    (api,) = PODS["Deployment linna-api"]["containers"]
+    assert api["readinessProbe"]["httpGet"]["path"] == "/readyz"
+    assert api["livenessProbe"]["httpGet"]["path"] == "/healthz"
+
+
+def test_secrets_are_files_of_those_who_need_them() -> None:
+    holders = {
+        name: {
+            item["key"]
+            for volume in pod["volumes"]
+            if "secret" in volume
+            for item in volume["secret"]["items"]
+        }
+        for name, pod in PODS.items()
+    }
+    service = {"database_password", "broker_password"}
+    assert holders == {
+        "Deployment linna-api": service,
+        "Deployment linna-worker": service,
+        "Deployment linna-scheduler": service,
+        "Job linna-migrate": {*service, "database_owner_password"},
+        "CronJob linna-backup": {"database_backup_password"},
+    }
+    assert not any(one["kind"] == "Secret" for one in RESOURCES)
+
+
+def test_every_variable_is_a_setting_and_every_command_exists() -> None:
+    known = {f"LINNA_{name.upper()}" for name in Settings.model_fields}
+    known |= {f"LINNA_{name}_PASSWORD_FILE" for name in ("DATABASE", "MIGRATION_DATABASE", "BROKER")}
+    (configuration,) = (one["data"] for one in RESOURCES if one["kind"] == "ConfigMap")
+    assert set(configuration) <= known
+    for pod in PODS.values():
+        for container in pod["containers"]:
+            assert {variable["name"] for variable in container.get("env", [])} <= known
+            words = container.get("args") or container["command"][2].removeprefix("exec linna ").split()
+            assert words[0] in GROUPS
+
+
+def test_the_network_refuses_what_is_not_named() -> None:
+    policies = {one["metadata"]["name"]: one["spec"] for one in RESOURCES if one["kind"] == "NetworkPolicy"}
+    assert policies["default-deny"] == {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
+
+    def members(name: str) -> set[str]:
+        (expression,) = policies[name]["podSelector"]["matchExpressions"]
+        return set(expression["values"])
+
+    assert members("api-ingress") == {"api"}
+    assert members("database") == {"api", "worker", "scheduler", "migrate", "backup"}
+    assert members("broker") == {"api", "worker", "scheduler"}
+    assert members("outside") == {"api", "worker"}
+    assert [name for name, spec in policies.items() if spec.get("ingress")] == ["api-ingress"]
+
+
+def test_the_backup_cannot_change_the_archive() -> None:
+    (container,) = PODS["CronJob linna-backup"]["containers"]
+    (mount,) = (one for one in container["volumeMounts"] if one["name"] == "archive")
+    assert mount["readOnly"] is True
+    (url,) = (one["value"] for one in container["env"] if one["name"] == "LINNA_DATABASE_URL")
+    assert url.startswith("postgresql+psycopg://linna_backup@")
