@@ -163,7 +163,9 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
         users.add_user(ground, "before", "viewer")
         chosen = next_second(ground)
         users.add_user(ground, "after", "viewer")
-        empty_database(open_database(server.url))
+        database = open_database(server.url)
+        empty_database(database)
+        database.engine.dispose()
         archive_all(ground)
     server.stop()
     shutil.rmtree(server.data)  # the disk of the database is lost, the archive is not
