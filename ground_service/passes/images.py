@@ -14,6 +14,7 @@ from ground_service.passes.model import Image
 from ground_service.passes.span import PassSpan, pass_span, vehicle_span
 from ground_service.store.vehicles import find_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
+from lunar.arrays import FloatArray
 from tmtc.dictionary import APID_LARGE_DATA, DICTIONARY
 from tmtc.errors import ValueRefused
 from tmtc.large_data import LargeDataReceiver
@@ -22,6 +23,8 @@ from tmtc.thumbnails import Thumbnail, unpack_thumbnail
 
 IMAGES_LIMIT = 2000
 """Largest number of images in a list; the newest of an interval are listed."""
+
+ORANGE_BGR = (0, 159, 230)
 
 DAY_NS = 86_400_000_000_000
 DAYS_LIMIT = 31
@@ -56,20 +59,48 @@ def list_images(
     return sorted(inside, key=lambda one: (one.time.utc_ns, one.source, one.frame_number))[-IMAGES_LIMIT:]
 
 
-def archived_image(ground: Ground, pass_id: int, frame_number: int) -> bytes:
-    """Return a full frame of a pass archive as PNG.
+def archived_image(ground: Ground, pass_id: int, frame_number: int, *, detections: bool = False) -> bytes:
+    """Return a full frame of a pass archive as PNG, with circles around the detections of the payload if required.
 
     Raises
     ------
     NotFound
         There is no such pass, or its archive has no such frame.
+    InvalidInput
+        Detections cannot be drawn because the archived file is no image.
     """
     with ground.database.reading() as connection:
-        store.get_pass(connection, pass_id)
+        record = store.get_pass(connection, pass_id)
         sha256 = store.frame_files(connection, pass_id).get(frame_number)
+        found = _circles(connection, pass_span(connection, record), frame_number) if detections else None
     if sha256 is None:
         raise NotFound(f"pass {pass_id}: image of frame", frame_number)
-    return ground.files.get(sha256)
+    octets = ground.files.get(sha256)
+    return octets if found is None else _drawn(octets, found)
+
+
+def _circles(connection: Connection, span: PassSpan, frame_number: int) -> FloatArray:
+    """Return the detections of a frame (n, 3): u, v and diameter in pixels."""
+    samples = store.detection_samples(connection, span)
+    rows = [
+        np.arange(samples.offsets[k], samples.offsets[k + 1])
+        for k in np.flatnonzero(samples.frame_number == frame_number)
+    ]
+    chosen = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+    circles: FloatArray = np.column_stack([samples.u_px, samples.v_px, samples.diameter_px])[chosen]
+    return circles
+
+
+def _drawn(octets: bytes, circles: FloatArray) -> bytes:
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(octets, dtype=np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise InvalidInput("archived image", "", "a PNG image", "another file")
+    for u_px, v_px, diameter_px in circles.tolist():
+        cv2.circle(picture, (round(u_px), round(v_px)), max(round(diameter_px / 2.0), 1), ORANGE_BGR, 1)
+    _, drawn = cv2.imencode(".png", picture)
+    return drawn.tobytes()
 
 
 def thumbnail_image(ground: Ground, spacecraft_id: int, instance: str, ticks: int) -> bytes:

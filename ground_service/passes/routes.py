@@ -284,9 +284,11 @@ def get_image(
     _: Viewer,
     pass_id: PassId,
     frame_number: Annotated[int, Path(ge=0, lt=1 << 32)],
+    detections: Annotated[bool, Query(description="Draw the detections of the payload")] = False,
 ) -> Response:
     """Return a frame of a pass archive as PNG."""
-    return Response(images.archived_image(ground, pass_id, frame_number), media_type="image/png")
+    octets = images.archived_image(ground, pass_id, frame_number, detections=detections)
+    return Response(octets, media_type="image/png")
 
 
 @passes.get("/parameters", responses=problems(404))

@@ -87,3 +87,42 @@ def test_a_change_with_the_cookie_from_another_origin_is_refused(client: TestCli
         answer = client.post("/api/v1/windows", json={}, headers=headers)
         assert answer.status_code == 403, headers
     assert client.post("/api/v1/windows", json={}, headers=OWN).status_code == 422
+
+
+@pytest.fixture
+def openmct(tmp_path: Path) -> Path:
+    """A folder with the files of the npm package that the service reads."""
+    folder = tmp_path / "openmct"
+    (folder / "dist").mkdir(parents=True)
+    (folder / "package.json").write_text('{"version": "4.2.0"}')
+    (folder / "LICENSE.md").write_text("terms")
+    (folder / "dist" / "openmct.js").write_text("script")
+    (folder / "dist" / "secret.env").write_text("no file of the displays")
+    return folder
+
+
+def test_the_displays_open_with_a_session_only(tmp_path: Path, openmct: Path) -> None:
+    settings = Settings(home=tmp_path / "home", openmct=openmct)
+    with TestClient(create_app(settings, inline_jobs=True)) as client:
+        token = users.add_user(client.app.state.ground, "ann", "viewer")
+        answer = client.get("/mct", follow_redirects=False)
+        assert (answer.status_code, answer.headers["location"]) == (303, "/?next=/mct")
+        start(client, token)
+        answer = client.get("/mct", follow_redirects=False)
+        assert answer.status_code == 200 and "/mct/4.2.0/openmct.js" in answer.text
+        assert "'unsafe-eval'" in answer.headers["content-security-policy"]
+        assert client.get("/mct/4.2.0/openmct.js").text == "script"
+        assert client.get("/mct/4.2.0/secret.env").status_code == 404
+        # A viewer reads layouts and stores none.
+        assert client.get("/api/v1/displays").status_code == 200
+        given = {"name": "n", "type": "folder", "version": 0, "document": {}}
+        assert client.put("/api/v1/displays/mine", json=given, headers=OWN).status_code == 403
+
+
+@pytest.mark.parametrize("missing", ["package.json", "LICENSE.md", "dist/openmct.js"])
+def test_an_incomplete_installation_counts_as_none(tmp_path: Path, openmct: Path, missing: str) -> None:
+    (openmct / missing).unlink()
+    settings = Settings(home=tmp_path / "home", openmct=openmct)
+    with TestClient(create_app(settings, inline_jobs=True)) as client:
+        answer = client.get("/mct")
+        assert answer.status_code == 200 and "make openmct" in answer.text

@@ -15,7 +15,7 @@ from ground_service.passes import images, store
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import list_spacecraft
 from ground_service.passes.parameters import spacecraft_parameters
-from ground_service.passes.service import trend_series
+from ground_service.passes.service import detections, trend_series
 from ground_service.store.stored_files import register_file
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import NS, SPACECRAFT, SyntheticPass, encode_downlink
@@ -84,7 +84,7 @@ def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Groun
 
 def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass: SyntheticPass) -> None:
     pass_id = import_archive(ground, synthetic_pass.folder)
-    _, png = cv2.imencode(".png", np.full((4, 4), 77, np.uint8))
+    _, png = cv2.imencode(".png", np.full((1024, 1024), 77, np.uint8))
     stored = ground.files.put_octets(png.tobytes())
     with ground.database.writing() as connection:
         register_file(connection, stored, "frame", "3.png", START)
@@ -96,6 +96,15 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
     assert record.start_utc_ns < found.time.utc_ns < record.stop_utc_ns
     assert found.address == f"/api/v1/passes/{pass_id}/images/3"
     assert images.archived_image(ground, pass_id, 3) == png.tobytes()
+    items, _ = detections(ground, pass_id, limit=1000, offset=0)
+    own = [one for one in items if one.frame_number == 3]
+    drawn = images.archived_image(ground, pass_id, 3, detections=True)
+    picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
+    assert own and set(map(tuple, picture.reshape(-1, 3).tolist())) == {(77, 77, 77), images.ORANGE_BGR}
+    for one in own:
+        rim = (round(one.v_px), round(one.u_px) + max(round(one.diameter_px / 2), 1))
+        if max(rim) < 1024:
+            assert tuple(picture[rim].tolist()) == images.ORANGE_BGR
     with pytest.raises(NotFound, match="image of frame"):
         images.archived_image(ground, pass_id, 4)
 

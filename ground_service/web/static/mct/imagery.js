@@ -12,18 +12,20 @@ const METADATA = {
   ],
 };
 
-function datum(one) {
+function datum(one, detections) {
   const name = `frame ${one.frame_number}, ${one.source}`;
-  return { name, utc: milliseconds(one.time), url: one.address, file: `${name.replaceAll(/[ ,]+/g, "-")}.png` };
+  const url = detections ? `${one.address}?detections=true` : one.address;
+  return { name, utc: milliseconds(one.time), url, file: `${name.replaceAll(/[ ,]+/g, "-")}.png` };
 }
 
 const LONGEST_MS = 31 * 86_400_000;
 
-async function request({ spacecraft }, { start, end, size, strategy, signal }) {
+async function request({ spacecraft, detections }, { start, end, size, strategy, signal }) {
   const from = Math.max(start, end - LONGEST_MS, 0);
   const query = { instance: spacecraft.instance, start: new Date(from).toISOString(), stop: new Date(Math.max(end, 0)).toISOString() };
   const { items } = await get(`spacecraft/${spacecraft.spacecraft_id}/images`, query, { signal });
-  return (strategy === "latest" || size === 1 ? items.slice(-1) : items).map(datum);
+  const shown = detections ? items.filter((one) => one.source === "archive") : items;
+  return (strategy === "latest" || size === 1 ? shown.slice(-1) : shown).map((one) => datum(one, detections));
 }
 
 function subscribe(openmct, object, callback) {
@@ -44,7 +46,9 @@ function subscribe(openmct, object, callback) {
 export function installImagery(openmct) {
   const isImagery = (object) => object.type === "linna.images";
   openmct.types.addType("linna.images", { name: "Images", cssClass: "icon-image", creatable: false });
-  addExtra("images", () => ({ type: "linna.images", name: "Images", telemetry: METADATA, configuration: { layers: [] } }));
+  const make = (name, detections) => () => ({ type: "linna.images", name, detections, telemetry: METADATA, configuration: { layers: [] } });
+  addExtra("images", make("Images", false));
+  addExtra("detections", make("Images with detections", true));
   openmct.telemetry.addProvider({
     supportsRequest: isImagery,
     request,
