@@ -1,7 +1,9 @@
 """Telemetry displays at /mct: Open MCT in Chromium, and the service without it."""
 
+import calendar
 import gzip
 import json
+import math
 import os
 import re
 import shutil
@@ -193,3 +195,42 @@ def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
         other.context.close()
     names = [one["name"] for one in json.loads(ask(f"{shown.url}/api/v1/displays")[1])["items"]]
     assert sorted(names) == ["Shift of Monday", "Stored layouts"]
+
+
+def bucket(start, stop, count, low, high, mean, after_gap=False):
+    times = {"start": f"2029-08-07T06:00:{start:02d}.000000Z", "stop": f"2029-08-07T06:00:{stop:02d}.000000Z"}
+    return times | {"count": count, "min": low, "max": high, "mean": mean, "after_gap": after_gap}
+
+
+def test_intervals_become_extremes_and_gaps_interrupt_the_line(page):
+    page.goto("/licences")
+    buckets = [bucket(0, 0, 1, 5.0, 5.0, 5.0), bucket(10, 20, 9, 1.0, 8.0, 4.0, after_gap=True)]
+    found = page.evaluate(
+        """async (buckets) => {
+            const { samplesOf } = await import("/static/mct/telemetry.js");
+            const pairs = (samples) => samples.map((one) => [one.utc, one.value]);
+            return [pairs(samplesOf(buckets, true)), pairs(samplesOf(buckets, false))];
+        }""",
+        buckets,
+    )
+    start = 1_000 * calendar.timegm((2029, 8, 7, 6, 0, 0))
+    extremes, means = found
+    assert extremes[0] == [start, 5.0] and extremes[2:] == [[start + 10_000, 1.0], [start + 20_000, 8.0]]
+    assert extremes[1][0] == start + 1 and math.isnan(extremes[1][1])
+    assert means == [[start, 5.0], [start + 15_000, 4.0]]
+
+
+def test_limits_have_sides_and_severities(page):
+    page.goto("/licences")
+    found = page.evaluate(
+        """async () => {
+            const { limitOf } = await import("/static/mct/telemetry.js");
+            const limits = { warning: [-10, 50], alarm: [null, 60] };
+            return [-11, -10, 50, 51, 60, 61].map((value) => limitOf(value, limits)?.cssClass ?? "");
+        }"""
+    )
+    low, high, alarm = (
+        f"is-limit--{side} is-limit--{colour}"
+        for side, colour in (("lwr", "yellow"), ("upr", "yellow"), ("upr", "red"))
+    )
+    assert found == [low, "", "", high, high, alarm]

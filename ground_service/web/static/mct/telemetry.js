@@ -123,7 +123,7 @@ function subscribe(openmct, object, callback) {
   return () => stop();
 }
 
-function limitOf(value, { warning, alarm }) {
+export function limitOf(value, { warning, alarm }) {
   for (const [limits, colour, name] of [
     [alarm, "red", "alarm"],
     [warning, "yellow", "warning"],
