@@ -16,11 +16,12 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.identification import minimum_members
-from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view
+from payload_emulator.flight.navigation.sighting import DESIGN_ALTITUDE_M, LandmarkMap, Pose, in_view
 from payload_emulator.flight.vision.detections import Detections
 
-# The ground falls away from a plane: towards the edges of the image depth exceeds altitude by up to a tenth.
-_SAG = 0.05
+# The ground falls away from a plane: towards the corners of the image depth exceeds altitude by up to a tenth at 50 km.
+# Half of the logarithm of the ratio.
+_SMALLEST_SAG = 0.05
 # Two solutions farther apart than this many tolerances of a detection on the ground are different places.
 _SEPARATE_TOLERANCES = 3.0
 # Angle off nadir up to which craters are searched: beyond it ground and horizon are close, and the distance diverges.
@@ -58,7 +59,7 @@ class AcquisitionParameters:
     tolerance_px: float = 8.0
     log_diameter_gate: float = 0.45
     minimum_altitude_m: float = 8_000.0
-    maximum_altitude_m: float = 120_000.0
+    maximum_altitude_m: float = 250_000.0
     false_fix_limit: float = 1e-5
     places: int = 12
     agreement_sigmas: float = 3.5
@@ -140,6 +141,8 @@ class _Votes:
         Altitudes tried.
     cell_m
         Edge of a cell of the vote.
+    sag
+        Half of the logarithm of the largest depth of the ground in the image over the altitude.
     """
 
     crater: FloatArray
@@ -153,6 +156,7 @@ class _Votes:
     altitude_m: float
     cell_m: float
     reach_m: float
+    sag: float
 
     @property
     def pairs(self) -> int:
@@ -189,8 +193,8 @@ class _Votes:
         # Diameter over the line of sight: depth lies between the lowest and the highest altitude tried.
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.log(landmarks.diameter_m[index][None, :] * camera.focal_px / found.diameter_px[:, None])
-        gate = parameters.log_diameter_gate
-        rows, columns = np.nonzero((size > np.log(low) - gate) & (size < np.log(high) + gate + 2.0 * _SAG))
+        gate, sag = parameters.log_diameter_gate, _sag(altitude, float(corner))
+        rows, columns = np.nonzero((size > np.log(low) - gate) & (size < np.log(high) + gate + 2.0 * sag))
         if not rows.size:
             return None
         pole = np.array([0.0, 0.0, 1.0])
@@ -208,6 +212,7 @@ class _Votes:
             altitude_m=altitude,
             cell_m=parameters.tolerance_px / camera.focal_px * altitude,
             reach_m=reach,
+            sag=sag,
         )
 
     def places(self, parameters: AcquisitionParameters) -> list[FloatArray]:
@@ -223,7 +228,9 @@ class _Votes:
             x = np.floor((camera @ self.east) / self.cell_m).astype(np.int64) + size // 2
             y = np.floor((camera @ self.north) / self.cell_m).astype(np.int64) + size // 2
             inside = (x >= 0) & (x < size) & (y >= 0) & (y < size) & (root > 0.0)
-            inside &= np.abs(self.log_depth - np.log(altitude) - _SAG) < parameters.log_diameter_gate + _SAG
+            inside &= (
+                np.abs(self.log_depth - np.log(altitude) - self.sag) < parameters.log_diameter_gate + self.sag
+            )
             cells = np.unique((x[inside] * size + y[inside]) * 4096 + self.detection[inside]) // 4096
             grid = np.bincount(cells, minlength=size * size).reshape(size, size).astype(np.float64)
             wide = np.pad(grid, 1)
@@ -238,6 +245,21 @@ class _Votes:
             (self.centre * (MOON_RADIUS_M + altitude) + (self.east * i + self.north * j) * self.cell_m)
             for _, i, j, altitude in found[: parameters.places]
         ]
+
+
+def _sag(altitude_m: float, corner_rad: float) -> float:
+    """Return half of the logarithm of depth over altitude in the corners of the image, or at the horizon in them.
+
+    The ray at an angle a from nadir meets the sphere of radius R from the distance r = R + altitude after
+    t = r cos a - sqrt(R^2 - r^2 sin^2 a), at the depth t cos a.
+    """
+    if altitude_m <= DESIGN_ALTITUDE_M:
+        return _SMALLEST_SAG
+    distance = MOON_RADIUS_M + altitude_m
+    sine = min(np.sin(corner_rad), MOON_RADIUS_M / distance)
+    cosine = np.sqrt(1.0 - sine**2)
+    ray = distance * cosine - np.sqrt(max(MOON_RADIUS_M**2 - (distance * sine) ** 2, 0.0))
+    return max(_SMALLEST_SAG, 0.5 * float(np.log(ray * cosine / altitude_m)))
 
 
 def _fit(

@@ -32,6 +32,7 @@ from payload_emulator.flight.navigation.association import (
     associate,
     detection_variance_px2,
     search_margin_px,
+    tracking_limit_m,
 )
 from payload_emulator.flight.navigation.correction import Fix, correct
 from payload_emulator.flight.navigation.dynamics import OrbitModel, process_noise
@@ -381,7 +382,7 @@ def tied(
     """Return the state after the relative measurement against the previous frame, and the number of ties."""
     parameters, prior, previous = setup.parameters, state.estimate, state.previous
     state = replace(state, estimate=without_clone(prior), previous=None)
-    if previous is None or prior.position_sigma_m > parameters.tracking_limit_m:
+    if previous is None or prior.position_sigma_m > tracking_limit_m(prior, parameters):
         return state, 0
     now = Remembered(found, detection_variance_px2(found, parameters), camera_from_icrf, mcmf_from_icrf)
     measured, ties = tie(
@@ -400,7 +401,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     """Return the fix around the prediction: by votes where it is uncertain, by association where it is not."""
     prior, landmarks, camera, parameters = state.estimate, state.landmarks, setup.camera, setup.parameters
     sigma_m = prior.position_sigma_m
-    if sigma_m > parameters.tracking_limit_m:
+    if sigma_m > tracking_limit_m(prior, parameters):
         expected = len(in_view(landmarks, pose, camera, 0.0))
         fix = recovery.search_by_votes(prior, pose, found, landmarks, camera, parameters, sigma_m)
         # A search that found no safe place is a fix refused, and counts the detections it was tried with.

@@ -93,7 +93,8 @@ class AnchoredParameters:
     detection_persistence
         Share of a detection's variance that is common to all frames of a crater.
     tracking_limit_m
-        Largest position sigma with which the search uses a linear prediction; above it, the search uses votes.
+        Largest position sigma with which the search uses a linear prediction; above it, the search uses votes. It is
+        valid at mission altitudes and grows above them (`ground_scale`).
     search_radius_m
         Half width of the widened search after a disagreement between map and images.
     divergence_limit_m

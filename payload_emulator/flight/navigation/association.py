@@ -11,7 +11,7 @@ from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.filter import FilterState
 from payload_emulator.flight.navigation.identification import Identification, identify
-from payload_emulator.flight.navigation.sighting import LandmarkMap, Sighting
+from payload_emulator.flight.navigation.sighting import LandmarkMap, Sighting, ground_scale
 from payload_emulator.flight.vision.detections import Detections
 
 
@@ -32,6 +32,11 @@ def search_margin_px(prior: FilterState, camera: PinholeCamera, limits: Anchored
     altitude_m = max(altitude_above_sphere_m(prior), limits.lowest_altitude_m)
     wanted = limits.search_sigmas * prior.position_sigma_m / altitude_m * camera.focal_px
     return min(wanted, limits.search_margin_px)
+
+
+def tracking_limit_m(prior: FilterState, parameters: AnchoredParameters) -> float:
+    """Return the largest position sigma with which the search uses a linear prediction."""
+    return parameters.tracking_limit_m * ground_scale(altitude_above_sphere_m(prior))
 
 
 def associate(

@@ -16,7 +16,7 @@ from payload_emulator.flight.navigation.association import altitude_above_sphere
 from payload_emulator.flight.navigation.correction import Fix, correct
 from payload_emulator.flight.navigation.filter import FilterState
 from payload_emulator.flight.navigation.identification import Identification
-from payload_emulator.flight.navigation.lost_in_space import PlaceIndex, find_place
+from payload_emulator.flight.navigation.lost_in_space import LostParameters, PlaceIndex, find_place
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, look
 from payload_emulator.flight.vision.detections import Detections
 
@@ -24,6 +24,8 @@ _NO_CRATERS = np.empty(0, dtype=np.int64)
 # Angular rate of a low orbit (2 pi in 111 minutes): an along-track position error implies a velocity error of this rate
 # times the position error.
 _ORBITAL_RATE_RAD_S = 1e-3
+# Highest altitude of a search without a prior over the predicted one.
+_HIGHEST_SHARE = 1.2
 
 
 def disagreements(
@@ -39,7 +41,9 @@ def disagreements(
         Craters of the map in the predicted image, and detections in the frame.
     """
     usable, limits = min(expected, detections), parameters.limits
-    if fix is not None and len(fix.index) >= max(1, limits.agreement_share * usable):
+    # A fix uses at most `crater_limit` craters, also where hundreds are in view.
+    explained = min(limits.agreement_share * usable, parameters.crater_limit)
+    if fix is not None and len(fix.index) >= max(1, explained):
         return 0
     return count + 1 if usable >= limits.judged_craters else count
 
@@ -126,7 +130,7 @@ def search_everywhere(
         Search index of the map.
     """
     sigma_px = np.sqrt(detection_variance_px2(found, parameters))
-    place = find_place(found, sigma_px, places, camera, parameters.lost)
+    place = find_place(found, sigma_px, places, camera, _lost_parameters(prior, parameters))
     if place is None:
         return None
     old, new = prior.mean[kalman.POSITION], pose.mcmf_from_icrf.T @ place.position_mcmf_m
@@ -148,6 +152,18 @@ def search_everywhere(
     return correct(
         fresh, there, found, identification, sighting, landmarks, camera, parameters, altitude_m, reacquired=True
     )  # fmt: skip
+
+
+def _lost_parameters(prior: FilterState, parameters: AnchoredParameters) -> LostParameters:
+    """Return the parameters of the search with altitudes up to 1.2 times the predicted one.
+
+    A lost estimate errs in its place rather than in its altitude, which follows from the period of the orbit. Below 46
+    km the altitudes of the parameters apply.
+    """
+    highest_m = _HIGHEST_SHARE * altitude_above_sphere_m(prior)
+    if highest_m <= parameters.lost.maximum_altitude_m:
+        return parameters.lost
+    return replace(parameters.lost, maximum_altitude_m=highest_m)
 
 
 def _turned_velocity(velocity: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:

@@ -23,6 +23,18 @@ from tmtc.tables import CatalogueTable
 # A crater is in sight if its centre is above the limb by this much: on the very limb a degree is many pixels.
 _LIMB_MARGIN_RAD = np.radians(5.0)
 
+DESIGN_ALTITUDE_M = 100_000.0
+"""Altitude up to which limits in metres on the ground were evaluated; they apply there as they are."""
+
+
+def ground_scale(altitude_m: float) -> float:
+    """Return the factor of limits in metres on the ground at an altitude: max(1, altitude / DESIGN_ALTITUDE_M).
+
+    A pixel at nadir covers altitude / focal length. Above the design altitude limits grow with it, so that they remain
+    the same in pixels: 1,500 m are 2.2 px at 100 km and would be 1.5 px at 150 km.
+    """
+    return max(1.0, altitude_m / DESIGN_ALTITUDE_M)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:

@@ -106,6 +106,33 @@ def test_a_place_kilometres_off_is_found_with_the_right_craters(
     assert fix.detection.size >= fix.needed >= 4
 
 
+@pytest.mark.parametrize("altitude_m", [150_000.0, 110_000.0])
+def test_a_place_is_found_from_high_orbits(altitude_m: float) -> None:
+    landmarks = crater_map(reach_rad=0.28, mean_in_image=2.0)
+    true = pose_at(1_500.0, -800.0, altitude_m)
+    found, owner = detected(landmarks, true, seed=4)
+    fix = search(found, landmarks, pose_at(7_500.0, -9_800.0, altitude_m + 2_000.0), 5_000.0)
+    assert fix is not None
+    np.testing.assert_array_equal(owner[fix.detection], fix.index)
+    # Half a pixel is 500 m at 150 km, averaged over dozens of craters.
+    assert np.linalg.norm(fix.pose.position_icrf_m - true.position_icrf_m) < 600.0
+
+
+@pytest.mark.parametrize("altitude_km", [120.0, 150.0, 200.0])
+def test_the_sag_is_that_of_the_ground_in_the_corner_or_of_the_horizon(altitude_km: float) -> None:
+    distance, corner = 1_737.4 + altitude_km, np.arctan(256.0 * np.sqrt(2.0) / FOCAL_PX)
+    angle = min(corner, np.arcsin(1_737.4 / distance))
+    # Sine rule in the triangle of centre, camera and ground.
+    at_centre = np.arcsin(distance * np.sin(angle) / 1_737.4) - angle
+    depth = distance - 1_737.4 * np.cos(at_centre)
+    found = acquisition._sag(1e3 * altitude_km, float(corner))
+    assert found == pytest.approx(0.5 * np.log(depth / altitude_km), rel=1e-4)
+
+
+def test_the_sag_is_constant_up_to_the_design_altitude() -> None:
+    assert {acquisition._sag(1e3 * km, 1.18) for km in (14.0, 50.0, 100.0)} == {0.05}
+
+
 def test_a_place_outside_the_search_is_not_found() -> None:
     landmarks, true = crater_map(), pose_at(0.0, 0.0)
     found, _ = detected(landmarks, true)

@@ -260,6 +260,9 @@ def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_s
         (2, 10, 10, 1),
         (3, 10, 10, -1),
         (1, 3, 9, -1),
+        # A fix uses 32 craters at most.
+        (31, 400, 250, 1),
+        (32, 400, 250, -1),
     ],
 )
 def test_frames_are_judged_by_the_share_they_explain(
@@ -514,6 +517,30 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
         np.testing.assert_allclose(own[k], expected, rtol=1e-9, atol=1e-12)
         at = sighting.by_position[k]
         np.testing.assert_allclose(place[k], at @ prior.covariance[:3, :3] @ at.T, rtol=1e-9)
+
+
+def at_altitude(altitude_m: float) -> FilterState:
+    mean = np.zeros(18)
+    mean[0] = 1_737_400.0 + altitude_m
+    return FilterState(0, mean, np.eye(18), np.empty(0, dtype=np.int64))
+
+
+@pytest.mark.parametrize(
+    ("altitude_m", "limit_m"),
+    [(14e3, 1_500.0), (50e3, 1_500.0), (100e3, 1_500.0), (150e3, 2_250.0), (200e3, 3_000.0)],
+)
+def test_the_limit_of_the_linear_search_grows_with_the_ground_in_a_pixel(
+    altitude_m: float, limit_m: float
+) -> None:
+    found = association.tracking_limit_m(at_altitude(altitude_m), AnchoredParameters())
+    assert found == pytest.approx(limit_m)
+
+
+def test_a_search_without_a_prior_covers_the_predicted_altitude() -> None:
+    parameters = AnchoredParameters()
+    assert recovery._lost_parameters(at_altitude(45e3), parameters) is parameters.lost
+    high = recovery._lost_parameters(at_altitude(150e3), parameters)
+    assert high == replace(parameters.lost, maximum_altitude_m=pytest.approx(180e3))
 
 
 def test_an_attitude_error_among_the_states_counts_once_in_the_spread(
