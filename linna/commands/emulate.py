@@ -195,7 +195,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         raise UsageError(f"--rate: expected a number from 0, found {arguments.rate}")
     data = data_folder()
     world = build_world(scenario, data)
-    loaded, _, catalogue = load_scenario_payload(world, data)
+    loaded, _, _ = load_scenario_payload(world, data)
     live = LivePayload(
         world,
         new_spacecraft(world, loaded),
@@ -207,7 +207,6 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         arguments.paused,
         arguments.stop_at_end,
         not arguments.no_operator,
-        catalogue,
         mission_text(world, data),
         arguments.mission_port,
     )

@@ -24,7 +24,6 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from lunar.catalogue import CraterCatalogue
 from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
@@ -45,6 +44,7 @@ from payload_emulator.session.live_ports import Server
 from payload_emulator.session.spacecraft import Spacecraft
 from payload_emulator.session.world import World, continued, exposures
 from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, transmit
+from payload_emulator.sim.render.labels import label_frame
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.link import LinkSettings
@@ -158,8 +158,6 @@ class LivePayload:
         Simulated seconds per second of the wall clock; 0: as fast as possible.
     paused
         Whether simulated time is stopped until `run` or `step`.
-    catalogue
-        Craters with rim heights, for the rings of the console; None: the catalogue of the terrain.
     mission
         Text of the mission description, for the ground at its first contact.
     has_operator
@@ -177,7 +175,6 @@ class LivePayload:
     paused: bool = False
     stop_at_end: bool = False
     has_operator: bool = True
-    catalogue: CraterCatalogue | None = None
     mission: str = ""
     mission_port: int = 0
     stopping: threading.Event = field(default_factory=threading.Event)
@@ -311,7 +308,7 @@ class LivePayload:
             kept = world.frame_utc_ns[
                 (np.arange(world.frame_utc_ns.size) < known) | (world.frame_utc_ns <= stop_utc_ns)
             ]
-            self.world, self.catalogue = replace(world, frame_utc_ns=kept), None
+            self.world = replace(world, frame_utc_ns=kept)
             further = [one for one in timeline(self.world) if last.utc_ns < one.utc_ns <= stop_utc_ns]
         taken = np.array([one.utc_ns for one in further], dtype=np.int64)
         turns = np.arange(last.utc_ns + interval_ns, stop_utc_ns, interval_ns)
@@ -425,24 +422,18 @@ class LivePayload:
             self._downwards.start(octets, self._way_s)
             self.sent += 1
         if self._servers["console"].clients:
-            self._send_message(
-                snapshot(self.world, self.spacecraft, flown, self.paused, self.rate, self.catalogue)
-            )
+            self._send_message(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate))
 
     def _send_message(self, message: dict[str, Any]) -> None:
         if "console" in self._servers:
             self._servers["console"].send(json.dumps(message).encode() + b"\n")
 
 
-def snapshot(
-    world: World,
-    spacecraft: Spacecraft,
-    flown: Flown,
-    paused: bool,
-    rate: float,
-    craters: CraterCatalogue | None = None,
-) -> dict[str, Any]:
-    """A moment for a viewer: image, detections, catalogue, outcome estimate of each estimator, and truth."""
+def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, rate: float) -> dict[str, Any]:
+    """A moment for a viewer: image, detections, catalogue, outcome estimate of each estimator, and truth.
+
+    A detection that the payload identified has the `crater_id` that it reported.
+    """
     message: dict[str, Any] = {
         "kind": "turn" if flown.exposure is None else "frame",
         "utc": format_utc(flown.moment.utc_ns),
@@ -456,6 +447,7 @@ def snapshot(
         "verifications": [],
     }
     estimates: dict[str, dict[str, Any]] = {}
+    identified: dict[int, int] = {}
     labels = DICTIONARY.labels
     for packet in flown.packets:
         try:
@@ -481,6 +473,9 @@ def snapshot(
                     strict=True,
                 )
             ]
+        elif name == "identifications":
+            items = values["items"]
+            identified |= dict(zip(items["detection"].tolist(), items["crater_id"].tolist(), strict=True))
         elif name in ("frame_outcome", "navigation_state"):
             estimator = labels(name, "estimator")[values["estimator"]]
             estimate = estimates.setdefault(estimator, {})
@@ -489,6 +484,9 @@ def snapshot(
                 estimate["reset_trigger"] = labels(name, "reset_trigger")[values["reset_trigger"]]
             else:
                 estimate |= {key: values[key] for key in ("latitude_deg", "longitude_deg", "altitude_m")}
+    for number, detection in enumerate(message.get("detections", [])):
+        if number in identified:
+            detection["crater_id"] = identified[number]
     if flown.exposure is not None:
         position = world.truth.positions_mcmf(flown.moment.utc_ns)[0]
         latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
@@ -500,7 +498,8 @@ def snapshot(
                 "altitude_m": altitude,
             },
             "altitude_km": altitude / 1e3,
-            "catalogue": _catalogue(world, flown, craters),
+            "terrain": {"name": world.terrain.name, "real": world.terrain.is_real},
+            "catalogue": _catalogue(world, flown),
             "image_jpeg": _jpeg(flown.exposure.image),
         }
         for estimate in estimates.values():
@@ -515,21 +514,27 @@ def snapshot(
     return message
 
 
-def _catalogue(world: World, flown: Flown, craters: CraterCatalogue | None) -> list[dict[str, float]]:
-    """Return the largest craters in the image, from the given catalogue or that of the terrain."""
+def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
+    """Return the largest craters in the image: over rendered ground, the ellipses of their rims at their heights."""
     assert flown.exposure is not None
-    craters = world.terrain.catalogue if craters is None else craters
-    index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX, craters)
-    shown = np.argsort(-diameter_px, kind="stable")[:_SHOWN_CRATERS].tolist()
-    ids = craters.ids[index]
+    if world.scenario.camera.images == "reduced":
+        # Nothing is rendered: the detections are made of the catalogue on the sphere.
+        index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX)
+        columns = {"u_px": uv[:, 0], "v_px": uv[:, 1], "diameter_px": diameter_px}
+    else:
+        camera, position = world.true_camera, world.truth.positions_mcmf(flown.exposure.utc_ns)[0]
+        altitude_m = float(spherical_from_mcmf(position)[2])
+        smallest_m = _SMALLEST_SHOWN_PX * altitude_m / camera.focal_px
+        labels = label_frame(
+            world.terrain, camera, position, flown.exposure.camera_from_mcmf, minimum_diameter_m=smallest_m
+        )
+        seen = np.flatnonzero(labels.inside & (labels.diameter_px > _SMALLEST_SHOWN_PX))
+        names = ("u_px", "v_px", "diameter_px", "major_px", "minor_px", "angle_rad")
+        index, columns = labels.index[seen], {name: getattr(labels, name)[seen] for name in names}
+    shown = np.argsort(-columns["diameter_px"], kind="stable")[:_SHOWN_CRATERS].tolist()
+    ids = world.terrain.catalogue.ids[index]
     return [
-        {
-            "id": int(ids[k]),
-            "u_px": float(uv[k, 0]),
-            "v_px": float(uv[k, 1]),
-            "diameter_px": float(diameter_px[k]),
-        }
-        for k in shown
+        {"id": int(ids[k]), **{name: float(column[k]) for name, column in columns.items()}} for k in shown
     ]
 
 

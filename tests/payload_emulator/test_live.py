@@ -16,18 +16,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lunar.camera import project_mcmf
 from lunar.datafolder import DataFolder, find_data
+from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.campaign import Case, fly_case, load_campaign, table
 from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
 from payload_emulator.session.flying import Flown, Moment, Operator
-from payload_emulator.session.live import Flight, LivePayload, TelecommandBuffer
+from payload_emulator.session.live import Flight, LivePayload, TelecommandBuffer, snapshot
 from payload_emulator.session.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import World, build_world
+from payload_emulator.session.world import Exposure, World, build_world
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.uplink import UplinkEncoder
@@ -113,6 +115,51 @@ def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, W
 
 def ping(count: int) -> bytes:
     return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
+
+
+def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> Flown:
+    """A moment with a nadir image that is not rendered."""
+    position = world.truth.positions_mcmf(utc_ns)[0]
+    exposure = Exposure(utc_ns, np.zeros((0, 0), np.uint8), np.zeros(9), 0, world.camera_from_mcmf(position))
+    return Flown(Moment(utc_ns, 0, 1.0, True, 0), exposure, b"", packets, b"")
+
+
+def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground(
+    flown: tuple[World, LoadedPayload],
+) -> None:
+    world = build_world(parse_scenario(SCENARIO.replace('"reduced"', '"rendered"')), NO_DATA)
+    utc_ns = int(world.frame_utc_ns[0])
+    message = snapshot(world, new_spacecraft(world, flown[1]), seen_from(world, utc_ns, []), False, 1.0)
+    rings = message["catalogue"]
+    row = {int(one): k for k, one in enumerate(world.terrain.catalogue.ids)}
+    craters = world.terrain.measured(np.array([row[one["id"]] for one in rings]))
+    position = world.truth.positions_mcmf(utc_ns)[0]
+    axes = (world.true_camera, world.camera_from_mcmf(position), position)
+    rims = project_mcmf(*axes, craters.position_mcmf_m)
+    sphere = project_mcmf(*axes, mcmf_from_spherical(craters.latitude_rad, craters.longitude_rad, 0.0))
+    shown = np.array([[one["u_px"], one["v_px"]] for one in rings])
+    assert len(rings) > 20
+    assert np.median(np.linalg.norm(shown - rims, axis=1)) < 0.2  # px; what is left is the tilt of rims
+    assert np.linalg.norm(shown - sphere, axis=1).max() > 5.0  # px: heights matter
+    assert all(one["minor_px"] <= one["diameter_px"] <= one["major_px"] for one in rings)
+
+
+def test_detections_that_the_payload_identified_have_their_craters(
+    flown: tuple[World, LoadedPayload],
+) -> None:
+    world, loaded = flown
+    frame = {"frame_number": 0, "image_ticks": 0}
+    found = {"u_px": 1.0, "v_px": 2.0, "diameter_px": 9.0, "score": 0.5, "size_class": 0, "sigma_px": 0.5}
+    pairs = {**frame, "items": [{"detection": 1, "crater_id": 4711}]}
+    detections = {**frame, "image_quality": 0, "items": [found, found, found]}
+    packets = [
+        DICTIONARY.pack(name, values, ticks=0, sequence_count=0)
+        for name, values in (("identifications", pairs), ("detections", detections))
+    ]
+    moment = seen_from(world, int(world.frame_utc_ns[0]), packets)
+    message = snapshot(world, new_spacecraft(world, loaded), moment, False, 1.0)
+    assert [one.get("crater_id") for one in message["detections"]] == [None, 4711, None]
+    assert message["terrain"] == {"name": world.terrain.name, "real": False}
 
 
 def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayload, Watcher]) -> None:

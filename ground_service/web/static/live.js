@@ -87,19 +87,21 @@ function refresh() {
   plots[1]?.setData([history.times, history.altitude]);
 }
 
-// A detection counts as matched here where a catalogued crater lies within half its radius.
+// A detection is matched if the payload reported the crater that it took it for.
 function rings({ catalogue = [], detections = [] }) {
   const circles = (ones, css, dash) => {
     context.beginPath();
     context.setLineDash(dash);
     context.strokeStyle = css;
     for (const one of ones) {
-      context.moveTo(one.u_px + 0.5 + one.diameter_px / 2, one.v_px + 0.5);
-      context.arc(one.u_px + 0.5, one.v_px + 0.5, one.diameter_px / 2, 0, 2 * Math.PI);
+      const [u, v, angle] = [one.u_px + 0.5, one.v_px + 0.5, one.angle_rad ?? 0];
+      const [major, minor] = [(one.major_px ?? one.diameter_px) / 2, (one.minor_px ?? one.diameter_px) / 2];
+      context.moveTo(u + major * Math.cos(angle), v + major * Math.sin(angle));
+      context.ellipse(u, v, major, minor, angle, 0, 2 * Math.PI);
     }
     context.stroke();
   };
-  const matched = (one) => catalogue.some((other) => Math.hypot(other.u_px - one.u_px, other.v_px - one.v_px) < other.diameter_px / 4);
+  const matched = (one) => one.crater_id !== undefined;
   context.lineWidth = 1.5;
   circles(catalogue, "#ffd400", [3, 3]);
   circles(detections.filter((one) => !matched(one)), "#00e5ff", []);
@@ -125,7 +127,7 @@ function numbers(message) {
     fact("Frame", figure(message.frame)),
     fact("Mode", message.mode),
     fact("Altitude", `${figure(message.altitude_km, 4)} km`),
-    fact("Detections", figure((message.detections ?? []).length)),
+    fact("Detections", `${figure((message.detections ?? []).length)}, ${figure((message.detections ?? []).filter((one) => one.crater_id !== undefined).length)} matched`),
     estimates.map(([name, one]) => fact(name, `${one.outcome ?? "–"}${one.error_m === undefined ? "" : `, ${figure(one.error_m)} m off`}`)),
     fact("Shown", `${byId("frame").dataset.rate ?? "–"} frames/s`),
   );
@@ -143,7 +145,7 @@ function remember(message) {
   history.times.push(time);
   history.altitude.push(message.altitude_km);
   const names = Object.keys(estimates);
-  if (names.join() !== history.names.join()) begin(names, reference);
+  if (names.join() !== history.names.join()) begin(names, reference, message.terrain);
   for (const name of history.names) (history.errors[name] ??= []).push(estimates[name]?.error_m || null);
   if (history.times.length > KEPT) {
     for (const column of [history.times, history.altitude, ...Object.values(history.errors)]) column.shift();
@@ -158,11 +160,12 @@ function remember(message) {
 }
 
 // Map, legend and charts, once it is known which estimators fly.
-function begin(names, reference) {
+function begin(names, reference, terrain) {
   history.names = names;
   for (const name of names) history.errors[name] = history.times.slice(1).map(() => null);
   map?.remove();
-  map = moonMap(byId("map"));
+  map = moonMap(byId("map"), { albedo: terrain?.real === true });
+  byId("terrain").textContent = terrain ? `Terrain: ${terrain.name}.` : "Terrain: not stated by the payload.";
   lines = {};
   paths = {};
   dots = {};
@@ -171,7 +174,7 @@ function begin(names, reference) {
     const css = name === "reference" ? "#ffffff" : solutionStyle(name, "estimate", index).colour;
     const first = [[reference.latitude_deg], [((((reference.longitude_deg + 180) % 360) + 360) % 360) - 180]];
     paths[name] = [[first.flat()]];
-    lines[name] = track(map, ...first, { color: css, weight: name === "reference" ? 5 : 2 });
+    lines[name] = track(map, ...first, { color: css, weight: name === "reference" ? 2 + 3 * names.length : 2 + 3 * (names.length - index), lineCap: "butt" });
     dots[name] = dot(map, ...first.flat(), { color: css });
     byId("map-legend").append(legendItem(name, css));
   }
