@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from ground_service.commanding.core import STAGES, CommandFate
+from ground_service.commanding.core import DUPLICATE, STAGES, CommandFate
 from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
 from ground_service.http.times import UtcTime
 from ground_service.text import LINE_PATTERN_JSON
@@ -68,6 +68,7 @@ class Telecommand(Entity):
     window_id: int | None = Field(description="The planned window that it belongs to")
     carrier_id: int | None = Field(description="The telecommand that carries it into the on-board schedule")
     reports: list[CommandReport]
+    remark: str = Field(description="Why it failed, was rejected or timed out; empty: it did not")
 
 
 class CommandRecord(Entity):
@@ -125,6 +126,21 @@ class CommandView:
         return self.record.state if self.fate is None else self.fate.state
 
     @property
+    def remark(self) -> str:
+        """Why the telecommand failed, was rejected or timed out."""
+        if self.fate is None:
+            return self.record.reason or ""
+        stages = [STAGES.get(report.subtype, str(report.subtype)) for report in self.fate.reports]
+        if self.fate.timed_out:
+            return f"no report of completion in time, last report: {stages[-1] if stages else 'none'}"
+        failed = (
+            f"{stage}: {_FAILURES.get(report.failure_code or 0, str(report.failure_code)).replace('_', ' ')}"
+            for stage, report in zip(stages, self.fate.reports, strict=True)
+            if report.failure_code not in (None, DUPLICATE)
+        )
+        return next(failed, "") if self.fate.state == "failed" else ""
+
+    @property
     def telecommand(self) -> Telecommand:
         """The telecommand as an entity."""
         return Telecommand.of(
@@ -134,6 +150,7 @@ class CommandView:
             state=self.state,
             timed_out=self.fate is not None and self.fate.timed_out,
             requested=self.record.created_utc_ns,
+            remark=self.remark,
             reports=[
                 CommandReport(
                     stage=STAGES.get(report.subtype, str(report.subtype)),

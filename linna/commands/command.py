@@ -30,7 +30,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     listing = actions.add_parser("list", help="list telecommands and their states, newest first")
     listing.add_argument("--limit", type=int, default=50)
     listing.set_defaults(handler=list_all)
-    showing = actions.add_parser("show", help="show a telecommand and the number of its verification reports")
+    showing = actions.add_parser(
+        "show", help="show a telecommand, its verification, and why it failed"
+    )
     showing.set_defaults(handler=show)
     releasing = actions.add_parser("release", help="release a queued telecommand")
     releasing.set_defaults(handler=release)
@@ -166,13 +168,24 @@ def _connection(address: str) -> Any:
 
 
 def _show(arguments: argparse.Namespace, telecommand: Telecommand) -> int:
-    text = f"telecommand {telecommand.id} ({telecommand.name}): {telecommand.state}"
+    remark = f", {telecommand.remark}" if telecommand.remark else ""
+    text = f"telecommand {telecommand.id} ({telecommand.name}): {telecommand.state}{remark}"
     emit(arguments, _figures(telecommand), text=text)
     return 0
 
 
 def _figures(telecommand: Telecommand) -> dict[str, Any]:
-    kept = {"id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by"}
+    kept = {
+        "id",
+        "name",
+        "arguments",
+        "state",
+        "critical",
+        "timed_out",
+        "requested_by",
+        "decided_by",
+        "remark",
+    }
     return {**telecommand.model_dump(mode="json", include=kept), "reports": len(telecommand.reports)}
 
 

@@ -151,7 +151,7 @@ def test_every_command_says_the_same_here_and_on_a_server(
         ask("command", "enter", "test_connection", "--spacecraft-id", 76)
         ask("command", "enter", "dance", "--spacecraft-id", 76, status=2)
         ask("command", "reject", 6, "--reason", "not now")
-        ask("command", "show", 6)
+        assert ask("command", "show", 6)["remark"] == "not now"
         ask("command", "list")
         ask("pass", "list")
         ask("report", 99, "--out", tmp_path / "r", status=2)

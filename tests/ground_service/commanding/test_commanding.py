@@ -199,6 +199,7 @@ def test_a_failure_says_why(ground: Ground, tmp_path: Path) -> None:
     assert view.state == "failed"
     assert view.fate is not None
     assert view.fate.reports[0].failure_code == 5
+    assert view.telecommand.remark == "not accepted: wrong mode"
 
 
 REQUEST = 0x18A0C000
