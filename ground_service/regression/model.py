@@ -13,6 +13,10 @@ OK = "ok"
 """Outcome of a successful replay."""
 
 
+REASONS_LIMIT = 5
+"""Reasons in a list; the verdict has all."""
+
+
 class Build(Entity):
     """A registered payload build."""
 
@@ -168,6 +172,16 @@ class JudgedGate(Entity):
     reason: str | None
     waived: str | None
 
+    @property
+    def text(self) -> str:
+        """The gate with its figures, or the reason of its outcome."""
+        place = "" if self.pass_name is None else f" on {self.pass_name}"
+        if self.outcome == "inconclusive" or self.baseline is None or self.candidate is None:
+            return f"{self.name}{place}: {self.reason or self.outcome}"
+        unit = f" {self.unit}" if self.unit else ""
+        limit = "" if self.limit is None else f", limit {self.limit:.4g}{unit}"
+        return f"{self.name}{place}: {self.baseline:.4g} to {self.candidate:.4g}{unit}{limit}"
+
 
 class JudgedReplay(Entity):
     """Replay of a pass by one build; its costs are null if its telemetry was not read."""
@@ -223,6 +237,21 @@ class Regression(Entity):
     created: UtcTime
     result: Verdict
 
+    def reasons(self) -> list[str]:
+        """Return why the verdict is not pass: failed and open gates, passes without a comparison."""
+        if self.verdict == "pass":
+            return []
+        gates = [one for one in self.result.gates if one.outcome != "pass" and not one.waived]
+        gates.sort(key=lambda one: one.outcome != "fail")
+        return [
+            *(one.text for one in gates),
+            *(
+                f"{one.name}: {one.detail or one.state}"
+                for one in self.result.passes
+                if one.state != "judged"
+            ),
+        ][:REASONS_LIMIT]
+
     def summary(self) -> RegressionSummary:
         """Return the regression as lists show it."""
         counted = [gate.outcome for gate in self.result.gates if not gate.waived]
@@ -230,7 +259,10 @@ class Regression(Entity):
             id=self.id,
             verdict=self.verdict,
             candidate=self.result.candidate.digest,
+            candidate_title=self.result.candidate.title,
             baseline=self.result.baseline.digest,
+            baseline_title=self.result.baseline.title,
+            reasons=self.reasons(),
             gates=len(self.result.gates),
             gates_failed=counted.count("fail"),
             gates_inconclusive=counted.count("inconclusive"),
@@ -246,7 +278,10 @@ class RegressionSummary(Entity):
     id: str
     verdict: str = Field(description="pass, fail or inconclusive", examples=["pass"])
     candidate: str = Field(description="Identity of the candidate build")
+    candidate_title: str = Field(description="Name, version and beginning of the identity")
     baseline: str = Field(description="Identity of the baseline build")
+    baseline_title: str
+    reasons: list[str] = Field(description="Why the verdict is not pass, the most important first")
     gates: int = Field(description="Number of gates")
     gates_failed: int
     gates_inconclusive: int

@@ -1,8 +1,9 @@
+import { keep, restore, state, stated } from "./address.js";
 import { finished, get, request, send } from "./api.js";
 import { acting, byId, element, figure, notice, show, stateMark, table, timeText, trouble, watch } from "./page.js";
 
 const LATEST = 12;
-let open = null;
+let open = stated("gates");
 
 const buildName = (build) => `${build.name} ${build.version} (${build.digest.slice(0, 8)})`;
 
@@ -50,15 +51,21 @@ async function regressionRows() {
   return { rows: rows.sort((a, b) => b.created.localeCompare(a.created)), total: verdicts.total };
 }
 
+// How many gates failed, and why the verdict is not pass.
 function outcomeOf({ job, verdict }) {
-  if (verdict && !verdict.gates) return "no gate was judged: see the report for the reason";
-  if (verdict) {
-    const open = verdict.gates_inconclusive ? `, ${figure(verdict.gates_inconclusive)} inconclusive` : "";
-    const needed = verdict.frames_needed == null ? "" : `: ${figure(verdict.frames_needed)} frames needed, ${figure(verdict.frames)} compared`;
-    return `${figure(verdict.gates_failed)} of ${figure(verdict.gates)} gates failed${open}${needed}`;
-  }
-  return job.state === "running" ? element("progress", { max: 1, value: job.progress, "aria-label": "regression" }) : (job.error ?? "");
+  if (!verdict) return job.state === "running" ? element("progress", { max: 1, value: job.progress, "aria-label": "regression" }) : (job.error ?? "");
+  const counts = `${figure(verdict.gates_failed)} of ${figure(verdict.gates)} gates failed${verdict.gates_inconclusive ? `, ${figure(verdict.gates_inconclusive)} inconclusive` : ""}`;
+  const needed = verdict.frames_needed == null ? null : `${figure(verdict.frames_needed)} frames needed, ${figure(verdict.frames)} compared`;
+  const reasons = [...(needed ? [needed] : []), ...verdict.reasons];
+  return [
+    element("span", {}, verdict.gates ? counts : "No gate was judged."),
+    reasons.length ? element("ul", { class: "reasons" }, reasons.map((one) => element("li", {}, one.replaceAll("_", " ")))) : null,
+  ].filter(Boolean);
 }
+
+// Jobs have identities only; the list of builds has their names.
+let builds = [];
+const titleOf = (row, role) => row[`${role}_title`] ?? builds.filter((one) => one.digest === row[role]).map(buildName)[0] ?? String(row[role] ?? "").slice(0, 12);
 
 async function loadRegressions() {
   const { rows, total } = await regressionRows();
@@ -68,8 +75,8 @@ async function loadRegressions() {
       "Regressions",
       [
         ["Entered", (row) => timeText(row.created)],
-        ["Candidate", (row) => String(row.candidate ?? "").slice(0, 12)],
-        ["Baseline", (row) => String(row.baseline ?? "").slice(0, 12)],
+        ["Candidate", (row) => titleOf(row, "candidate")],
+        ["Baseline", (row) => titleOf(row, "baseline")],
         ["Verdict", (row) => (row.verdict ? verdictMark(row.verdict.verdict) : stateMark(row.job.state))],
         ["Outcome", outcomeOf],
         ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates"), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report")) : "")],
@@ -87,23 +94,31 @@ async function loadRegressions() {
 
 function toggle(id) {
   open = open === id ? null : id;
+  state({ gates: open });
   loadRegressions().catch(trouble);
 }
 
+const archiveChoice = (archive) => {
+  const pass = archive.pass_id === null ? null : [", ", element("a", { href: `/passes/${archive.pass_id}` }, `pass ${archive.pass_id}`)];
+  return element("label", {}, element("input", { type: "checkbox", name: "archive", value: archive.digest, checked: true }), element("span", {}, `${archive.name}, ${archive.frames} frames`, pass));
+};
+
+// A pass is replayed from its archive: one without a kept archive is listed with what to do.
+const passWithout = (pass) =>
+  element("label", {}, element("input", { type: "checkbox", disabled: true }), element("span", {}, element("a", { href: `/passes/${pass.id}` }, `pass ${pass.id}, ${pass.name}`), ": no archive with its images is kept; upload it below"));
+
 async function load() {
-  const [builds, archives] = await Promise.all([get("builds", { limit: 200 }), get("regression-archives")]);
+  const [found, archives, passes] = await Promise.all([get("builds", { limit: 200 }), get("regression-archives"), get("passes", { limit: 200 })]);
+  builds = found.items;
   const chosen = { candidate: byId("candidate").value, baseline: byId("baseline").value };
-  const options = () => [element("option", { value: "current" }, "the build on this machine"), ...builds.items.map((build) => element("option", { value: build.digest }, buildName(build)))];
   for (const name of ["candidate", "baseline"]) {
-    show(name, options());
-    if (chosen[name]) byId(name).value = chosen[name];
+    show(name, element("option", { value: "current" }, "current, the installed flight code"), builds.map((one) => element("option", { value: one.digest }, buildName(one))));
+    byId(name).value = chosen[name] || "current";
+    restore(name);
   }
-  show(
-    "archives",
-    archives.length
-      ? archives.map((archive) => element("label", {}, element("input", { type: "checkbox", name: "archive", value: archive.digest, checked: true }), `${archive.name}, ${archive.frames} frames`))
-      : element("p", { class: "hint" }, "None kept: bring a zipped pass archive below."),
-  );
+  const kept = new Set(archives.map((one) => one.pass_id));
+  const without = passes.items.filter((one) => !kept.has(one.id));
+  show("archives", archives.map(archiveChoice), without.map(passWithout), archives.length + without.length ? null : element("p", { class: "hint" }, "None: upload a zipped pass archive below."));
   show(
     "builds",
     table(
@@ -114,7 +129,7 @@ async function load() {
         ["What it is", (row) => row.description],
         ["Registered", (row) => `${timeText(row.registered)} by ${row.registered_by}`],
       ],
-      builds.items,
+      builds,
       "No build registered.",
     ),
   );
@@ -131,7 +146,7 @@ byId("run").addEventListener(
     await loadRegressions();
     await finished(job.id);
     await loadRegressions();
-    notice("The verdict is here.");
+    notice("The regression is complete.");
   }),
 );
 byId("bring").addEventListener(
@@ -151,4 +166,5 @@ watch((message) => {
   clearTimeout(pending);
   pending = setTimeout(() => loadRegressions().catch(trouble), 400);
 });
+for (const name of ["candidate", "baseline"]) byId(name).addEventListener("change", () => keep(name));
 load().catch((error) => error.status === 401 || trouble(error));
