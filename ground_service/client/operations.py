@@ -25,6 +25,7 @@ from ground_service.links.model import Contacts, LinkStatus
 from ground_service.missions.model import HeldCatalogue, MissionDetail, MissionRevision
 from ground_service.passes.model import (
     Completeness,
+    Crater,
     Detection,
     Event,
     ExportFormat,
@@ -33,6 +34,7 @@ from ground_service.passes.model import (
     PassDetail,
     PassParameters,
     PassSummary,
+    SpacecraftEvent,
     SpacecraftInstance,
     States,
     Trend,
@@ -164,9 +166,35 @@ class Client(Connection):
         """List the detections of a pass in time order."""
         return self._list(Detection, f"/passes/{pass_id}/detections")
 
+    def list_craters(self, pass_id: int) -> Listing[Crater]:
+        """List the craters of the catalogue of a pass, the largest first."""
+        return self._list(Crater, f"/passes/{pass_id}/craters")
+
     def list_events(self, pass_id: int) -> Listing[Event]:
         """List the event reports of a pass in time order."""
         return self._list(Event, f"/passes/{pass_id}/events")
+
+    def list_spacecraft_events(
+        self,
+        spacecraft_id: int,
+        *,
+        instance: str = "flight",
+        severities: Sequence[str] = (),
+        name: str | None = None,
+        start: str | None = None,
+        stop: str | None = None,
+    ) -> Listing[SpacecraftEvent]:
+        """List the event reports of all passes of a spacecraft, newest first; no severities: any."""
+        return self._list(
+            SpacecraftEvent,
+            "/events",
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            severity=list(severities) or None,
+            name=name,
+            start=start,
+            stop=stop,
+        )
 
     def get_states(
         self, pass_id: int, *, estimator: str = "paper", values: Sequence[str] = (), max_points: int = 1000

@@ -143,6 +143,15 @@ class Detection(Entity):
     correlation_id: CorrelationId
 
 
+class Crater(Entity):
+    """A crater of the catalogue of a pass."""
+
+    id: int
+    latitude_deg: float
+    longitude_deg: float = Field(description="East, -180 to 180")
+    diameter_m: float
+
+
 class Bucket(Entity):
     """An interval of a series: minimum, maximum and mean of its samples."""
 
@@ -190,6 +199,12 @@ class Image(Entity):
     source: Literal["thumbnail", "archive"]
     pass_id: int | None = Field(description="Pass of the archive; null for a thumbnail")
     address: str = Field(description="Address of the image as PNG", examples=["/api/v1/passes/1/images/12"])
+
+
+class SpacecraftEvent(Event):
+    """An event report of a spacecraft, and the pass that it belongs to."""
+
+    pass_id: int | None = Field(description="null: in no pass")
 
 
 class Trend(Entity):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import Path, Query, Response
 from fastapi.responses import JSONResponse
@@ -32,6 +32,7 @@ from ground_service.passes import images, parameters, service
 from ground_service.passes import live as newest
 from ground_service.passes.model import (
     Completeness,
+    Crater,
     Detection,
     Event,
     ExportFormat,
@@ -43,6 +44,7 @@ from ground_service.passes.model import (
     PassDetail,
     PassParameters,
     PassSummary,
+    SpacecraftEvent,
     SpacecraftInstance,
     States,
     Trend,
@@ -57,6 +59,7 @@ EXPORT_MEDIA: dict[ExportFormat, str] = {
 }
 UPLOAD_PATHS = (f"{API_PREFIX}/archives",)
 
+EventSeverity = Literal["info", "low", "medium", "high"]
 MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="Most intervals of a series")]
 Parameter = Annotated[str, Path(max_length=200, examples=["temperature_c"])]
 
@@ -176,6 +179,42 @@ def get_states(
 def list_events(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Event]:
     """List the event reports of a pass, in time order."""
     items, total = service.list_events(ground, pass_id, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
+
+
+@passes.get("/passes/{pass_id}/craters")
+def list_craters(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Crater]:
+    """List the craters of the catalogue of a pass, the largest first."""
+    items, total = service.craters(ground, pass_id, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
+
+
+@passes.get("/events", responses=problems(404))
+def list_spacecraft_events(
+    ground: GroundOf,
+    _: Viewer,
+    paging: PagingOf,
+    spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
+    instance: Instance = FLOWN,
+    severity: Annotated[list[EventSeverity] | None, Query(description="Default: any severity")] = None,
+    name: Annotated[
+        str | None, Query(min_length=1, max_length=100, description="Part of the name of the event")
+    ] = None,
+    start: GivenTime | None = None,
+    stop: GivenTime | None = None,
+) -> PageOf[SpacecraftEvent]:
+    """List the event reports of all passes of a spacecraft, newest first."""
+    items, total = service.spacecraft_events(
+        ground,
+        spacecraft_id,
+        instance,
+        severities=severity or [],
+        name=name,
+        start_utc_ns=None if start is None else start.utc_ns,
+        stop_utc_ns=None if stop is None else stop.utc_ns,
+        limit=paging.limit,
+        offset=paging.offset,
+    )
     return paging.page(items, total)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,11 +21,13 @@ from ground_service.missions import store as missions
 from ground_service.passes import store
 from ground_service.passes.cache import remembered
 from ground_service.passes.model import (
+    Crater,
     Detection,
     Event,
     PassDetail,
     PassRecord,
     PassSummary,
+    SpacecraftEvent,
     Trend,
 )
 from ground_service.passes.packet_accounting import packet_accounting
@@ -36,7 +40,13 @@ from ground_service.passes.series import (
     SeriesReading,
     series_document,
 )
-from ground_service.passes.span import LAST_TICKS, PassSpan, pass_span, vehicle_span
+from ground_service.passes.span import (
+    LAST_TICKS,
+    PASS_MARGIN_NS,
+    PassSpan,
+    pass_span,
+    vehicle_span,
+)
 from ground_service.passes.store import detection_frames, detection_samples, event_list
 from ground_service.passes.trends import trend_of
 from ground_service.store import rollups
@@ -45,6 +55,7 @@ from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.store import load_correlations
+from lunar.catalogue import CraterCatalogue, load_catalogue
 from reports.values import PacketAccounting, PassEvent
 from tmtc.dictionary import DICTIONARY
 
@@ -151,6 +162,50 @@ def list_events(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tup
     return [Event.of(asdict(one), time=one.utc_ns) for one in found[offset : offset + limit]], len(found)
 
 
+def spacecraft_events(
+    ground: Ground,
+    spacecraft_id: int,
+    instance: str,
+    *,
+    severities: Sequence[str] = (),
+    name: str | None = None,
+    start_utc_ns: int | None = None,
+    stop_utc_ns: int | None = None,
+    limit: int,
+    offset: int,
+) -> tuple[list[SpacecraftEvent], int]:
+    """Return a page of the event reports of a spacecraft that match, newest first, and their number.
+
+    Raises
+    ------
+    NotFound
+        There is no such spacecraft.
+    """
+    with ground.database.reading() as connection:
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns)
+        found, total = store.event_page(
+            connection, span, severities=severities, name=name, limit=limit, offset=offset
+        )
+        passes = store.passes_of_vehicle(connection, vehicle, reported=False)
+    return [
+        SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=_pass_at(passes, one.utc_ns))
+        for one in found
+    ], total
+
+
+def _pass_at(passes: Sequence[PassRecord], utc_ns: int) -> int | None:
+    """Return the newest of the passes that a time belongs to."""
+    return next(
+        (
+            one.id
+            for one in reversed(passes)
+            if one.start_utc_ns - PASS_MARGIN_NS <= utc_ns <= one.stop_utc_ns + PASS_MARGIN_NS
+        ),
+        None,
+    )
+
+
 def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:
     """Return a page of the detections of a pass, in time order, and the total number."""
     with ground.database.reading() as connection:
@@ -180,6 +235,35 @@ def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tupl
         )
         for row, frame in zip(rows.tolist(), frames.tolist(), strict=True)
     ], total
+
+
+def craters(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Crater], int]:
+    """Return a page of the catalogue of a pass, the largest craters first, and their number; 0 without a catalogue.
+
+    An imported pass has the craters of the terrain near its ground track.
+    """
+    with ground.database.reading() as connection:
+        sha256 = store.get_pass(connection, pass_id).catalogue_sha256
+    if sha256 is None:
+        return [], 0
+    catalogue = _loaded_catalogue(ground.files.path(sha256))
+    chosen = np.lexsort((catalogue.ids, -catalogue.diameter_m))[offset : offset + limit]
+    east = (np.degrees(catalogue.longitude_rad[chosen]) + 180.0) % 360.0 - 180.0
+    columns = (
+        catalogue.ids[chosen],
+        np.degrees(catalogue.latitude_rad[chosen]),
+        east,
+        catalogue.diameter_m[chosen],
+    )
+    names = ("id", "latitude_deg", "longitude_deg", "diameter_m")
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return [Crater(**dict(zip(names, row, strict=True))) for row in rows], len(catalogue)
+
+
+@lru_cache(maxsize=4)
+def _loaded_catalogue(path: Path) -> CraterCatalogue:
+    """Return a catalogue of the archive, whose files are named by their content."""
+    return load_catalogue(path)
 
 
 def state_series(

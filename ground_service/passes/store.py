@@ -297,28 +297,70 @@ def code_labels(labels: Mapping[int, str], codes: NDArray[Any]) -> tuple[str, ..
     return tuple(labels.get(int(code), str(int(code))) for code in codes)
 
 
+_EVENT_COLUMNS = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
+
+
 def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     """Event reports of a pass, in time order."""
-    names = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
-    rows = samples(connection, span, "events", names)
+    rows = samples(connection, span, "events", _EVENT_COLUMNS)
+    events = _pass_events(list(zip(*rows.values(), strict=True)), span)
+    return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
+
+
+def event_page(
+    connection: Connection,
+    span: PassSpan,
+    *,
+    severities: Sequence[str],
+    name: str | None,
+    limit: int,
+    offset: int,
+) -> tuple[list[PassEvent], int]:
+    """Return a page of the event reports of a span that match, newest first, and their number.
+
+    No severities: all. `name` is a part of the name of the event.
+    """
+    table = repository.SAMPLES["events"]
+    where = [
+        table.c.vehicle_id == span.vehicle,
+        table.c.dictionary_version == span.dictionary_version,
+        table.c.ticks.between(span.start_ticks, span.stop_ticks),
+    ]
+    if severities:
+        where.append(table.c.severity.in_([code for code, one in _SEVERITIES.items() if one in severities]))
+    if name is not None:
+        part = name.strip().lower().replace(" ", "_")
+        labels = DICTIONARY.labels("event_info", "event_id")
+        where.append(table.c.event_id.in_([code for code, label in labels.items() if part in label]))
+    total = connection.execute(select(func.count()).select_from(table).where(*where)).scalar_one()
+    query = (
+        select(*(table.c[column] for column in _EVENT_COLUMNS))
+        .where(*where)
+        .order_by(table.c.ticks.desc(), table.c.packet_id.desc())
+        .limit(limit)
+        .offset(offset)
+    )
+    return _pass_events([tuple(row) for row in connection.execute(query)], span), int(total)
+
+
+def _pass_events(rows: Sequence[tuple[Any, ...]], span: PassSpan) -> list[PassEvent]:
+    """Return event reports of rows of `_EVENT_COLUMNS`."""
     labels = DICTIONARY.labels("event_info", "event_id")
-    utc_ns, correlation_ids = utc_ns_of_ticks(np.array(rows["ticks"], dtype=np.int64), span.correlations)
-    events = [
+    utc_ns, correlation_ids = utc_ns_of_ticks(
+        np.array([row[0] for row in rows], dtype=np.int64), span.correlations
+    )
+    return [
         PassEvent(
             utc_ns=int(utc),
-            severity=_SEVERITIES.get(rows["severity"][i], str(rows["severity"][i])),
-            name=labels.get(rows["event_id"][i], str(rows["event_id"][i])),
-            detail=_event_detail(
-                labels.get(rows["event_id"][i], ""),
-                rows["frame_number"][i],
-                rows["value_1"][i],
-                rows["value_2"][i],
-            ),
-            correlation_id=int(correlation_ids[i]),
+            severity=_SEVERITIES.get(severity, str(severity)),
+            name=labels.get(event_id, str(event_id)),
+            detail=_event_detail(labels.get(event_id, ""), *values),
+            correlation_id=int(correlation),
         )
-        for i, utc in enumerate(utc_ns)
+        for (_, severity, event_id, *values), utc, correlation in zip(
+            rows, utc_ns, correlation_ids, strict=True
+        )
     ]
-    return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
 
 
 def _event_detail(name: str, frame_number: int, *values: float | None) -> str:

@@ -302,6 +302,8 @@ MATRIX = [
     ("GET", "/passes/1/events", "viewer"),
     ("GET", "/passes/1/telemetry/power_w", "viewer"),
     ("GET", "/passes/1/parameters", "viewer"),
+    ("GET", "/passes/1/craters", "viewer"),
+    ("GET", "/events", "viewer"),
     ("GET", "/passes/1/reports", "viewer"),
     ("GET", "/passes/1/packets/housekeeping", "viewer"),
     ("POST", "/passes/1/reports", "operator"),
