@@ -91,6 +91,7 @@ class Session(Entity):
     role: Role
     expires: UtcTime | None = Field(description="null: unlimited")
     browser: bool = Field(description="Whether the request used the cookie of a browser session")
+    time: UtcTime = Field(description="Mission time of the service: its clock, unless a simulation sets it")
 
 
 class NewSession(Given):

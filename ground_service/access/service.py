@@ -18,7 +18,7 @@ from sqlalchemy import Connection
 
 from ground_service.access import store
 from ground_service.access.model import DAYS_LIMIT, Role, Session, Token, TokenRecord, User, UserRecord
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, StoreError
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -284,7 +284,14 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
         audit(
             connection, caller.name, "start session", caller.name, {"token_id": key, "parent_id": parent.id}
         )
-    return secret, Session(name=caller.name, role=user.role, expires=UtcTime(expires), browser=True)
+    started = Session(
+        name=caller.name,
+        role=user.role,
+        expires=UtcTime(expires),
+        browser=True,
+        time=UtcTime(mission_now_ns()),
+    )
+    return secret, started
 
 
 def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
@@ -294,7 +301,13 @@ def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
         with ground.database.reading() as connection:
             expires = store.get_token(connection, caller.token_id).expires_utc_ns
     until = None if expires is None else UtcTime(expires)
-    return Session(name=caller.name, role=caller.role, expires=until, browser=browser)
+    return Session(
+        name=caller.name,
+        role=caller.role,
+        expires=until,
+        browser=browser,
+        time=UtcTime(mission_now_ns()),
+    )
 
 
 def end_session(ground: Ground, caller: Caller) -> None:

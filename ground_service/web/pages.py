@@ -49,7 +49,8 @@ _MEDIA = {
 class Page:
     """A page: its address, its template and script, its name in the navigation ('' for none).
 
-    `section` is the page whose name the navigation marks as current; "" for its own.
+    `section` is the page whose name the navigation marks as current; "" for its own. `needs` is the lowest role that
+    can use the page; "" for every role.
     """
 
     path: str
@@ -57,6 +58,7 @@ class Page:
     title: str
     entry: str
     section: str = ""
+    needs: str = ""
 
 
 DISPLAYS = Page("/mct", "mct", "Telemetry displays", "Displays")
@@ -69,6 +71,7 @@ PAGES = (
     Page("/passes/{pass_id}", "pass", "Pass", "", "passes"),
     Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
     DISPLAYS,
+    Page("/events", "events", "Events", "Events"),
     Page("/alarms", "alarms", "Alarms", "Alarms"),
     Page("/commands", "commands", "Commands", "Commands"),
     Page("/regression", "regression", "Regression", "Regression"),
@@ -76,7 +79,7 @@ PAGES = (
     Page("/missions", "missions", "Missions", "Missions"),
     Page("/missions/{revision}", "mission", "Mission", "", "missions"),
     Page("/automation", "automation", "Automation", "Automation"),
-    Page("/audit", "audit", "Audit log", "Audit"),
+    Page("/audit", "audit", "Audit log", "Audit", needs="operator"),
     Page("/status", "status", "Status of the service", ""),
     Page("/users", "users", "Users and tokens", ""),
     Page("/docs", "docs", "HTTP API", ""),

@@ -1,3 +1,4 @@
+import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
 import { acting, byId, element, figure, pager, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
 
@@ -5,22 +6,10 @@ const OPEN = ["raised", "acknowledged", "shelved"];
 const HOUR_MS = 3600e3;
 const words = (name) => name.replaceAll("_", " ");
 
-function readAddress() {
-  const given = new URLSearchParams(location.search);
-  byId("state").value = given.get("state") ?? "open";
-  byId("severity").value = given.get("severity") ?? "";
-}
-
-function writeAddress() {
-  const given = new URLSearchParams(location.search);
-  given.set("state", byId("state").value);
-  given.set("severity", byId("severity").value);
-  history.replaceState(null, "", `?${given}`);
-}
-
 async function showHistory(id) {
   const alarm = await get(`alarms/${id}`);
   byId("history-section").hidden = false;
+  state({ alarm: id });
   byId("history-title").textContent = `History of alarm ${id}: ${words(alarm.name)}`;
   show(
     "history",
@@ -81,10 +70,12 @@ const reload = pager(async (limit, offset) => {
 
 for (const name of ["state", "severity"]) {
   byId(name).addEventListener("change", acting(async () => {
-    writeAddress();
+    state({ [name]: byId(name).value || "any" });
     await reload.first();
   }));
 }
 watch((message) => message.kind === "alarm" && reload().catch(trouble));
-readAddress();
+byId("state").value = stated("state") === "any" ? "" : (stated("state") ?? "open");
+byId("severity").value = stated("severity") === "any" ? "" : (stated("severity") ?? "");
 reload().catch((error) => error.status === 401 || trouble(error));
+if (stated("alarm")) showHistory(stated("alarm")).catch((error) => error.status === 401 || trouble(error));

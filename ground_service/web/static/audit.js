@@ -1,8 +1,9 @@
+import { keep, restore, stated } from "./address.js";
 import { get } from "./api.js";
 import { acting, byId, element, pager, show, table, timeText, trouble } from "./page.js";
 
 const FIELDS = ["actor", "action", "target", "since", "until"];
-let chosen = {};
+let chosen = Object.fromEntries(FIELDS.map((name) => [name, stated(name)]).filter(([, value]) => value));
 
 function detail(entry) {
   const text = Object.entries(entry.detail)
@@ -38,7 +39,9 @@ byId("filter").addEventListener(
   "submit",
   acting(async () => {
     chosen = Object.fromEntries(FIELDS.map((name) => [name, byId(name).value.trim()]).filter(([, value]) => value));
+    keep(...FIELDS);
     await load.first();
   }),
 );
+restore(...FIELDS);
 load().catch((error) => error.status === 401 || trouble(error));

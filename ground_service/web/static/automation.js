@@ -1,4 +1,4 @@
-import { get, post } from "./api.js";
+import { get, send } from "./api.js";
 import { acting, element, pager, show, table, timeText, trouble } from "./page.js";
 
 function outcome(row) {
@@ -27,11 +27,11 @@ function conditions(when) {
 
 function decisions(row) {
   const button = (label, decision) => {
-    const made = element("button", { type: "button" }, label);
+    const made = element("button", { type: "button", "data-needs": "operator" }, label);
     made.addEventListener(
       "click",
       acting(async () => {
-        await post(`automation/actions/${row.id}/${decision}`);
+        await send("POST", `automation/actions/${row.id}/${decision}`);
         await load();
       }),
     );

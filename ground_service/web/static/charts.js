@@ -1,6 +1,7 @@
 // Series on a time axis: mean line in a band from least to greatest value, silences left open.
 /* global uPlot */
-import { element, figure } from "./page.js";
+import { state, stated } from "./address.js";
+import { element, figure, isoText } from "./page.js";
 
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const COLOURS = ["--blue", "--vermillion", "--green", "--purple", "--orange", "--sky", "--gray1"];
@@ -48,65 +49,123 @@ function clockTexts(plot, times, _, __, step) {
 
 const faint = (css) => (css.startsWith("#") && css.length === 7 ? `${css}38` : css);
 
-// series: [{label, times, mean, low?, high?}]; logarithmic axis where asked for.
-export function chart(place, title, unit, series, { logarithmic = false, group = null, height = 220 } = {}) {
-  const label = unit ? `${title}, ${unit}` : title;
-  const box = element("figure", { class: "chart", tabindex: "0", role: "group", "aria-label": `chart: ${label}` });
-  box.append(element("figcaption", {}, label));
-  place.append(box);
-  if (!series.some((one) => one.times.length)) {
-    box.append(element("p", { class: "hint" }, "No samples."));
-    return { box, plot: null };
+// Zoom: charts of a group show the same time, which is in the address.
+const groups = new Map(); // plots by group
+const zooms = new Map(); // [from, to] by group; none: each chart shows all of its time
+
+const ends = (plot) => [plot.data[0][0], plot.data[0].at(-1)];
+
+function zoomTo(group) {
+  const shown = (groups.get(group) ?? []).filter((plot) => plot.root.isConnected);
+  groups.set(group, shown);
+  for (const plot of shown) {
+    const [min, max] = zooms.get(group) ?? ends(plot);
+    if (plot.scales.x.min !== min || plot.scales.x.max !== max) plot.setScale("x", { min, max });
   }
-  const tables = series.map((one) =>
-    one.low ? [one.times, one.mean, one.low, one.high] : [one.times, one.mean],
-  );
-  const data = tables.length === 1 ? tables[0] : uPlot.join(tables, tables.map((t) => t.slice(1).map(() => 2)));
-  const lines = [{ label: "UTC", value: (_, time) => (time === null ? "–" : new Date(1000 * time).toISOString().slice(0, 19).replace("T", " ")) }];
-  const bands = [];
-  series.forEach((one, index) => {
-    const stroke = one.colour ?? colour(index);
-    lines.push({
-      label: one.label,
-      stroke,
-      width: 1.5,
-      dash: one.dash,
-      points: { show: (plot) => plot.data[0].length < 40, size: 4 },
-      value: (_, value) => (value === null || value === undefined ? "–" : value.toPrecision(6)),
-    });
-    if (!one.low) return;
-    lines.push({ label: "min", width: 0, points: { show: false }, stroke: "transparent", class: "hidden" });
-    lines.push({ label: "max", width: 0, points: { show: false }, stroke: "transparent", class: "hidden" });
-    bands.push({ series: [lines.length - 1, lines.length - 2], fill: faint(stroke) });
-  });
-  const ink = style("--muted");
-  const grid = { stroke: style("--grid"), width: 1 };
+}
+
+function joinGroup(group, plot) {
+  const [from, to] = (stated("zoom") ?? "").split("~").map((text) => Date.parse(text) / 1000);
+  if (from < to) zooms.set(group, [from, to]);
+  groups.set(group, [...(groups.get(group) ?? []), plot]);
+  zoomTo(group);
+}
+
+function zoomed(plot, group) {
+  const { min, max } = plot.scales.x;
+  const [first, last] = ends(plot);
+  const [from, to] = zooms.get(group) ?? [first, last];
+  if (min === from && max === to) return;
+  if (min <= first && max >= last) zooms.delete(group);
+  else zooms.set(group, [min, max]);
+  const zoom = zooms.get(group);
+  state({ zoom: zoom ? zoom.map(isoText).join("~") : null });
+  zoomTo(group);
+}
+
+// What a chart shows of a series: of codes, steps with their names; of numbers, a line on the axis of their unit.
+const axisOf = (one) => (one.labels ? `codes of ${one.label}` : (one.unit ?? ""));
+const STEPS = { align: 1 };
+
+function lineOf(one, stroke, scale, paths) {
+  const text = one.labels ? (value) => one.labels[value] ?? String(value) : (value) => value.toPrecision(6);
+  return {
+    label: one.label,
+    scale,
+    stroke,
+    width: 1.5,
+    dash: one.dash,
+    paths,
+    points: { show: (plot) => plot.data[0].length < 40, size: 4 },
+    value: (_, value) => (value === null || value === undefined ? "–" : text(value)),
+  };
+}
+
+function axisFor(one, scale, index, colours, logarithmic) {
+  const { ink, grid } = colours;
   // Decades only: the nine lines in each make a hatching.
   const rules = logarithmic ? { ...grid, filter: (_, splits) => splits.map((value) => (Number.isInteger(Math.log10(value)) ? value : null)) } : grid;
-  const plot = new uPlot(
-    {
-      width: box.clientWidth,
-      height,
-      padding: [null, 40, null, null], // the date under the last tick
-      tzDate: (time) => uPlot.tzDate(new Date(1000 * time), "Etc/UTC"),
-      // What is nearer than a metre is drawn at the edge: zeros at a reset would rule the axis.
-      scales: { y: logarithmic ? { distr: 3, range: (_, low, high) => [Math.max(1, 10 ** Math.floor(Math.log10(Math.max(low, 1)))), 10 ** Math.ceil(Math.log10(Math.max(high, 10)))] } : {} },
-      axes: [
-        { stroke: ink, grid, ticks: grid, values: clockTexts, space: 80 },
-        { stroke: ink, grid: rules, ticks: rules, size: 86, values: (_, values) => values.map((value) => (value === null ? null : figure(value, 6))) },
-      ],
-      series: lines,
-      bands,
-      cursor: group ? { sync: { key: group, setSeries: false } } : {},
-      legend: { live: true },
-    },
-    data,
-    box,
-  );
-  const first = data[0][0];
-  const last = data[0][data[0].length - 1];
+  const axis = { scale, side: index ? 1 : 3, stroke: ink, grid: index ? { show: false } : rules, ticks: rules, size: 86 };
+  if (!one.labels) return { ...axis, values: (_, values) => values.map((value) => (value === null ? null : figure(value, 6))) };
+  const codes = Object.keys(one.labels).map(Number);
+  return {
+    ...axis,
+    size: 110,
+    splits: (_, __, least, greatest) => codes.filter((code) => code >= least && code <= greatest),
+    values: (_, values) => values.map((value) => (one.labels[value] ?? "").replaceAll("_", " ")),
+  };
+}
+
+// What is nearer than a metre is drawn at the edge: zeros at a reset would rule the axis.
+const LOGARITHMIC = { distr: 3, range: (_, low, high) => [Math.max(1, 10 ** Math.floor(Math.log10(Math.max(low, 1)))), 10 ** Math.ceil(Math.log10(Math.max(high, 10)))] };
+const CODES = { range: (_, low, high) => [low - 0.5, high + 0.5] };
+
+// Limits of a series as dashed lines, where the axis shows them.
+function drawLimits(plot, series, scaleOf) {
+  const { ctx, bbox } = plot;
+  ctx.save();
+  ctx.setLineDash([6, 4]);
+  for (const one of series) {
+    for (const [kind, css] of [["warning", "--orange"], ["alarm", "--vermillion"]]) {
+      for (const value of one[kind] ?? []) {
+        const y = value === null ? NaN : plot.valToPos(value, scaleOf(one), true);
+        if (!(y >= bbox.top && y <= bbox.top + bbox.height)) continue;
+        ctx.strokeStyle = style(css);
+        ctx.beginPath();
+        ctx.moveTo(bbox.left, y);
+        ctx.lineTo(bbox.left + bbox.width, y);
+        ctx.stroke();
+      }
+    }
+  }
+  ctx.restore();
+}
+
+// Lines and bands of the series, and their values as uPlot takes them.
+function drawnSeries(series, scaleOf) {
+  const lines = [{ label: "UTC", value: (_, time) => (time === null ? "–" : new Date(1000 * time).toISOString().slice(0, 19).replace("T", " ")) }];
+  const bands = [];
+  const tables = [];
+  series.forEach((one, index) => {
+    const stroke = one.colour ?? colour(index);
+    const paths = one.labels ? uPlot.paths.stepped(STEPS) : undefined;
+    // Between codes there is no mean: an interval with several shows the band from the least to the greatest.
+    const middle = one.labels ? one.high : one.mean;
+    lines.push(lineOf(one, stroke, scaleOf(one), paths));
+    tables.push(one.low ? [one.times, middle, one.low, one.high] : [one.times, middle]);
+    if (!one.low) return;
+    const edge = { width: 0, scale: scaleOf(one), paths, points: { show: false }, stroke: "transparent", class: "hidden" };
+    lines.push({ label: "min", ...edge }, { label: "max", ...edge });
+    bands.push({ series: [lines.length - 1, lines.length - 2], fill: faint(stroke) });
+  });
+  const data = tables.length === 1 ? tables[0] : uPlot.join(tables, tables.map((t) => t.slice(1).map(() => 2)));
+  return { lines, bands, data };
+}
+
+function zoomByKeys(box, plot) {
   box.addEventListener("keydown", (event) => {
     const { min, max } = plot.scales.x;
+    const [first, last] = ends(plot);
     const [middle, half] = [(min + max) / 2, (max - min) / 2];
     const to = {
       "+": [middle - half / 2, middle + half / 2],
@@ -119,6 +178,50 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
     event.preventDefault();
     plot.setScale("x", { min: Math.max(to[0], first), max: Math.min(to[1], last) });
   });
+}
+
+// series: [{label, times, mean, low?, high?, unit?, labels?, warning?, alarm?}]; logarithmic axis where asked for.
+export function chart(place, title, unit, series, { logarithmic = false, group = null, height = 220 } = {}) {
+  const label = unit ? `${title}, ${unit}` : title;
+  const box = element("figure", { class: "chart", tabindex: "0", role: "group", "aria-label": `chart: ${label}` });
+  box.append(element("figcaption", {}, label));
+  place.append(box);
+  if (!series.some((one) => one.times.length)) {
+    box.append(element("p", { class: "hint" }, "No samples."));
+    return { box, plot: null };
+  }
+  const axes = [...new Map(series.map((one) => [axisOf(one), one]))];
+  if (axes.length > 2) throw new Error("A chart has two axes: choose parameters with at most two units.");
+  const scaleOf = (one) => (axisOf(one) === axes[0][0] ? "y" : "second");
+  const { lines, bands, data } = drawnSeries(series, scaleOf);
+  const colours = { ink: style("--muted"), grid: { stroke: style("--grid"), width: 1 } };
+  const scales = Object.fromEntries(axes.map(([, one]) => [scaleOf(one), one.labels ? CODES : logarithmic ? LOGARITHMIC : {}]));
+  const plot = new uPlot(
+    {
+      width: box.clientWidth,
+      height,
+      padding: [null, axes.length > 1 ? null : 40, null, null], // the date under the last tick
+      tzDate: (time) => uPlot.tzDate(new Date(1000 * time), "Etc/UTC"),
+      scales,
+      axes: [
+        { stroke: colours.ink, grid: colours.grid, ticks: colours.grid, values: clockTexts, space: 80 },
+        ...axes.map(([, one], index) => axisFor(one, scaleOf(one), index, colours, logarithmic)),
+      ],
+      series: lines,
+      bands,
+      cursor: group ? { sync: { key: group, setSeries: false } } : {},
+      legend: { live: true },
+      hooks: {
+        draw: [(drawn) => drawLimits(drawn, series, scaleOf)],
+        setScale: [(changed, key) => key === "x" && group && zoomed(changed, group)],
+      },
+    },
+    data,
+    box,
+  );
+  box.plot = plot;
+  if (group) joinGroup(group, plot);
+  zoomByKeys(box, plot);
   new ResizeObserver(() => plot.setSize({ width: box.clientWidth, height })).observe(box);
   return { box, plot };
 }

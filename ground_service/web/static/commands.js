@@ -1,3 +1,4 @@
+import { bind } from "./address.js";
 import { get, send } from "./api.js";
 import { acting, byId, dictionary, element, notice, pager, show, stateMark, table, timeText, trouble, watch } from "./page.js";
 
@@ -59,14 +60,13 @@ function argumentsOf(chosen) {
 
 function lights(command) {
   const reached = new Set(command.reports.map((report) => report.stage));
-  const failure = command.reports.find((report) => report.failure);
-  const bad = Boolean(failure) || command.timed_out || command.state === "failed";
-  const text = [...STAGES.filter((stage) => reached.has(stage)), failure ? `failed: ${words(failure.failure)}` : null, command.timed_out ? "timed out" : null].filter(Boolean).join(", ") || "no report yet";
+  const bad = command.timed_out || command.state === "failed";
+  const text = [...STAGES.filter((stage) => reached.has(stage)), bad ? command.remark : null].filter(Boolean).join(", ") || "no report yet";
   return element(
     "span",
     { class: "lights", role: "img", "aria-label": text, title: text },
     STAGES.map((stage) => element("span", { class: `light${reached.has(stage) ? " on" : bad ? " bad" : ""}` })),
-    element("span", { class: "after" }, bad ? (failure ? words(failure.failure) : "timed out") : ""),
+    element("span", { class: "after" }, command.remark),
   );
 }
 
@@ -94,6 +94,7 @@ async function loadLinks() {
       notice(`Link ${row.name} sends what is released.`);
       await loadLinks();
     });
+  await loadReceivers(items);
   show(
     "links",
     table(
@@ -115,8 +116,32 @@ async function loadLinks() {
   );
 }
 
+// State of the telecommand receiver of each linked spacecraft, by its newest telemetry.
+const FLAGS = ["no_rf_available", "no_bit_lock", "lockout", "wait", "retransmit"];
+async function loadReceivers(links) {
+  const spacecraft = [...new Map(links.map((one) => [`${one.spacecraft_id} ${one.instance}`, one])).values()];
+  const answers = await Promise.all(spacecraft.map((one) => get(`spacecraft/${one.spacecraft_id}/uplink`, { instance: one.instance }).catch(() => null)));
+  const channels = answers.filter(Boolean).flatMap((one) => one.channels.map((channel) => ({ ...channel, spacecraft: `${one.spacecraft_id}, ${one.instance}` })));
+  show(
+    "receivers",
+    table(
+      "Receivers",
+      [
+        ["Spacecraft", (row) => row.spacecraft],
+        ["Channel", (row) => String(row.virtual_channel), "num"],
+        ["State", (row) => FLAGS.filter((flag) => row[flag]).map(words).join(", ") || "ready"],
+        ["Next frame", (row) => String(row.report_value), "num"],
+        ["Frames seen", (row) => String(row.frames), "num"],
+        ["Received", (row) => timeText(row.received)],
+      ],
+      channels,
+      "No telemetry with the state of a telecommand receiver.",
+    ),
+  );
+}
+
 const load = pager(async (limit, offset) => {
-  const page = await get("telecommands", { limit, offset });
+  const page = await get("telecommands", { limit, offset, state: byId("state").value || null });
   show(
     "commands",
     table(
@@ -133,7 +158,7 @@ const load = pager(async (limit, offset) => {
         ["", deeds],
       ],
       page.items,
-      "No telecommand yet.",
+      byId("state").value ? "No telecommand in this state." : "No telecommand yet.",
     ),
   );
   return page;
@@ -141,6 +166,8 @@ const load = pager(async (limit, offset) => {
 
 show("name", dictionary.telecommands.map((one) => element("option", { value: one.name }, words(one.name))));
 byId("name").value = "test_connection";
+bind("name", "state");
+byId("state").addEventListener("change", acting(() => load.first()));
 byId("name").addEventListener("change", showArguments);
 showArguments();
 byId("enter").addEventListener(

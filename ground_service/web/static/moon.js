@@ -2,7 +2,8 @@
 /* global L */
 import { element } from "./page.js";
 
-export function moonMap(place) {
+// `albedo`: over the Moon itself, its picture is the background; other terrain has none.
+export function moonMap(place, { albedo = true } = {}) {
   const map = L.map(place, {
     crs: L.CRS.EPSG4326,
     preferCanvas: true,
@@ -21,10 +22,13 @@ export function moonMap(place) {
   ]);
   const background = new Image();
   background.onload = () => L.imageOverlay(background.src, [[-90, -180], [90, 180]]).addTo(map).bringToBack();
-  fetch("/moon.jpg").then(async (answer) => {
-    if (answer.ok) background.src = URL.createObjectURL(await answer.blob());
-    else place.classList.add("bare");
-  });
+  place.classList.toggle("bare", !albedo);
+  if (albedo) {
+    fetch("/moon.jpg").then(async (answer) => {
+      if (answer.ok) background.src = URL.createObjectURL(await answer.blob());
+      else place.classList.add("bare");
+    });
+  }
   const lines = { weight: 0.5, color: "#8792a0", interactive: false };
   for (let longitude = -180; longitude <= 180; longitude += 30) {
     L.polyline([[-90, longitude], [90, longitude]], lines).addTo(map);
@@ -66,6 +70,21 @@ export function track(map, latitudes, longitudes, options) {
   return L.polyline(pieces, { weight: 2, interactive: false, ...options }).addTo(map);
 }
 
+// Rims of craters: circles of their true size, at least a point.
+export function craterRims(map, craters) {
+  const css = getComputedStyle(document.documentElement).getPropertyValue("--muted").trim();
+  const degrees = (metres) => (metres / 1_737_400) * (180 / Math.PI);
+  for (const one of craters) {
+    const half = degrees(one.diameter_m / 2);
+    const points = [];
+    for (let step = 0; step < 24; step += 1) {
+      const angle = (step * Math.PI) / 12;
+      points.push([one.latitude_deg + half * Math.cos(angle), one.longitude_deg + (half * Math.sin(angle)) / Math.cos((one.latitude_deg * Math.PI) / 180)]);
+    }
+    L.polygon(points, { color: css, weight: 1, fillOpacity: 0.12, interactive: false }).addTo(map);
+  }
+}
+
 export function dot(map, latitude, longitude, options) {
   return L.circleMarker([latitude, wrapped(longitude)], { radius: 5, weight: 2, interactive: false, ...options }).addTo(map);
 }
@@ -74,4 +93,12 @@ export function legendItem(label, css) {
   const mark = element("span", { class: "mark" });
   mark.style.background = css;
   return element("li", {}, mark, label);
+}
+
+// A legend item that shows and hides a layer of the map.
+export function layerItem(map, layer, label, css) {
+  const mark = element("span", { class: "mark" });
+  mark.style.background = css;
+  const box = element("input", { type: "checkbox", checked: true, onchange: () => (box.checked ? layer.addTo(map) : layer.remove()) });
+  return element("li", {}, element("label", {}, box, mark, label));
 }

@@ -1,4 +1,5 @@
 // What every page shares: elements, tables, notices, sign-in, clock.
+import { state, stated } from "./address.js";
 import { follow, get, send } from "./api.js";
 import { parameterName, unitText } from "./units.js";
 
@@ -118,9 +119,10 @@ export function limitText([least, greatest]) {
 export const stateMark = (state) => element("span", { class: `state ${state}` }, state);
 
 export function pager(load, size = 25) {
-  let offset = 0;
+  let offset = Math.max(0, Math.floor(Number(stated("offset")) || 0));
   async function go(to) {
     offset = Math.max(0, to);
+    state({ offset: offset || null });
     const page = await load(size, offset);
     byId("range").textContent = page.total
       ? `${offset + 1} to ${Math.min(offset + size, page.total)} of ${page.total}`
@@ -160,6 +162,7 @@ dialog.addEventListener("close", async () => {
 // Who is signed in: adapts the page to the role and returns the session.
 async function signedIn() {
   const session = await get("session");
+  setClock(session.time);
   byId("user").textContent = session.browser ? `${session.name}, ${session.role}` : "";
   byId("caller").textContent = session.browser ? "Sign out" : "Sign in";
   byId("caller").hidden = session.name === "local";
@@ -176,19 +179,44 @@ byId("caller").addEventListener("click", async () => {
   location.reload();
 });
 
+// Mission time: the clock of the service, which a simulated mission sets.
+const SIMULATED_MS = 60_000; // further from the clock of the browser, the time is simulated
+const ASK_AGAIN_MS = 10_000;
+let offsetMs = null;
+export const missionNow = () => (Date.now() + (offsetMs ?? 0)) / 1000;
+
+function setClock(time) {
+  offsetMs = Date.parse(time) - Date.now();
+  if (Math.abs(offsetMs) > SIMULATED_MS) {
+    // It may run at any speed.
+    setTimeout(() => get("session").then((session) => setClock(session.time), () => {}), ASK_AGAIN_MS);
+  }
+  tick();
+}
+
 function tick() {
-  const now = new Date().toISOString();
-  byId("clock").textContent = `${now.slice(0, 10)} ${now.slice(11, 19)} UTC`;
+  if (offsetMs === null) return;
+  const now = new Date(1000 * missionNow()).toISOString();
+  const simulated = Math.abs(offsetMs) > SIMULATED_MS ? ", simulated" : "";
+  byId("clock").textContent = `${now.slice(0, 10)} ${now.slice(11, 19)} UTC${simulated}`;
   byId("clock").dateTime = now;
 }
-tick();
 setInterval(tick, 1000);
+
+byId("menu").addEventListener("click", () => {
+  const open = byId("menu").getAttribute("aria-expanded") !== "true";
+  byId("menu").setAttribute("aria-expanded", open);
+});
 
 const watchers = [];
 export const watch = (onMessage) => watchers.push(onMessage);
 
+// The session of the user; pages that differ by role wait for it.
+export const session = signedIn();
+export const mayOperate = () => ["operator", "admin"].includes(document.body.dataset.role);
+
 // Only after a first answer: a socket that is refused tells nothing, an answer tells that a token is needed.
-signedIn()
+session
   .then(() =>
     follow(
       (message) => watchers.forEach((onMessage) => onMessage(message)),

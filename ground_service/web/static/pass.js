@@ -1,6 +1,8 @@
+import { bind } from "./address.js";
 import { finished, get, request, send } from "./api.js";
 import { chart, columns, solutionStyle } from "./charts.js";
-import { legendItem, moonMap, track } from "./moon.js";
+import { craterRims, layerItem, moonMap, track } from "./moon.js";
+import { drawParameters } from "./parameters.js";
 import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, parameterOptions, seconds, show, stateMark, table, timeText, trouble, unitText } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
@@ -17,6 +19,7 @@ async function save(path, name, options) {
 async function showExports() {
   const formats = await get("exports/formats");
   show("export-states", ["reference", ...dictionary.estimators].map((name) => element("option", { value: name }, name)));
+  bind("export-states");
   const button = (one) =>
     element(
       "button",
@@ -163,18 +166,44 @@ function showCompleteness(found) {
   );
 }
 
-async function showStates(estimators) {
-  const map = moonMap(byId("map"));
-  const answers = await Promise.all(
-    estimators.map((name) => get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 600 }).catch(() => null)),
-  );
+// The terrain that was flown over, by the mission description: the picture of the Moon is of the Moon only.
+async function terrainOf(pass) {
+  if (!pass.mission_revision) return { albedo: false, text: "Terrain: not stated, since no mission description was in force." };
+  const { evidence } = (await get(`missions/${pass.mission_revision.slice(0, 16)}`)).document;
+  const world = evidence?.world;
+  if (!world) return { albedo: false, text: "Terrain: not stated in the mission description." };
+  if (world === "real-terrain" || world === "photographs") return { albedo: true, text: "Terrain: the Moon; the background is its albedo." };
+  const seed = evidence.seed === null || evidence.seed === undefined ? "" : `, seed ${evidence.seed}`;
+  return { albedo: false, text: `Terrain: ${words(world.replaceAll("-", " "))}${seed}, which is not the Moon's: no picture of it is shown.` };
+}
+
+const CRATERS_SHOWN = 1000;
+
+async function showTerrain(pass) {
+  const [terrain, craters] = await Promise.all([terrainOf(pass), get(`passes/${passId}/craters`, { limit: CRATERS_SHOWN })]);
+  const map = moonMap(byId("map"), terrain);
+  craterRims(map, craters.items);
+  const shown = craters.total > craters.items.length ? `the ${figure(craters.items.length)} largest of ${figure(craters.total)}` : figure(craters.total);
+  byId("terrain").textContent = `${terrain.text} ${craters.total ? `Circles: ${shown} craters of the catalogue of the pass.` : "The pass has no crater catalogue."}`;
+  return map;
+}
+
+// Tracks lie on each other where the whole Moon is shown: wide ones below narrow ones, so that each is seen.
+const trackWeight = (index, count) => 2 + 4 * (count - 1 - index);
+
+async function showStates(pass, estimators) {
+  const [map, ...answers] = await Promise.all([
+    showTerrain(pass),
+    ...estimators.map((name) => get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 600 }).catch(() => null)),
+  ]);
   const found = answers.filter((answer) => answer?.series[0].samples);
   const bounds = [];
-  found.forEach((one) => {
+  found.forEach((one, index) => {
     const [latitude, longitude] = one.series.map((series) => columns(series.buckets, seconds).mean);
-    const line = track(map, latitude, longitude, { color: solutionStyle(one.estimator).colour });
+    const css = solutionStyle(one.estimator).colour;
+    const line = track(map, latitude, longitude, { color: css, weight: trackWeight(index, found.length), lineCap: "butt" });
     if (line.getLatLngs().length) bounds.push(line.getBounds());
-    byId("map-legend").append(legendItem(one.estimator, solutionStyle(one.estimator).colour));
+    byId("map-legend").append(layerItem(map, line, one.estimator, css));
   });
   if (bounds.length) map.fitBounds(bounds.reduce((all, one) => all.extend(one)), { maxZoom: 4, padding: [20, 20] });
   STATES.forEach((value, which) => {
@@ -189,10 +218,14 @@ async function showStates(estimators) {
   if (!found.length) show("navigation", element("p", { class: "hint" }, "No navigation states of this pass have come."));
 }
 
+let parameters = [];
 async function showParameters() {
-  const { parameters, packets } = await get(`passes/${passId}/parameters`);
+  const answer = await get(`passes/${passId}/parameters`);
+  const { packets } = answer;
+  ({ parameters } = answer);
   show("parameter", parameterOptions(parameters));
   byId("parameter").value = "temperature_c";
+  bind("parameter");
   const link = (packet, format) =>
     element(
       "button",
@@ -205,10 +238,9 @@ async function showParameters() {
 }
 
 async function showParameter() {
-  const name = byId("parameter").value;
-  const series = await get(`passes/${passId}/telemetry/${encodeURIComponent(name)}`, { max_points: 600 });
+  const chosen = parameters.find((one) => one.name === byId("parameter").value);
   show("housekeeping");
-  chart(byId("housekeeping"), parameterName(name, series.unit), unitText(series.unit), [{ label: parameterName(name, series.unit), ...columns(series.buckets, seconds) }], { group: "pass" });
+  if (chosen) await drawParameters(byId("housekeeping"), passId, [chosen], { group: "pass" });
 }
 
 let events = [];
@@ -253,6 +285,7 @@ byId("make-report").addEventListener(
   }),
 );
 byId("parameter").addEventListener("change", acting(showParameter));
+bind("only-alarms");
 byId("only-alarms").addEventListener("change", showEvents);
 
 async function load() {
@@ -262,6 +295,7 @@ async function load() {
   byId("span").textContent =
     `${timeText(pass.start)} to ${timeText(pass.stop)}, ${lengthText(seconds(pass.stop) - seconds(pass.start))}, ` +
     `spacecraft ${pass.spacecraft_id} (${pass.instance})`;
+  byId("all-events").href = `/events?spacecraft=${encodeURIComponent(`${pass.spacecraft_id} ${pass.instance}`)}`;
   show(
     "mission",
     pass.mission_revision
@@ -279,7 +313,7 @@ async function load() {
     }),
     showParameters(),
     showExports(),
-    showStates(dictionary.estimators),
+    showStates(pass, dictionary.estimators),
   ]);
 }
 

@@ -1,8 +1,8 @@
+import { keep, restore } from "./address.js";
 import { get, send } from "./api.js";
 import { acting, byId, element, figure, lengthText, notice, pager, seconds, show, table, timeText, trouble } from "./page.js";
 
-const address = new URLSearchParams(location.search);
-byId("search").value = address.get("search") ?? "";
+restore("search");
 
 const load = pager(async (limit, offset) => {
   const page = await get("passes", { limit, offset, search: byId("search").value || null });
@@ -37,8 +37,7 @@ const verdict = (report) => (report ? element("span", { class: `state ${report.v
 byId("find").addEventListener(
   "submit",
   acting(async () => {
-    address.set("search", byId("search").value);
-    history.replaceState(null, "", `?${address}`);
+    keep("search");
     await load.first();
   }),
 );

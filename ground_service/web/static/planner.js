@@ -1,12 +1,16 @@
+import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
-import { acting, byId, element, figure, isoText, lengthText, notice, seconds, show, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, figure, isoText, lengthText, mayOperate, missionNow, notice, seconds, session, show, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { loadRequests } from "./requests.js";
 
 const ROW_PX = 34;
 const HEAD_PX = 24;
 const DAY_S = 86400;
 let windows = [];
 let candidates = [];
-let contacts = [];
+let contacts = []; // of the search
+let linked = []; // of the links
+let ephemerides = [];
 let chosen = null;
 let view = [0, 1]; // seconds of UTC [from, to]
 let viewChosen = false; // else the view follows what there is to see
@@ -16,18 +20,31 @@ const selectable = (row) => ({ start: seconds(row.start), stop: seconds(row.stop
 
 function whole() {
   const spans = [...windows, ...candidates].map(selectable);
-  if (!spans.length) {
-    const now = Date.now() / 1000;
-    return [now, now + DAY_S];
-  }
+  if (!spans.length) return emptyView();
   const from = Math.min(...spans.map((one) => one.start));
   const to = Math.max(...spans.map((one) => one.stop));
   const margin = Math.max(600, 0.05 * (to - from));
   return [from - margin, to + margin];
 }
 
+// Without windows: the next day of the mission; of an ephemeris that does not cover it, its first day.
+function emptyView() {
+  const now = missionNow();
+  const { start, stop } = chosenEphemeris() ? selectable(chosenEphemeris()) : { start: now, stop: now + DAY_S };
+  const from = start <= now && now < stop ? now : start;
+  return [from, Math.min(from + DAY_S, Math.max(stop, from + 3600))];
+}
+
+const chosenEphemeris = () => ephemerides.find((one) => String(one.id) === byId("ephemeris").value) ?? ephemerides[0];
+
+const spacecraftChosen = () => {
+  const [id, instance] = byId("spacecraft").value.split(" ");
+  return { spacecraft_id: Number(id), instance };
+};
+
 function tickStep(span) {
-  return [60, 300, 600, 1800, 3600, 3 * 3600, 6 * 3600, DAY_S, 2 * DAY_S, 7 * DAY_S].find((step) => span / step <= 12) ?? 30 * DAY_S;
+  const most = Math.max(3, Math.min(12, Math.floor(byId("timeline").clientWidth / 70)));
+  return [60, 300, 600, 1800, 3600, 3 * 3600, 6 * 3600, DAY_S, 2 * DAY_S, 7 * DAY_S].find((step) => span / step <= most) ?? 30 * DAY_S;
 }
 
 // Windows that share time stand below each other.
@@ -45,7 +62,7 @@ function lanes(rows) {
 function drawTimeline() {
   if (dragging) return;
   const place = byId("timeline");
-  const width = Math.max(320, place.clientWidth);
+  const width = Math.max(240, place.clientWidth);
   if (!viewChosen) view = whole();
   const scale = width / (view[1] - view[0]);
   const x = (time) => (time - view[0]) * scale;
@@ -73,12 +90,15 @@ function drawTimeline() {
     text.textContent = name;
     drawn.append(text);
   }
+  for (const one of linked) {
+    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop ?? one.start)), sections[2].top + 6, `contact ${one.state}`, `link ${one.link}, ${one.station}, ${one.state}, ${timeText(one.start)} to ${timeText(one.stop)}`));
+  }
   for (const one of contacts) {
     drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[2].top + 6, "contact", `${one.station} ${timeText(one.start)} to ${timeText(one.stop)}`));
   }
   for (const one of candidates) {
-    const made = bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].top + 4, "candidate", `candidate ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}: plan it`);
-    pressable(made, acting(() => plan(one)));
+    const made = bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].top + 4, "candidate", `candidate ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}${mayOperate() ? ": plan it" : ""}`);
+    if (mayOperate()) pressable(made, acting(() => plan(one)));
     drawn.append(made);
   }
   ordered.forEach((row, index) => drawn.append(windowBar(row, x, sections[1].top + 4 + lane[index] * ROW_PX, scale)));
@@ -112,7 +132,7 @@ function windowBar(row, x, top, scale) {
   made.append(text);
   made.dataset.window = row.id;
   pressable(made, () => choose(row.id));
-  if (row.state !== "draft") return made;
+  if (row.state !== "draft" || !mayOperate()) return made;
   made.addEventListener("keydown", (event) => {
     const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
     if (!by) return;
@@ -166,6 +186,7 @@ async function move(row, start, stop) {
 
 function choose(id) {
   chosen = id;
+  state({ window: id });
   drawTimeline();
   showChosen();
 }
@@ -218,7 +239,7 @@ async function plan(candidate) {
     start: candidate.start,
     stop: candidate.stop,
     cadence_s: byId("cadence").valueAsNumber,
-    spacecraft_id: 76,
+    ...spacecraftChosen(),
     ephemeris_id: ephemeris,
   });
   candidates = candidates.filter((one) => one !== candidate);
@@ -233,6 +254,7 @@ const limits = (name) => {
 
 async function search() {
   const found = await send("POST", "windows/search", {
+    ...spacecraftChosen(),
     ephemeris_id: Number(byId("ephemeris").value) || null,
     start: byId("from").value || null,
     stop: byId("to").value || null,
@@ -245,8 +267,7 @@ async function search() {
   });
   candidates = found.candidates;
   contacts = found.contacts;
-  viewChosen = false;
-  drawTimeline();
+  showAll();
   const refused = Object.entries(found.refused).map(([reason, count]) => `${count} ${reason.replaceAll("_", " ")}`).join(", ");
   show(
     "candidates",
@@ -296,16 +317,57 @@ const zoom = (factor, shift = 0) => () => {
   const middle = (view[0] + view[1]) / 2 + shift * half;
   view = [middle - half, middle + half];
   viewChosen = true;
+  state({ view: view.map(isoText).join("~") });
   drawTimeline();
+  soonContacts();
 };
+
+function showAll() {
+  viewChosen = false;
+  state({ view: null });
+  drawTimeline();
+  soonContacts();
+}
+
+// Contacts of the links in the shown time; they are predicted for at most a month.
+const CONTACTS_S = 31 * DAY_S;
+let contactsPending = null;
+function soonContacts() {
+  clearTimeout(contactsPending);
+  contactsPending = setTimeout(() => loadContacts().catch(trouble), 300);
+}
+
+async function loadContacts() {
+  const found = await get("contacts", { since: isoText(view[0]), until: isoText(Math.min(view[1], view[0] + CONTACTS_S)) });
+  linked = found.contacts;
+  drawTimeline();
+  const reasons = Object.entries(found.unpredicted).map(([link, reason]) => element("p", { class: "hint" }, `Contacts of link ${link} cannot be predicted: ${reason}.`));
+  show(
+    "contacts",
+    reasons,
+    table(
+      "Contacts",
+      [
+        ["Link", (row) => row.link],
+        ["Station", (row) => row.station],
+        ["Spacecraft", (row) => String(row.spacecraft_id), "num"],
+        ["Start", (row) => timeText(row.start)],
+        ["Stop", (row) => timeText(row.stop)],
+        ["State", (row) => stateMark(row.state)],
+        ["Telecommands", (row) => figure(row.telecommands), "num"],
+        ["Octets", (row) => figure(row.octets), "num"],
+        ["Reason", (row) => row.reason ?? ""],
+      ],
+      linked,
+      "No contact of a link in the shown time.",
+    ),
+  );
+}
 byId("earlier").addEventListener("click", zoom(1, -1));
 byId("later").addEventListener("click", zoom(1, 1));
 byId("nearer").addEventListener("click", zoom(0.5));
 byId("farther").addEventListener("click", zoom(2));
-byId("whole").addEventListener("click", () => {
-  viewChosen = false;
-  drawTimeline();
-});
+byId("whole").addEventListener("click", showAll);
 byId("search").addEventListener("submit", acting(search));
 byId("export").addEventListener(
   "click",
@@ -322,19 +384,58 @@ byId("import").addEventListener(
     await load();
   }),
 );
-new ResizeObserver(() => windows && drawTimeline()).observe(byId("timeline"));
+new ResizeObserver(drawTimeline).observe(byId("timeline"));
+
+// Spacecraft that telemetry or a mission description names, flown ones first.
+async function loadSpacecraft() {
+  const [found, missions] = await Promise.all([get("spacecraft"), get("missions", { limit: 200 })]);
+  const declared = missions.items.filter((one) => one.spacecraft_id !== null).map((one) => `${one.spacecraft_id} flight`);
+  const keys = [...new Set([...declared, ...found.items.map((one) => `${one.spacecraft_id} ${one.instance}`)])];
+  show("spacecraft", (keys.length ? keys : ["76 flight"]).map((key) => element("option", { value: key }, key.replace(" ", ", "))));
+  return missions.items;
+}
+
+// A camera needs daylight: the search applies it unless other limits are stated.
+async function showDaylight(missions) {
+  const mission = missions.find((one) => one.spacecraft_id === spacecraftChosen().spacecraft_id);
+  const camera = mission && (await get(`missions/${mission.revision.slice(0, 16)}`)).document.camera;
+  const needed = camera?.fov_deg !== null && camera?.fov_deg !== undefined;
+  byId("sun-min").placeholder = needed ? "0" : "";
+  byId("sun-max").placeholder = needed ? "90" : "";
+  byId("daylight").textContent = needed ? "The mission description states a camera: without other limits, candidates have the Sun above the horizon throughout." : "No mission description of this spacecraft states a camera: candidates may be at night.";
+}
+
+function showSpan() {
+  const one = chosenEphemeris();
+  byId("from").placeholder = one ? one.start.slice(0, 19) + "Z" : "";
+  byId("to").placeholder = one ? one.stop.slice(0, 19) + "Z" : "";
+}
+
+const FIELDS = ["ephemeris", "from", "to", "altitude-min", "altitude-max", "sun-min", "sun-max", "latitude-min", "latitude-max", "cadence", "sunlit", "contact"];
 
 async function start() {
-  const ephemerides = await get("ephemerides", { limit: 100 });
-  show("ephemeris", element("option", { value: "" }, "the newest"), ephemerides.items.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
-  await load();
-  const asked = location.hash.match(/^#window-(\d+)$/);
-  if (asked) choose(Number(asked[1]));
+  await session;
+  const [found, missions] = await Promise.all([get("ephemerides", { limit: 100 }), loadSpacecraft()]);
+  ephemerides = found.items;
+  show("ephemeris", element("option", { value: "" }, "the newest"), ephemerides.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
+  bind("spacecraft", ...FIELDS);
+  showSpan();
+  byId("ephemeris").addEventListener("change", () => {
+    showSpan();
+    showAll();
+  });
+  byId("spacecraft").addEventListener("change", acting(() => Promise.all([showDaylight(missions), loadRequests(spacecraftChosen())])));
+  const [from, to] = (stated("view") ?? "").split("~").map((text) => Date.parse(text) / 1000);
+  if (from < to) [view, viewChosen] = [[from, to], true];
+  await Promise.all([load(), showDaylight(missions), loadRequests(spacecraftChosen())]);
+  const asked = stated("window") ?? location.hash.match(/^#window-(\d+)$/)?.[1];
+  if (asked) choose(Number(asked));
+  await loadContacts();
 }
 
 let pending = null;
 watch(() => {
   clearTimeout(pending);
-  pending = setTimeout(() => load().catch(trouble), 400);
+  pending = setTimeout(() => Promise.all([load(), loadRequests(spacecraftChosen())]).catch(trouble), 400);
 });
 start().catch((error) => error.status === 401 || trouble(error));

@@ -1,63 +1,103 @@
+import { bind, restore, state, stated, statedAll } from "./address.js";
 import { get } from "./api.js";
-import { chart, columns } from "./charts.js";
+import { drawParameters } from "./parameters.js";
 import { showLive } from "./values.js";
-import { acting, byId, dictionary, element, figure, limitText, parameterName, parameterOptions, seconds, show, timeText, trouble, unitText } from "./page.js";
+import { acting, byId, element, parameterName, parameterOptions, show, timeText, trouble } from "./page.js";
 
-let definition = Object.fromEntries(dictionary.parameters.map((one) => [one.name, one]));
+let drawn = []; // [{pass, names}] of the charts, in their order
+const known = new Map(); // parameters by pass
 
-function csv(series) {
-  const lines = ["start,stop,count,min,max,mean,after_gap"];
-  for (const one of series.buckets) {
-    lines.push([one.start, one.stop, one.count, one.min, one.max, one.mean, one.after_gap].join(","));
-  }
-  return URL.createObjectURL(new Blob([`${lines.join("\n")}\n`], { type: "text/csv" }));
+async function parametersOf(pass) {
+  if (!known.has(pass)) known.set(pass, (await get(`passes/${pass}/parameters`)).parameters);
+  return known.get(pass);
+}
+
+const text = ({ pass, names }) => `${pass}:${names.join(",")}`;
+
+function keepCharts() {
+  state({ chart: drawn.map(text) });
+  const choices = drawn.map(({ names }, index) => element("option", { value: index }, `with ${names.map((name) => parameterName(name, "")).join(", ")}`));
+  show("chart", element("option", { value: "new" }, "a new one"), choices);
+}
+
+async function draw(entry, place) {
+  const all = await parametersOf(entry.pass);
+  const chosen = entry.names.map((name) => all.find((one) => one.name === name)).filter(Boolean);
+  if (!chosen.length) throw new Error(`Pass ${entry.pass} has no parameter ${entry.names.join(", ")}.`);
+  return drawParameters(place, entry.pass, chosen, { group: "telemetry", maxPoints: byId("points").value });
 }
 
 async function add() {
-  const [passId, name] = [byId("pass").value, byId("parameter").value];
-  const series = await get(`passes/${passId}/telemetry/${encodeURIComponent(name)}`, { max_points: byId("points").value });
-  const { box } = chart(byId("charts"), parameterName(name, series.unit), unitText(series.unit), [{ label: parameterName(name, series.unit), ...columns(series.buckets, seconds) }], { group: "telemetry" });
-  const about = definition[name];
-  const limits = [
-    about.warning ? `warning ${limitText(about.warning)}` : null,
-    about.alarm ? `alarm ${limitText(about.alarm)}` : null,
-    Object.keys(about.labels).length ? Object.entries(about.labels).map(([code, label]) => `${code}: ${label}`).join(", ") : null,
-  ].filter(Boolean);
-  const last = series.buckets.at(-1);
-  box.append(
-    element(
-      "p",
-      { class: "hint" },
-      `${about.description ? `${about.description}. ` : ""}${figure(series.samples)} samples` + (last ? `, last ${figure(last.mean)} at ${timeText(last.stop)}` : "") + (limits.length ? `; ${limits.join(", ")}` : "") + ". ",
-      element("a", { href: csv(series), download: `pass-${passId}-${name}.csv` }, "CSV"),
-    ),
-  );
+  const [pass, name] = [Number(byId("pass").value), byId("parameter").value];
+  const shared = drawn[byId("chart").value];
+  if (!drawn.length) show("charts");
+  if (!shared) {
+    const entry = { pass, names: [name] };
+    await draw(entry, byId("charts"));
+    drawn.push(entry);
+  } else {
+    if (shared.pass !== pass) throw new Error("A chart shows parameters of one pass.");
+    const entry = { pass, names: [...new Set([...shared.names, name])] };
+    const place = element("div");
+    byId("charts").append(place); // a chart is as wide as its place
+    try {
+      await draw(entry, place);
+      byId("charts").children[drawn.indexOf(shared)].replaceWith(...place.children);
+    } finally {
+      place.remove();
+    }
+    shared.names = entry.names;
+  }
+  keepCharts();
 }
 
 async function chooseParameters() {
   const wanted = byId("parameter").value;
-  const { parameters } = await get(`passes/${byId("pass").value}/parameters`);
-  definition = Object.fromEntries(parameters.map((one) => [one.name, one]));
+  const parameters = await parametersOf(Number(byId("pass").value));
   show("parameter", parameterOptions(parameters));
-  if (wanted in definition) byId("parameter").value = wanted;
+  byId("parameter").value = parameters.some((one) => one.name === wanted) ? wanted : (parameters.find((one) => one.name === "temperature_c") ?? parameters[0])?.name;
+}
+
+function statedCharts() {
+  return statedAll("chart").map((one) => {
+    const [pass, names] = one.split(":");
+    return { pass: Number(pass), names: (names ?? "").split(",") };
+  });
 }
 
 async function load() {
   const passes = await get("passes", { limit: 1000 });
-  const wanted = new URLSearchParams(location.search);
-  const asked = Number(wanted.get("pass"));
+  const asked = Number(stated("pass"));
   if (asked && !passes.items.some((one) => one.id === asked)) passes.items.unshift(await get(`passes/${asked}`));
   show("pass", passes.items.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
-  if (wanted.get("pass")) byId("pass").value = wanted.get("pass");
-  if (passes.items.length) await chooseParameters();
-  if ("temperature_c" in definition) byId("parameter").value = "temperature_c";
-  if (wanted.get("parameter") in definition) byId("parameter").value = wanted.get("parameter");
-  if (passes.items.length) await add();
-  else show("charts", element("p", { class: "hint" }, "No pass yet."));
+  restore("pass");
+  bind("points");
+  keepPassAndParameter();
+  if (!passes.items.length) {
+    show("charts", element("p", { class: "hint" }, "No pass yet."));
+    return;
+  }
+  await chooseParameters();
+  restore("parameter");
+  const wanted = statedCharts();
+  if (!wanted.length) await add();
+  for (const entry of wanted) {
+    await draw(entry, byId("charts"));
+    drawn.push(entry);
+  }
+  keepCharts();
+}
+
+function keepPassAndParameter() {
+  for (const id of ["pass", "parameter"]) byId(id).addEventListener("change", () => state({ [id]: byId(id).value }));
 }
 
 byId("choice").addEventListener("submit", acting(add));
 byId("pass").addEventListener("change", acting(chooseParameters));
-byId("clear").addEventListener("click", () => show("charts"));
+byId("clear").addEventListener("click", () => {
+  show("charts");
+  drawn = [];
+  keepCharts();
+});
 showLive();
 load().catch((error) => error.status === 401 || trouble(error));

@@ -1,4 +1,5 @@
 // Newest values of the parameters of a spacecraft: value, limit state, age and recent course, updated by the feed.
+import { bind, restore } from "./address.js";
 import { get } from "./api.js";
 import { acting, byId, element, lengthText, parameterName, show, stateMark, svg, table, timeText, trouble, unitText, watch } from "./page.js";
 
@@ -63,6 +64,7 @@ async function refresh() {
   const packets = [...new Set(values.map((one) => one.packet))];
   show("packet", packets.map((one) => element("option", { value: one }, one.replaceAll("_", " "))));
   if (packets.includes(packet)) byId("packet").value = packet;
+  else restore("packet");
   draw();
 }
 
@@ -77,19 +79,14 @@ export async function showLive() {
   try {
     const { items } = await get("spacecraft");
     show("spacecraft", items.map((one) => element("option", { value: `${one.spacecraft_id} ${one.instance}` }, `${one.spacecraft_id}, ${one.instance}`)));
-    const wanted = new URLSearchParams(location.search).get("spacecraft");
-    if (items.some((one) => `${one.spacecraft_id} ${one.instance}` === wanted)) byId("spacecraft").value = wanted;
+    restore("spacecraft");
     if (!items.length) draw();
     await refresh();
   } catch (error) {
     if (error.status !== 401) trouble(error);
   }
-  byId("spacecraft").addEventListener("change", acting(async () => {
-    const words = new URLSearchParams(location.search);
-    words.set("spacecraft", byId("spacecraft").value);
-    history.replaceState(null, "", `?${words}`);
-    await refresh();
-  }));
+  byId("spacecraft").addEventListener("change", acting(refresh));
+  bind("spacecraft", "packet");
   byId("packet").addEventListener("change", draw);
   watch((message) => message.kind === "telemetry" && soon());
   setInterval(draw, 5000);
