@@ -30,9 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     listing = actions.add_parser("list", help="list telecommands and their states, newest first")
     listing.add_argument("--limit", type=int, default=50)
     listing.set_defaults(handler=list_all)
-    showing = actions.add_parser(
-        "show", help="show a telecommand, its verification, and why it failed"
-    )
+    showing = actions.add_parser("show", help="show a telecommand, its verification, and why it failed")
     showing.set_defaults(handler=show)
     releasing = actions.add_parser("release", help="release a queued telecommand")
     releasing.set_defaults(handler=release)

@@ -29,8 +29,10 @@ function whole() {
 
 // Without windows: the next day of the mission; of an ephemeris that does not cover it, its first day.
 function emptyView() {
-  const now = missionNow();
-  const { start, stop } = chosenEphemeris() ? selectable(chosenEphemeris()) : { start: now, stop: now + DAY_S };
+  const now = 600 * Math.floor(missionNow() / 600); // in whole steps, so that the view stands still
+  const covers = ephemerides.find((one) => seconds(one.start) <= now && now < seconds(one.stop));
+  const shown = byId("ephemeris").value ? chosenEphemeris() : (covers ?? chosenEphemeris());
+  const { start, stop } = shown ? selectable(shown) : { start: now, stop: now + DAY_S };
   const from = start <= now && now < stop ? now : start;
   return [from, Math.min(from + DAY_S, Math.max(stop, from + 3600))];
 }
@@ -63,7 +65,10 @@ function drawTimeline() {
   if (dragging) return;
   const place = byId("timeline");
   const width = Math.max(240, place.clientWidth);
-  if (!viewChosen) view = whole();
+  if (!viewChosen && String(whole()) !== String(view)) {
+    view = whole();
+    if (contactsOf) soonContacts();
+  }
   const scale = width / (view[1] - view[0]);
   const x = (time) => (time - view[0]) * scale;
   const ordered = [...windows].sort((a, b) => seconds(a.start) - seconds(b.start));
@@ -332,12 +337,14 @@ function showAll() {
 // Contacts of the links in the shown time; they are predicted for at most a month.
 const CONTACTS_S = 31 * DAY_S;
 let contactsPending = null;
+let contactsOf = false; // contacts of a view have been asked for
 function soonContacts() {
   clearTimeout(contactsPending);
   contactsPending = setTimeout(() => loadContacts().catch(trouble), 300);
 }
 
 async function loadContacts() {
+  contactsOf = true;
   const found = await get("contacts", { since: isoText(view[0]), until: isoText(Math.min(view[1], view[0] + CONTACTS_S)) });
   linked = found.contacts;
   drawTimeline();

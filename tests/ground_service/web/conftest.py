@@ -20,9 +20,13 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
+from lunar.ephemeris import ephemeris_from_states
+from lunar.oem import format_oem
+from lunar.timescales import parse_utc
 
 CHROMIUM = "/usr/bin/chromium"
 START_S = 180.0
+NS = 1_000_000_000
 FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -199,3 +203,19 @@ def page(browser: Browser, service: Service) -> Iterator[Page]:
 def _note_foreign(url: str, own: str, errors: list[str]) -> None:
     if not url.startswith((own, own.replace("http", "ws", 1), "blob:", "data:")):
         errors.append(f"asked another host: {url}")
+
+
+@pytest.fixture
+def day_of_orbits(tmp_path):
+    """Six hours of a circular orbit as an OEM file."""
+    start = parse_utc("2030-01-01T00:00:00Z")
+    elapsed = np.arange(0.0, 6 * 3600.0 + 1.0, 60.0)
+    angle = (elapsed * 2 * np.pi / 6672.0)[:, None]
+    along, across = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.4, 0.9165])
+    position = 1_768_180.0 * (np.cos(angle) * along + np.sin(angle) * across)
+    velocity = 1_768_180.0 * 2 * np.pi / 6672.0 * (np.cos(angle) * across - np.sin(angle) * along)
+    path = tmp_path / "orbits.oem"
+    path.write_text(
+        format_oem(ephemeris_from_states(start + np.rint(elapsed * NS).astype(np.int64), position, velocity))
+    )
+    return path
