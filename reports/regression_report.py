@@ -14,8 +14,8 @@ from reports.statistics import quantiles
 from reports.text import count_text, significant_text
 from reports.values import CampaignPass, RegressionGate, RegressionReport
 
-_ORDER = ("fail", "inconclusive", "pass")
-_SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion"}
+_ORDER = ("fail", "inconclusive", "not judged", "pass")
+_SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "not judged": ""}
 
 
 def regression_document(report: RegressionReport) -> Document:

@@ -544,6 +544,14 @@ class Client(Connection):
         """Upload a zipped pass archive to keep it for regressions."""
         return self._post(KeptArchive, "/regression-archives", file, pinned=pinned)
 
+    def keep_pass_archive(self, pass_id: int, *, pinned: bool = False) -> KeptArchive:
+        """Keep the regression archive of a pass."""
+        return self._post(KeptArchive, f"/passes/{pass_id}/regression-archive", pinned=pinned)
+
+    def render_kept_archive(self, digest: str) -> Job:
+        """Render the missing frames of a kept archive as a job."""
+        return self._post(Job, f"/regression-archives/{_part(digest)}/frames")
+
     def change_kept_archive(self, digest: str, *, pinned: bool) -> KeptArchive:
         """Change whether a kept archive is pinned."""
         path = f"/regression-archives/{_part(digest)}"

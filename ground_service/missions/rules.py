@@ -34,6 +34,7 @@ ACTIONS: Final = (
     "evaluate",
     "report",
     "mark_processed",
+    "keep_archive",
     "run_regression",
     "compute_trends",
     "notify",
@@ -48,7 +49,7 @@ CONDITIONS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Triggers that have the value of each condition."""
 
-PASS_ACTIONS: Final = ("align", "evaluate", "report", "mark_processed")
+PASS_ACTIONS: Final = ("align", "evaluate", "report", "mark_processed", "keep_archive")
 """Actions on one pass."""
 
 PASS_TRIGGERS: Final = (
@@ -232,6 +233,8 @@ DEFAULT_RULES: Final = (
         do=("align", "report", "mark_processed"),
     ),
     Rule(name="trends", on="window processed", do=("compute_trends",)),
+    Rule(name="regression archive of a window", on="window processed", do=("keep_archive",)),
+    Rule(name="regression archive of an imported pass", on="archive imported", do=("keep_archive",)),
 )
 """Rules of a mission description that states none."""
 

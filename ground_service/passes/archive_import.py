@@ -34,6 +34,7 @@ from lunar.timescales import parse_utc
 SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"
 MISSION_FILE = "mission.toml"
+MANIFEST_FILE = "manifest.json"
 MANIFEST_LIMIT_OCTETS = 16 << 20
 
 FRAMES_KEPT = 200
@@ -74,6 +75,8 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     if attitudes is not None:
         load_attitudes(folder / attitudes, str(folder / attitudes))
     stored = {name: ground.files.put_file(folder / name) for name in names if not name.startswith("frames/")}
+    # The regression archive of the pass is made of the stored files, which the manifest names.
+    stored[MANIFEST_FILE] = ground.files.put_file(folder / MANIFEST_FILE)
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
     pass_id = _register(
         ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text)

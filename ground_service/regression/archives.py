@@ -12,7 +12,7 @@ import struct
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,15 +25,24 @@ from ground_service.http.times import UtcTime
 from ground_service.passes.archive_import import checked_files, read_manifest
 from ground_service.passes.archive_zip import unpacked
 from ground_service.regression import store
-from ground_service.regression.model import ArchiveRecord, KeptArchive
+from ground_service.regression.model import (
+    COMPLETE,
+    TELEMETRY_ONLY,
+    TO_RENDER,
+    ArchiveRecord,
+    KeptArchive,
+)
 from ground_service.store.counters import hold
-from ground_service.store.files import FileArchive, replace_durably
+from ground_service.store.files import FileArchive, StoredFile, replace_durably
 
 MANIFEST = "manifest.json"
 _FILES_LOCK = "files of regression archives"
 """Lock held while files of archives are in use, so that no file is removed that another process has just stored."""
 
 INPUTS = "payload/inputs.jsonl"
+DETECTIONS = "payload/detections.jsonl"
+"""Received detections by frame, from which an archive without frames is replayed."""
+
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 _PNG_HEADER = struct.Struct(">8s4x4sII")
 _FLIGHT_FOLDERS = ("payload/", "frames/")
@@ -50,19 +59,29 @@ class PassArchive:
     Attributes
     ----------
     digest
-        SHA-256 of the manifest, which holds the hash of every other file: the identity of the archive.
-    frames
-        Frames that the payload was given.
+        SHA-256 of the manifest that the archive was kept with, which has the hash of every file: its identity.
+    frames, frames_stored
+        Frames that the payload was given, and those with a stored image.
+    state, reason
+        See `KeptArchive`.
     """
 
     folder: Path
     digest: str
     manifest: dict[str, Any]
     frames: int
+    frames_stored: int
+    state: str = COMPLETE
+    reason: str = ""
 
     @property
     def name(self) -> str:
         return str(self.manifest["pass_name"])
+
+    @property
+    def has_inputs(self) -> bool:
+        """Whether the archive contains the inputs of the payload."""
+        return INPUTS in self.manifest["files"]
 
 
 @contextmanager
@@ -84,12 +103,15 @@ def opened_archive(path: Path) -> Iterator[Path]:
 
 
 def check_archive(folder: Path) -> PassArchive:
-    """An archive that can be flown again: every hash as in the manifest, every frame there, of the camera it names.
+    """Check the hash of every file and the size of every stored frame, and return the archive.
+
+    Frames that are not stored are rendered from the scenario of the archive at its first use; without a scenario the
+    archive is telemetry only.
 
     Raises
     ------
     InvalidInput
-        What is wrong with it, and where.
+        The archive is damaged or lacks an input of the payload.
     """
     manifest, digest = read_manifest(folder)
     names = set(checked_files(folder, manifest))
@@ -106,33 +128,31 @@ def check_archive(folder: Path) -> PassArchive:
             )
     rows = frame_inputs(folder)
     lacking = [row["frame"] for row in rows if row["image"] and row["image"] not in names]
+    _check_images(folder, manifest, [row for row in rows if row["image"] in names])
+    state, reason = COMPLETE, ""
     if lacking:
-        raise InvalidInput(
-            str(folder),
-            "frames",
-            f"{len(rows)} frames",
-            f"{len(lacking)} missing, the first {lacking[0]} (linna replay --complete renders them)",
-        )
+        state = TO_RENDER
+        if not manifest.get("scenario_toml"):
+            state = TELEMETRY_ONLY
+            reason = (
+                f"{len(lacking)} of {len(rows)} frames are not stored, the first {lacking[0]}, and the archive "
+                "declares no scenario to render them from"
+            )
+    return PassArchive(folder, digest, manifest, len(rows), len(rows) - len(lacking), state, reason)
+
+
+def _check_images(folder: Path, manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Check that the stored frames have the recorded size and that of the camera."""
     camera = manifest.get("camera") or {}
     size = (camera.get("width_px"), camera.get("height_px"))
     for row in rows:
-        if row["image"]:
-            found = _png_size(folder / row["image"])
-            if tuple(row["shape"][:2]) != found[::-1]:
-                raise InvalidInput(
-                    str(folder / row["image"]),
-                    "",
-                    f"{row['shape'][1]} x {row['shape'][0]} px as recorded",
-                    _by(found),
-                )
-            if found != size:
-                raise InvalidInput(
-                    str(folder / row["image"]),
-                    "",
-                    f"an image of the camera of {_by(size)} px",
-                    f"{_by(found)} px",
-                )
-    return PassArchive(folder, digest, manifest, len(rows))
+        place = str(folder / row["image"])
+        found = _png_size(folder / row["image"])
+        if tuple(row["shape"][:2]) != found[::-1]:
+            recorded = f"{row['shape'][1]} x {row['shape'][0]} px as recorded"
+            raise InvalidInput(place, "", recorded, _by(found))
+        if found != size:
+            raise InvalidInput(place, "", f"an image of the camera of {_by(size)} px", f"{_by(found)} px")
 
 
 def pack_archive(folder: Path, target: Path) -> None:
@@ -155,11 +175,15 @@ def pack_archive(folder: Path, target: Path) -> None:
 
 
 def write_flight_view(archive: Path, folder: Path) -> None:
-    """Copy what the payload was given into a folder: manifest without truth, inputs, tables, parameters, images."""
+    """Copy what the payload was given into a folder: manifest without truth, inputs, tables, parameters, images.
+
+    An archive with recorded detections is replayed without images.
+    """
     manifest, _ = read_manifest(archive)
     folder.mkdir(parents=True)
+    folders = ("payload/",) if DETECTIONS in manifest["files"] else _FLIGHT_FOLDERS
     for name in manifest["files"]:
-        if name.startswith(_FLIGHT_FOLDERS):
+        if name.startswith(folders):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(archive / name, folder / name)
     seen = {key: manifest[key] for key in _FLIGHT_KEYS if key in manifest}
@@ -181,25 +205,65 @@ def keep_archive(ground: Ground, path: Path, *, pinned: bool = False) -> PassArc
     """Check an archive and keep it by content; keeping it again changes nothing but the pin."""
     with opened_archive(path) as folder:
         archive = check_archive(folder)
-        files = store_of(ground)
-        stored = {name: files.put_file(folder / name) for name in (*archive.manifest["files"], MANIFEST)}
-        now = utc_now_ns()
-        with ground.database.writing() as connection:
-            hold(connection, _FILES_LOCK)
-            for name, file in stored.items():
-                if not file.path.exists():  # the file was removed with another archive meanwhile
-                    files.put_file(folder / name)
-            record = ArchiveRecord(
-                digest=archive.digest,
-                name=archive.name,
-                manifest_sha256=stored[MANIFEST].sha256,
-                frames=archive.frames,
-                octets=sum(file.octets for file in stored.values()),
-                pinned=pinned,
-                kept_since=UtcTime(now),
-            )
-            store.keep_archive(connection, record)
+        store_archive(ground, archive, pinned=pinned)
     return archive
+
+
+def store_archive(
+    ground: Ground, archive: PassArchive, *, pinned: bool = False, pass_id: int | None = None
+) -> None:
+    """Keep a checked archive; with `pass_id` it replaces the archives that were made of this pass before."""
+    files = store_of(ground)
+    stored = _stored(files, archive)
+    with ground.database.writing() as connection:
+        hold(connection, _FILES_LOCK)
+        _restore(files, archive.folder, stored)
+        record = ArchiveRecord(
+            digest=archive.digest,
+            name=archive.name,
+            manifest_sha256=stored[MANIFEST].sha256,
+            frames=archive.frames,
+            frames_stored=archive.frames_stored,
+            state=archive.state,
+            reason=archive.reason,
+            octets=sum(file.octets for file in stored.values()),
+            pinned=pinned,
+            kept_since=UtcTime(utc_now_ns()),
+            pass_id=pass_id,
+        )
+        store.keep_archive(connection, record)
+        if pass_id is not None:
+            replaced = store.remove_replaced(connection, pass_id, archive.digest)
+            _remove_files(files, replaced, store.list_archives(connection))
+
+
+def restock_archive(ground: Ground, record: ArchiveRecord, archive: PassArchive) -> None:
+    """Replace the files and the state of a kept archive, unless another process has done so."""
+    files = store_of(ground)
+    stored = _stored(files, archive)
+    with ground.database.writing() as connection:
+        hold(connection, _FILES_LOCK)
+        _restore(files, archive.folder, stored)
+        store.restock_archive(
+            connection,
+            record,
+            manifest_sha256=stored[MANIFEST].sha256,
+            frames_stored=archive.frames_stored,
+            state=archive.state,
+            reason=archive.reason,
+            octets=sum(file.octets for file in stored.values()),
+        )
+
+
+def _stored(files: FileArchive, archive: PassArchive) -> dict[str, StoredFile]:
+    return {name: files.put_file(archive.folder / name) for name in (*archive.manifest["files"], MANIFEST)}
+
+
+def _restore(files: FileArchive, folder: Path, stored: Mapping[str, StoredFile]) -> None:
+    """Store files again that were removed with another archive meanwhile."""
+    for name, file in stored.items():
+        if not file.path.exists():
+            files.put_file(folder / name)
 
 
 def kept_archives(ground: Ground) -> list[KeptArchive]:
@@ -229,20 +293,38 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
         No archive of this identity is kept.
     """
     with ground.database.writing() as connection:
-        manifest_sha256 = store.use_archive(connection, digest, utc_now_ns()).manifest_sha256
+        record = store.use_archive(connection, digest, utc_now_ns())
     files = store_of(ground)
-    manifest = json.loads(files.get(manifest_sha256))
+    archive = archive_of(ground, record, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / MANIFEST).write_bytes(files.get(manifest_sha256))
-        for name, entry in manifest["files"].items():
+        (folder / MANIFEST).write_bytes(files.get(record.manifest_sha256))
+        for name, entry in archive.manifest["files"].items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(files.path(entry["sha256"]), folder / name)
     except FileNotFoundError:
         raise NotFound("file of archive", digest) from None
     except OSError as error:
         raise storage_error(error, folder) from None
-    return check_archive(folder)
+    if archive.has_inputs:
+        check_archive(folder)
+    else:
+        checked_files(folder, archive.manifest)
+    return archive
+
+
+def archive_of(ground: Ground, record: ArchiveRecord, folder: Path) -> PassArchive:
+    """Return a kept archive with its manifest; `folder` is where its files are."""
+    manifest = json.loads(store_of(ground).get(record.manifest_sha256))
+    return PassArchive(
+        folder,
+        record.digest,
+        manifest,
+        record.frames,
+        record.frames_stored,
+        record.state,
+        record.reason,
+    )
 
 
 def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
@@ -260,10 +342,23 @@ def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
         old = store.remove_unused(connection, utc_now_ns() - unused_for_ns)
-        needed = _held(files, store.list_archives(connection))
-        for sha256 in _held(files, old) - needed:
-            files.path(sha256).unlink(missing_ok=True)
+        _remove_files(files, old, store.list_archives(connection))
     return sorted(record.digest for record in old)
+
+
+def _remove_files(
+    files: FileArchive, removed: Sequence[ArchiveRecord], kept: Sequence[ArchiveRecord]
+) -> None:
+    """Remove the files of removed archives that no kept archive has."""
+    for sha256 in _held(files, removed) - _held(files, kept):
+        files.path(sha256).unlink(missing_ok=True)
+
+
+def scratch_of(ground: Ground) -> Path:
+    """Return the folder for temporary copies of archives, which only the service can read."""
+    folder = ground.home / "regression" / "scratch"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def store_of(ground: Ground) -> FileArchive:

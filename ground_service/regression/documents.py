@@ -19,9 +19,15 @@ from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
 from ground_service.regression import store
 from ground_service.regression.archives import store_of
-from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, PASS, Gate
+from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED, PASS, Gate
 from ground_service.regression.model import JudgedGate, Verdict
-from ground_service.regression.outcome import PassVerdict, RegressionOutcome, pass_figures
+from ground_service.regression.outcome import (
+    JUDGED,
+    JUDGED_STATES,
+    PassVerdict,
+    RegressionOutcome,
+    pass_figures,
+)
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 from lunar.timescales import format_utc
 from reports.values import (
@@ -68,19 +74,19 @@ def regression_text(verdict: Verdict) -> str:
     for one in verdict.passes:
         if one.state != "judged":
             lines.append(f"  {one.name}: {one.state}: {one.detail}")
-    for gate in sorted(verdict.gates, key=lambda gate: (FAIL, INCONCLUSIVE, PASS).index(gate.outcome)):
+    order = (FAIL, INCONCLUSIVE, NOT_JUDGED, PASS)
+    for gate in sorted(verdict.gates, key=lambda gate: order.index(gate.outcome)):
         if gate.passed:
             continue
         where = f" on {gate.pass_name}" if gate.pass_name else ""
         state = f"waived ({gate.outcome}): {gate.waived}" if gate.waived else gate.outcome
         lines.append(f"  {state}: {gate.name}{where}: {gate_text(gate)}")
-    counts = {
-        name: sum(gate.outcome == name for gate in verdict.gates) for name in (PASS, FAIL, INCONCLUSIVE)
-    }
+    counts = {name: sum(gate.outcome == name for gate in verdict.gates) for name in order}
     lines.append(
         f"  {counts[PASS]} of {len(verdict.gates)} gates passed, {counts[FAIL]} failed, "
-        f"{counts[INCONCLUSIVE]} inconclusive, over "
-        f"{sum(one.state == 'judged' for one in verdict.passes)} of {len(verdict.passes)} passes "
+        f"{counts[INCONCLUSIVE]} inconclusive, "
+        + (f"{counts[NOT_JUDGED]} not judged, " if counts[NOT_JUDGED] else "")
+        + f"over {sum(one.state in JUDGED_STATES for one in verdict.passes)} of {len(verdict.passes)} passes "
         f"({verdict.frames} frames)"
     )
     if not verdict.gates:
@@ -93,6 +99,8 @@ def regression_text(verdict: Verdict) -> str:
 
 def gate_text(gate: JudgedGate) -> str:
     """Return the values of a gate, why it is inconclusive, and the number of frames needed."""
+    if gate.outcome == NOT_JUDGED:
+        return gate.reason or ""
     parts = [
         f"{_number(gate.baseline)} -> {_number(gate.candidate)} {gate.unit}".rstrip(),
         f"limit {_number(gate.limit)}",
@@ -111,7 +119,7 @@ def gate_text(gate: JudgedGate) -> str:
 def needed_text(verdict: Verdict) -> str:
     """Return the number of frames and passes needed to decide every gate over the suite; empty if all are decided."""
     needed, frames = verdict.frames_needed, verdict.frames
-    judged = sum(one.state == "judged" for one in verdict.passes)
+    judged = sum(one.state in JUDGED_STATES for one in verdict.passes)
     if needed is None or needed <= frames or not judged:
         return ""
     passes = math.ceil(needed * judged / frames)
@@ -135,10 +143,12 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
     """
     cases: list[tuple[str, str, str, str]] = []
     for one in verdict.passes:
-        kind = "" if one.state == "judged" else "failure" if one.state == "candidate failed" else "error"
+        kind = {"candidate failed": "failure", NOT_JUDGED: "skipped"}.get(one.state, "error")
+        if one.state in JUDGED_STATES:
+            kind = ""
         cases.append((f"pass {one.name}", "passes", kind, one.detail and f"{one.state}: {one.detail}"))
     for gate in verdict.gates:
-        kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: "error"}[gate.outcome]
+        kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: "error", NOT_JUDGED: "skipped"}[gate.outcome]
         text = f"{gate.outcome}: {gate_text(gate)}"
         if gate.waived:
             kind, text = "skipped", f"waived: {gate.waived}; {text}"
@@ -194,8 +204,8 @@ def regression_html(ground: Ground, outcome: RegressionOutcome, identity: str) -
 
 def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str) -> RegressionReport:
     """The report of a regression as a value."""
-    judged = [one for one in outcome.passes if one.state == "judged"]
-    troubled = [one for one in outcome.passes if one.state != "judged"]
+    judged = [one for one in outcome.passes if one.state == JUDGED]
+    troubled = [one for one in outcome.passes if one.state != JUDGED]
     sources = sorted(
         {str(name) for one in judged if one.context for name in one.context.manifest.get("data_sources", ())}
     )
@@ -455,17 +465,22 @@ def _verdict_text(outcome: RegressionOutcome, troubled: list[PassVerdict]) -> st
         parts.append(f"{_counted(failed, 'failed')}.")
     if unresolved:
         parts.append(f"{_counted(unresolved, 'inconclusive')}.")
-    if not outcome.gates:
+    unjudged = [gate for gate in outcome.gates if gate.outcome == NOT_JUDGED]
+    if len(unjudged) == len(outcome.gates):
         parts.append("No gate was judged.")
     elif not failed and not unresolved:
         parts.append(f"{sum(gate.passed for gate in outcome.gates)} of {len(outcome.gates)} gates passed.")
+    if unjudged:
+        parts.append(f"{_counted(unjudged, 'not judged')}.")
     if waived:
         parts.append(f"{_counted(waived, 'waived')}.")
     needed = needed_text(verdict_document(outcome))
     if needed:
         parts.append(f"{needed}.")
     if troubled:
-        parts.append(f"{len(troubled)} of {len(outcome.passes)} passes were not judged: see the remarks.")
+        parts.append(
+            f"{len(troubled)} of {len(outcome.passes)} passes were not judged, or without frames: see the remarks."
+        )
     return " ".join(parts)
 
 

@@ -21,12 +21,15 @@ from ground_service.regression.builds import CURRENT, Build, load_build, registe
 from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
 from ground_service.regression.model import Comparison
 from ground_service.regression.outcome import PassVerdict, RegressionOutcome
+from ground_service.regression.pass_archives import archive_of_pass
+from ground_service.regression.rendering import settle_archive
 from ground_service.regression.search import bisect, differences
 from ground_service.regression.service import (
     do_replay,
     find_replay,
     is_done,
     keep_regression,
+    may_be_replayed,
     run_regression,
 )
 
@@ -67,7 +70,9 @@ def prepared(
 def compared(ground: Ground, given: Comparison) -> dict[str, Any]:
     """Return the arguments of the job of a comparison."""
     unusable = [one.model_dump() for one in given.unusable]
-    arguments = prepared(ground, given.candidate, given.baseline, given.archives, all_if_empty=not unusable)
+    of_passes = [archive_of_pass(ground, pass_id).digest for pass_id in given.passes]
+    archives = list(dict.fromkeys([*given.archives, *of_passes]))
+    arguments = prepared(ground, given.candidate, given.baseline, archives, all_if_empty=not unusable)
     return {**arguments, "unusable": unusable, "workers": given.workers}
 
 
@@ -81,9 +86,12 @@ def named_build(ground: Ground, name: str) -> Build:
 def missing_replays(ground: Ground, arguments: Mapping[str, Any]) -> list[dict[str, str]]:
     """Arguments of the jobs of the replays that a regression needs and that were not done yet."""
     builds = [registered_build(ground, arguments[side]) for side in ("baseline", "candidate")]
+    chosen = set(arguments["archives"])
+    archives = {one.digest for one in kept_archives(ground) if one.digest in chosen and may_be_replayed(one)}
     return [
         {"archive": digest, "build": build.digest}
         for digest in arguments["archives"]
+        if digest in archives
         for build in dict.fromkeys(builds)
         if not is_done(find_replay(ground, digest, build))
     ]
@@ -93,6 +101,12 @@ def replay_job(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> di
     """One build over one archive."""
     replay = do_replay(ground, str(arguments["archive"]), registered_build(ground, str(arguments["build"])))
     return {"outcome": replay.outcome, "detail": replay.detail, "cpu_s": replay.cpu_s}
+
+
+def rendering_job(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    """Render the missing frames of a kept archive; an archive that could not be rendered is tried again."""
+    kept = settle_archive(ground, str(arguments["digest"]), again=True)
+    return kept.model_dump(mode="json", include={"digest", "frames", "frames_stored", "state", "reason"})
 
 
 def regression_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:

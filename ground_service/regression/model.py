@@ -12,6 +12,9 @@ from ground_service.http.times import UtcTime
 OK = "ok"
 """Outcome of a successful replay."""
 
+COMPLETE, TO_RENDER, TELEMETRY_ONLY = "complete", "to render", "telemetry only"
+"""States of a kept archive: all frames are stored; missing frames are rendered at the first use; no frames."""
+
 
 REASONS_LIMIT = 5
 """Reasons in a list; the verdict has all."""
@@ -38,10 +41,17 @@ class KeptArchive(Entity):
     digest: str
     name: str
     frames: int
+    frames_stored: int = Field(description="Frames with a stored image")
+    state: str = Field(
+        description="complete: all frames are stored; to render: the missing frames are rendered at the first use; "
+        "telemetry only: the frames are not available",
+        examples=["complete"],
+    )
+    reason: str = Field(description="Why frames are not available; otherwise empty")
     octets: int
     pinned: bool
     kept_since: UtcTime
-    pass_id: int | None = Field(default=None, description="The pass that was imported from it")
+    pass_id: int | None = Field(default=None, description="The pass of the archive")
 
 
 class ArchiveRecord(KeptArchive):
@@ -91,7 +101,12 @@ class Comparison(Given):
     )
     baseline: str = Field(default="current", pattern=r"^(current|[0-9a-f]{8,64})$")
     archives: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
-        default_factory=list, max_length=1000, description="Identities of kept archives; all when empty"
+        default_factory=list,
+        max_length=1000,
+        description="Identities of kept archives; without archives and passes: all kept archives",
+    )
+    passes: list[Annotated[int, Field(ge=1, le=2**31 - 1)]] = Field(
+        default_factory=list, max_length=1000, description="Passes whose archives are replayed"
     )
     unusable: list[UnusableArchive] = Field(
         default_factory=list, max_length=1000, description="Archives that could not be kept"
@@ -154,7 +169,7 @@ class JudgedGate(Entity):
 
     name: str = Field(examples=["detector.recall"])
     pass_name: str | None = Field(alias="pass", description="null: the whole suite")
-    outcome: str = Field(description="pass, fail or inconclusive", examples=["pass"])
+    outcome: str = Field(description="pass, fail, inconclusive or not judged", examples=["pass"])
     passed: bool
     baseline: float | None
     candidate: float | None
@@ -202,7 +217,10 @@ class JudgedPass(Entity):
 
     name: str
     archive: str
-    state: str = Field(description="judged, candidate failed, baseline failed or unusable")
+    state: str = Field(
+        description="judged, telemetry judged (without frames), not judged, candidate failed, baseline failed or "
+        "unusable"
+    )
     detail: str
     baseline: JudgedReplay | None = None
     candidate: JudgedReplay | None = None

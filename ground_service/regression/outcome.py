@@ -8,12 +8,22 @@ from typing import Any
 import numpy as np
 
 from ground_service.regression.builds import Build
-from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, PASS, Gate, verdict_of
+from ground_service.regression.gates.core import (
+    FAIL,
+    INCONCLUSIVE,
+    NOT_JUDGED,
+    PASS,
+    Gate,
+    verdict_of,
+)
 from ground_service.regression.gates.metrics import outcome_shares
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.model import KeptReplay
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
+
+JUDGED, TELEMETRY_JUDGED = "judged", "telemetry judged"
+JUDGED_STATES = (JUDGED, TELEMETRY_JUDGED)
 
 EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
 
@@ -25,9 +35,10 @@ class PassVerdict:
     Attributes
     ----------
     state
-        "judged", "candidate failed", "baseline failed" or "unusable" (the archive).
+        "judged", "telemetry judged" (from the received detections, without frames), "not judged" (the archive has
+        neither frames nor inputs of the payload), "candidate failed", "baseline failed" or "unusable" (the archive).
     detail
-        What went wrong, empty for a pass that was judged.
+        The reason of the state; empty for a pass that was judged.
     """
 
     name: str
@@ -57,12 +68,15 @@ class RegressionOutcome:
         """Pass, fail or inconclusive.
 
         "fail": a gate failed, or the candidate failed on a pass. "inconclusive": there is no gate, a gate is
-        inconclusive, or a pass could not be judged because of its archive or its baseline.
+        inconclusive, a pass could not be judged because of its archive or its baseline, or no pass has frames.
         """
         of_gates = verdict_of(self.gates)
-        if of_gates == FAIL or any(one.state == "candidate failed" for one in self.passes):
+        states = {one.state for one in self.passes}
+        if of_gates == FAIL or "candidate failed" in states:
             return FAIL
-        return of_gates if all(one.state == "judged" for one in self.passes) else INCONCLUSIVE
+        if JUDGED not in states or states - {*JUDGED_STATES, NOT_JUDGED}:
+            return INCONCLUSIVE
+        return of_gates
 
     @property
     def exit_status(self) -> int:
@@ -75,7 +89,7 @@ class RegressionOutcome:
         return sum(
             len(one.baseline_read.frames)
             for one in self.passes
-            if one.state == "judged" and one.baseline_read
+            if one.state in JUDGED_STATES and one.baseline_read
         )
 
     @property

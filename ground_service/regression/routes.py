@@ -17,6 +17,7 @@ from ground_service.http.common import (
     IdempotencyKey,
     Key,
     PagingOf,
+    PassId,
     upload_body,
 )
 from ground_service.http.model import PageOf
@@ -45,6 +46,7 @@ from ground_service.regression.model import (
     RegressionRequest,
     RegressionSummary,
 )
+from ground_service.regression.pass_archives import keep_pass
 from ground_service.store.files import StoredFile
 
 UPLOAD_PATHS = (f"{API_PREFIX}/builds", f"{API_PREFIX}/regression-archives")
@@ -96,6 +98,19 @@ async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: 
         return archive_service.kept_archive(ground, kept.digest)
 
     return await upload.run(keep)
+
+
+@regressions.post("/passes/{pass_id}/regression-archive", status_code=201, responses=problems(404))
+def keep_pass_archive(ground: GroundOf, _: Operator, pass_id: PassId, pinned: bool = False) -> KeptArchive:
+    """Keep the regression archive of a pass: its received data, and the inputs of the payload if they are known."""
+    return keep_pass(ground, pass_id, pinned=pinned)
+
+
+@regressions.post("/regression-archives/{digest}/frames", status_code=202, responses=problems(404))
+def render_kept_archive(ground: GroundOf, _: Operator, dispatcher: DispatcherOf, digest: Digest) -> Job:
+    """Render the missing frames of a kept archive as a job, and compare them with the recorded hashes."""
+    archive_service.kept_archive(ground, digest)
+    return get_job(ground, dispatcher.submit("rendering", {"digest": digest}))
 
 
 @regressions.patch("/regression-archives/{digest}")

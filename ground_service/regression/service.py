@@ -13,7 +13,7 @@ import os
 import platform
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,46 @@ from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.regression import store
-from ground_service.regression.archives import PassArchive, check_out, keep_archive, store_of
+from ground_service.regression.archives import (
+    DETECTIONS,
+    PassArchive,
+    archive_of,
+    check_out,
+    keep_archive,
+    scratch_of,
+    store_of,
+)
 from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build
 from ground_service.regression.documents import regression_html, verdict_document
-from ground_service.regression.gates.core import judge
+from ground_service.regression.gates.core import (
+    NOT_JUDGED,
+    Gate,
+    GatePolicy,
+    judge,
+    judge_without_frames,
+    not_judged,
+)
 from ground_service.regression.gates.metrics import same_telemetry
 from ground_service.regression.gates.policy import PolicyFile
-from ground_service.regression.model import OK, KeptReplay, Regression, RegressionSummary
-from ground_service.regression.outcome import PassVerdict, RegressionOutcome
+from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.model import (
+    COMPLETE,
+    OK,
+    TELEMETRY_ONLY,
+    KeptArchive,
+    KeptReplay,
+    Regression,
+    RegressionSummary,
+)
+from ground_service.regression.outcome import (
+    JUDGED,
+    TELEMETRY_JUDGED,
+    PassVerdict,
+    RegressionOutcome,
+)
+from ground_service.regression.pass_archives import LIVE, NO_INPUTS
+from ground_service.regression.rendering import settle_archive
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store.stored_files import register_file
@@ -69,8 +100,11 @@ def run_regression(
     if not archives and not unusable:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
     kept = [*(_kept(ground, given) for given in archives), *unusable]
-    usable = list(dict.fromkeys(one.digest for one in kept if isinstance(one, PassArchive)))
-    shards = [(digest, build) for digest in usable for build in dict.fromkeys((baseline, candidate))]
+    builds = tuple(dict.fromkeys((baseline, candidate)))
+    usable = {
+        one.digest: one for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)
+    }
+    shards = [(digest, build) for digest in usable for build in builds]
     shards = [shard for shard in shards if not is_done(find_replay(ground, *shard))]
     fly_shards(ground, shards, workers=workers, progress=progress)
     return judge_regression(ground, kept, candidate, baseline, policy)
@@ -103,9 +137,10 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
     known = find_replay(ground, digest, build)
     if known is not None and is_done(known):
         return known
-    with tempfile.TemporaryDirectory(prefix="replay-", dir=_scratch(ground)) as folder:
+    settle_archive(ground, digest)
+    with tempfile.TemporaryDirectory(prefix="replay-", dir=scratch_of(ground)) as folder:
         archive = check_out(ground, digest, Path(folder) / "archive")
-        refusal = _other_camera(build, archive)
+        refusal = _other_camera(build, archive) or _unreplayable(archive, (build,))
         if refusal:
             refused = KeptReplay(
                 outcome="refused",
@@ -187,7 +222,8 @@ def judge_regression(
     judged = [one for one in passes if one.baseline_read is not None and one.candidate_read is not None]
     remarks = []
     names = _unique_names(judged)
-    before, after = {}, {}
+    before: dict[str, PassFrames] = {}
+    after: dict[str, PassFrames] = {}
     elsewhere = 0
     for name, one in zip(names, judged, strict=True):
         assert one.baseline_read and one.candidate_read and one.baseline and one.candidate
@@ -200,7 +236,8 @@ def judge_regression(
         remarks.append(
             f"{elsewhere} passes were flown on different machines by the two builds: their latencies are not compared"
         )
-    gates = judge(before, after, policy.policy, today=format_utc(utc_now_ns())[:10])
+    whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
+    gates = _gates(before, after, whole, passes, policy.policy)
     if before and all(same_telemetry(before[name], after[name]) for name in before):
         remarks.append("Both builds sent identical telemetry in every frame: it is compared exactly")
     waived = [gate for gate in gates if gate.waived]
@@ -275,19 +312,71 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
     path = Path(given)
     try:
         if path.exists():
-            return keep_archive(ground, path)
+            return _settled(ground, keep_archive(ground, path).digest, path)
         with ground.database.reading() as connection:
             record = store.find_archive(connection, str(given))
         if record is None:
             raise InvalidInput(
                 str(given), "", "a pass archive, or the identity or the pass of one that is kept", "neither"
             )
-        return PassArchive(path, record.digest, {"pass_name": record.name}, record.frames)
+        return _settled(ground, record.digest, path)
     except (GroundError, LunarError) as error:
         return PassVerdict(path.name, "", "unusable", str(error))
 
 
+def may_be_replayed(archive: KeptArchive) -> bool:
+    """Return whether a kept archive has frames, or inputs of the payload from which it can be replayed."""
+    return archive.state != TELEMETRY_ONLY or archive.reason not in (LIVE, NO_INPUTS)
+
+
+def _settled(ground: Ground, digest: str, path: Path) -> PassArchive:
+    """Return a kept archive, whose missing frames are rendered first."""
+    settle_archive(ground, digest)
+    with ground.database.reading() as connection:
+        return archive_of(ground, store.get_archive(connection, digest), path)
+
+
+def _unreplayable(archive: PassArchive, builds: Sequence[Build]) -> str:
+    """Return why builds cannot replay an archive; empty if they can."""
+    if archive.state == COMPLETE:
+        return ""
+    if DETECTIONS not in archive.manifest["files"]:
+        return archive.reason
+    programs = [build.name for build in builds if build.command]
+    return f"{programs[0]} is a program, which needs frames: {archive.reason}" if programs else ""
+
+
+def _gates(
+    before: Mapping[str, PassFrames],
+    after: Mapping[str, PassFrames],
+    whole: Collection[str],
+    passes: Sequence[PassVerdict],
+    policy: GatePolicy,
+) -> list[Gate]:
+    """Return the gates over the passes with frames (`whole`), those without frames, and those that were not judged."""
+    today = format_utc(utc_now_ns())[:10]
+
+    def part(frames: Mapping[str, PassFrames], complete: bool) -> dict[str, PassFrames]:
+        return {name: one for name, one in frames.items() if (name in whole) == complete}
+
+    without = part(before, False)
+    if without and len(without) < len(before):
+        # Two families of tests: each has half of the probability that a build as good as the baseline fails.
+        policy = dataclasses.replace(policy, confidence=1.0 - (1.0 - policy.confidence) / 2.0)
+    gates = judge(part(before, True), part(after, True), policy, today=today)
+    if without:
+        reason = next(one.detail for one in passes if one.state == TELEMETRY_JUDGED)
+        gates += judge_without_frames(without, part(after, False), policy, reason, today=today)
+    out = [one for one in passes if one.state == NOT_JUDGED]
+    if out:
+        gates += not_judged(policy, [one.name for one in out], out[0].detail)
+    return gates
+
+
 def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseline: Build) -> PassVerdict:
+    reason = _unreplayable(archive, (baseline, candidate))
+    if reason:
+        return PassVerdict(archive.name, archive.digest, NOT_JUDGED, reason)
     replays = [find_replay(ground, archive.digest, build) for build in (baseline, candidate)]
     old, new = replays
     if old is None or new is None:
@@ -299,12 +388,15 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
             )
             return PassVerdict(archive.name, archive.digest, state, told, old, new)
     try:
-        with tempfile.TemporaryDirectory(prefix="judge-", dir=_scratch(ground)) as folder:
+        with tempfile.TemporaryDirectory(prefix="judge-", dir=scratch_of(ground)) as folder:
             context = pass_context(check_out(ground, archive.digest, Path(folder) / "a"), ground.data)
         read = [_read(ground, context, replay) for replay in (old, new)]
     except (GroundError, LunarError) as error:
         return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)
-    return PassVerdict(archive.name, archive.digest, "judged", "", old, new, context, read[0], read[1])
+    state = JUDGED if archive.state == COMPLETE else TELEMETRY_JUDGED
+    return PassVerdict(
+        archive.name, archive.digest, state, archive.reason, old, new, context, read[0], read[1]
+    )
 
 
 def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownlink:
@@ -338,12 +430,6 @@ def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
         name if names.count(name) == 1 else f"{name} {one.digest[:8]}"
         for name, one in zip(names, passes, strict=True)
     ]
-
-
-def _scratch(ground: Ground) -> Path:
-    folder = ground.home / "regression" / "scratch"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 @functools.cache

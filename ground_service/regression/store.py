@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, delete, select, update
+from sqlalchemy import Connection, delete, func, select, update
 
 from ground_service.errors import NotFound
 from ground_service.regression.model import (
@@ -55,15 +55,43 @@ def list_builds(connection: Connection, *, limit: int, offset: int) -> tuple[lis
 
 
 def keep_archive(connection: Connection, archive: ArchiveRecord) -> None:
-    """Add a kept archive; adding it again notes its use and pins it if requested."""
-    values = archive.model_dump(exclude={"kept_since", "pinned", "pass_id"})
+    """Add a kept archive; adding it again notes its use, pins it if requested, and adds its pass."""
+    values = archive.model_dump(exclude={"kept_since", "pinned"})
     now, pinned = archive.kept_since.utc_ns, int(archive.pinned)
     added = repository.add_new(
         connection, ARCHIVES, **values, pinned=pinned, used_utc_ns=now, created_utc_ns=now
     )
     if not added:
-        pin = {"pinned": 1} if pinned else {}
-        repository.change(connection, ARCHIVES, archive.digest, used_utc_ns=now, **pin)
+        changed: dict[str, int] = {"pinned": 1} if pinned else {}
+        if archive.pass_id is not None:
+            changed["pass_id"] = archive.pass_id
+        repository.change(connection, ARCHIVES, archive.digest, used_utc_ns=now, **changed)
+
+
+def restock_archive(
+    connection: Connection, archive: ArchiveRecord, *, manifest_sha256: str, **values: str | int
+) -> bool:
+    """Replace the files of a kept archive, and remove its replays; return False if it has changed meanwhile."""
+    expected = {"manifest_sha256": archive.manifest_sha256}
+    changed = change_if(
+        connection, ARCHIVES, archive.digest, expected, manifest_sha256=manifest_sha256, **values
+    )
+    if changed:
+        connection.execute(delete(REPLAYS).where(REPLAYS.c.archive_digest == archive.digest))
+    return changed
+
+
+def archives_of_pass(connection: Connection, pass_id: int) -> list[ArchiveRecord]:
+    """Return the kept archives of a pass, newest first."""
+    return [one for one in reversed(list_archives(connection)) if one.pass_id == pass_id]
+
+
+def remove_replaced(connection: Connection, pass_id: int, digest: str) -> list[ArchiveRecord]:
+    """Delete the archives that were made of a pass, except one and those that are pinned; return them."""
+    query = delete(ARCHIVES).where(
+        ARCHIVES.c.pass_id == pass_id, ARCHIVES.c.digest != digest, ARCHIVES.c.pinned == 0
+    )
+    return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
 
 
 def get_archive(connection: Connection, digest: str) -> ArchiveRecord:
@@ -87,7 +115,11 @@ def list_archives(connection: Connection) -> list[ArchiveRecord]:
     """Return all kept archives, oldest first."""
     passes = repository.PASSES
     query = (
-        select(ARCHIVES, passes.c.id.label("pass_id"))
+        select(
+            *(one for one in ARCHIVES.c if one is not ARCHIVES.c.pass_id),
+            func.coalesce(ARCHIVES.c.pass_id, passes.c.id).label("pass_id"),
+        )
+        .select_from(ARCHIVES)
         .outerjoin(passes, passes.c.archive_digest == ARCHIVES.c.digest)
         .order_by(ARCHIVES.c.created_utc_ns, ARCHIVES.c.digest)
     )

@@ -993,12 +993,16 @@ REGRESSION_ARCHIVES = Table(
     column("name", Text),
     column("manifest_sha256", String(64)),
     column("frames", Integer),
+    column("frames_stored", Integer),
+    column("state", String(16)),
+    column("reason", Text),
+    optional("pass_id", Integer, index=True),
     column("octets", BigInteger),
     column("pinned", Flag),
     column("used_utc_ns", BigInteger, index=True),
     column("created_utc_ns", BigInteger),
 )
-"""A pass archive kept to be flown again; `digest` is the SHA-256 of its manifest."""
+"""A pass archive kept for replays; `digest` is the SHA-256 of the manifest that it was kept with."""
 
 
 REPLAYS = Table(

@@ -190,6 +190,13 @@ def _mark_processed(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     return {"window_id": action.window_id, "state": close_window(ground, action.window_id)}
 
 
+def _keep_archive(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    from ground_service.regression.pass_archives import keep_pass
+
+    kept = keep_pass(ground, _pass_of(action))
+    return {"archive": kept.digest, "frames": kept.frames, "state": kept.state, "reason": kept.reason}
+
+
 def _run_regression(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     from ground_service.regression.jobs import prepared, regression_job
 
@@ -238,6 +245,7 @@ DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
     "evaluate": _evaluate,
     "report": _report,
     "mark_processed": _mark_processed,
+    "keep_archive": _keep_archive,
     "run_regression": _run_regression,
     "compute_trends": _compute_trends,
     "notify": _notify,

@@ -94,6 +94,12 @@ def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[s
     return replay_job(ground, arguments, job_id)
 
 
+def _rendering(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    from ground_service.regression.jobs import rendering_job
+
+    return rendering_job(ground, arguments, job_id)
+
+
 def _regression(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     from ground_service.regression.jobs import regression_job
 
@@ -111,6 +117,7 @@ WORK: dict[str, Work] = {
     "ingest": _ingest,
     "archive": _archive,
     "replay": _replay,
+    "rendering": _rendering,
     "regression": _regression,
     "analysis": _analysis,
     "nightly": nightly,

@@ -72,10 +72,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     search.add_argument("--top", type=int, default=10, metavar="N")
     _finish(search, _search)
     archive = commands.add_parser(
-        "archive", help="list, add, pin, pack or remove the archives kept for replays"
+        "archive", help="list, add, render, pin, pack or remove the archives kept for replays"
     )
-    archive.add_argument("action", choices=("list", "add", "pin", "unpin", "pack", "prune"))
-    archive.add_argument("target", nargs="?", help="archive to add or pack; identity to pin or unpin")
+    archive.add_argument("action", choices=("list", "add", "render", "pin", "unpin", "pack", "prune"))
+    archive.add_argument(
+        "target",
+        nargs="?",
+        help="archive to add or pack; pass to add or render; identity to render, pin or unpin",
+    )
     archive.add_argument("--out", type=Path, metavar="FILE", help="zip to write (pack)")
     archive.add_argument(
         "--unused-days",
@@ -98,11 +102,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def _archives(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--archive",
-        required=True,
+        default=[],
         nargs="+",
         action="extend",
         metavar="ARCHIVE",
         help="pass archives: folders, zips, folders of archives, or identities of kept archives",
+    )
+    parser.add_argument(
+        "--pass",
+        dest="passes",
+        type=int,
+        default=[],
+        nargs="+",
+        action="extend",
+        metavar="ID",
+        help="passes whose archives are replayed",
     )
     parser.add_argument(
         "--workers", type=int, metavar="N", help="simultaneous replays (default: one for each core)"
@@ -237,6 +251,10 @@ def _comparison(
     service: Client, arguments: argparse.Namespace, candidate: str, baseline: str
 ) -> dict[str, Any]:
     """Return a request to compare two builds over archives, which are uploaded if needed."""
+    from linna.errors import UsageError
+
+    if not arguments.archive and not arguments.passes:
+        raise UsageError(f"regress {arguments.what}: expected --archive ARCHIVE or --pass ID, found neither")
     workers = arguments.workers
     if workers is None and server_of(arguments) is None:
         workers = os.cpu_count() or 1
@@ -246,6 +264,7 @@ def _comparison(
         "candidate": builds[candidate],
         "baseline": builds[baseline],
         "archives": archives,
+        "passes": arguments.passes,
         "unusable": unusable,
         "workers": workers,
     }
@@ -325,7 +344,7 @@ def _archive(arguments: argparse.Namespace) -> int:
     from ground_service.regression import archives
     from linna.errors import UsageError
 
-    if arguments.action in ("add", "pin", "unpin", "pack") and not arguments.target:
+    if arguments.action in ("add", "render", "pin", "unpin", "pack") and not arguments.target:
         raise UsageError(f"regress archive {arguments.action}: expected an archive, found none")
     if arguments.action == "pack":
         if arguments.out is None:
@@ -335,22 +354,37 @@ def _archive(arguments: argparse.Namespace) -> int:
         return 0
     removed: list[str] = []
     with ground_client(arguments) as service:
-        if arguments.action == "add":
+        if arguments.action == "add" and _is_pass(arguments.target):
+            service.keep_pass_archive(int(arguments.target))
+        elif arguments.action == "add":
             _upload(service, Path(arguments.target), set())
+        elif arguments.action == "render":
+            target = arguments.target
+            digest = service.keep_pass_archive(int(target)).digest if _is_pass(target) else target
+            log("rendering the missing frames ...")
+            service.wait(service.render_kept_archive(digest).id)
         elif arguments.action in ("pin", "unpin"):
             service.change_kept_archive(arguments.target, pinned=arguments.action == "pin")
         elif arguments.action == "prune":
             removed = service.delete_kept_archives(unused_days=arguments.unused_days).removed
         kept = service.list_kept_archives()
-    shown = {"digest", "name", "frames", "octets", "pinned", "pass_id"}
+    shown = {
+        "digest", "name", "frames", "frames_stored", "state", "reason", "octets", "pinned", "pass_id",
+    }  # fmt: skip
     lines = [
-        f"{one.digest[:16]}  {one.frames:5} frames  {one.octets / 1e6:8.1f} MB  {one.name}"
+        f"{one.digest[:16]}  {one.frames_stored:5} of {one.frames:5} frames  {one.octets / 1e6:8.1f} MB  {one.name}"
         f"{'' if one.pass_id is None else f'  pass {one.pass_id}'}{'  pinned' if one.pinned else ''}"
+        f"{'' if one.state == 'complete' else f'  {one.state}'}{f': {one.reason}' if one.reason else ''}"
         for one in kept
     ]
     rows = [one.model_dump(mode="json", include=shown) for one in kept]
     emit(arguments, {"archives": rows, "removed": removed}, text="\n".join(lines) or "no archive is kept")
     return 0
+
+
+def _is_pass(target: str) -> bool:
+    """Return whether a target is the number of a pass and no file."""
+    return target.isascii() and target.isdigit() and len(target) < 10 and not Path(target).exists()
 
 
 def _build(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ import json
 import shutil
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from payload_emulator.flight.models import DEFAULT_NETWORK, NETWORKS, load_shipp
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.payload import Payload
 from payload_emulator.flight.ports import UNLIMITED, BareBoard, ResetCause
-from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.parameter_file import BuildParameters, parse_parameters
@@ -47,6 +47,10 @@ from tmtc.downlink import encode_cadus
 Image = NDArray[Any]
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 CpuClock = Callable[[], float]
+Recorded = tuple[ImageQuality, Detections]
+
+DETECTIONS = "payload/detections.jsonl"
+"""Received detections of an archive without frames, a line for each image."""
 
 STAGES = ("network", "detector", "navigation")
 """The network; the rest of the detector (image preparation, decoding); everything after it, telemetry included."""
@@ -150,15 +154,21 @@ def replay_archive(
     """
     manifest = _manifest(archive)
     record = load_record(archive)
-    lacking = missing_frames(archive, record.inputs)
+    recorded = load_detections(archive)
+    lacking = missing_frames(archive, record.inputs) if recorded is None else []
     if lacking and data is None:
         raise RecordError(
             f"{archive}: expected every frame, found {len(lacking)} missing, the first {lacking[0]}; "
             "complete the archive first (linna replay --complete)"
         )
-    images = rendered_images(archive, record, data) if lacking and data else stored_images(archive, record)
+    if recorded is not None:
+        images: Iterable[Image] = (np.zeros(item.image_shape, np.uint8) for item in record.inputs)
+    elif lacking and data:
+        images = rendered_images(archive, record, data)
+    else:
+        images = stored_images(archive, record)
     started = time.monotonic()
-    flown = replay(record, images, _with_network(build, manifest), progress=progress)
+    flown = replay(record, images, _with_network(build, manifest), progress=progress, recorded=recorded)
     wall_s = time.monotonic() - started
     out.mkdir(parents=True, exist_ok=True)
     octets = encode_cadus(
@@ -201,12 +211,18 @@ def replay(
     *,
     progress: Progress | None = None,
     cpu_clock: CpuClock = time.thread_time,
+    recorded: Mapping[int, Recorded] | None = None,
 ) -> Replay:
-    """The packets that a build makes of a recorded pass."""
+    """Return the packets that a build makes of a recorded pass.
+
+    Parameters
+    ----------
+    recorded
+        Received detections by on-board time of the image, in place of the detector; None: the images are examined.
+    """
     parameters = parameters_of(build, record.parameters)
-    detector = _TimedDetector(
-        load_shipped_model() if build.model is None else build.model, parameters, cpu_clock
-    )
+    model = load_shipped_model() if build.model is None else build.model
+    detector = _TimedDetector(model, parameters, cpu_clock, recorded)
     board = RecordedBoard()
 
     def started() -> Payload:
@@ -218,7 +234,7 @@ def replay(
             model_octets=detector.onnx.model_octets,
             board=board,
             mode=PayloadMode.standby,
-            make_detector=lambda octets: _TimedDetector(octets, parameters, cpu_clock),
+            make_detector=lambda octets: _TimedDetector(octets, parameters, cpu_clock, recorded),
         )
 
     payload = started()
@@ -231,6 +247,7 @@ def replay(
         if board.enter_step(item) and item is not record.inputs[0]:
             payload = started()
         detector.reset()
+        detector.image_ticks = item.clock_ticks
         began = cpu_clock()
         packets += payload.step(image, item.attitude, item.clock_ticks, item.telecommands, item.instruments)
         step_s = cpu_clock() - began
@@ -295,6 +312,34 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     return _ahead(image_of, record.inputs)
 
 
+def load_detections(archive: Path) -> dict[int, Recorded] | None:
+    """Return the received detections of an archive without frames by on-board time; None for an archive with frames.
+
+    Raises
+    ------
+    RecordError
+        The file has another form.
+    """
+    path = archive / DETECTIONS
+    if not path.is_file():
+        return None
+    found: dict[int, Recorded] = {}
+    try:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            row = json.loads(line)
+            u_px, v_px, diameter_px, score, sigma_px = (
+                np.array([np.nan if value is None else value for value in row[name]], dtype=np.float64)
+                for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")
+            )
+            detections = Detections(u_px, v_px, diameter_px, score, sigma_px)
+            found[int(row["ticks"])] = ImageQuality(row["quality"]), detections
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(
+            f"{path}: expected the detections of each image, found something else ({error})"
+        ) from None
+    return found
+
+
 def complete_archive(
     archive: Path, out: Path, data: DataFolder, progress: Progress | None = None
 ) -> dict[str, Any]:
@@ -351,6 +396,8 @@ class _TimedDetector:
     model: bytes
     parameters: BuildParameters
     clock: CpuClock
+    recorded: Mapping[int, Recorded] | None = None
+    image_ticks: int = 0
     onnx: OnnxDetector = field(init=False)
     examine_s: float = field(default=0.0, init=False)
     network_s: float = field(default=0.0, init=False)
@@ -377,6 +424,8 @@ class _TimedDetector:
     def examine(
         self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
     ) -> tuple[ImageQuality, Detections]:
+        if self.recorded is not None:
+            return self.recorded.get(self.image_ticks, (ImageQuality.INVALID, no_detections()))
         began = self.clock()
         found = self.onnx.examine(image, sun_in_camera)
         self.examine_s += self.clock() - began

@@ -339,6 +339,8 @@ MATRIX = [
     ("POST", "/regression-archives", "operator"),
     ("PATCH", f"/regression-archives/{'0' * 64}", "operator"),
     ("DELETE", "/regression-archives", "operator"),
+    ("POST", f"/regression-archives/{'0' * 64}/frames", "operator"),
+    ("POST", "/passes/1/regression-archive", "operator"),
     ("POST", "/analyses", "operator"),
     ("GET", "/regressions", "viewer"),
     ("POST", "/regressions", "operator"),

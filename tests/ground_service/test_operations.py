@@ -22,13 +22,13 @@ with warnings.catch_warnings():
 
 VERBS = {
     "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export", "get",
-    "import", "keep", "list", "refuse", "reject", "release", "request", "revoke", "run", "search", "send", "shelve",
-    "start", "take", "uplink", "upload",
+    "import", "keep", "list", "refuse", "reject", "release", "render", "request", "revoke", "run",
+    "search", "send", "shelve", "start", "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
     "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "End",
     "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register", "Reject",
-    "Release", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
+    "Release", "Render", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
     "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "links", "missions", "passes",

@@ -348,6 +348,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("correlate", "receptions", receptions, "--spacecraft-id", 76)
             ask("correlate", "receptions", mission, "--spacecraft-id", 76)
             ask("regress", "archive", "add", synthetic_archive)
+            ask("regress", "archive", "add", 99)
+            ask("regress", "archive", "render", "0" * 64)
             ask("regress", "archive", "pin", "0" * 64)
             do("regress", "archive", "prune", "--unused-days", 1)
             ask("regress", "archive", "list")
@@ -358,6 +360,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("regress", "run", *archives, "--build", "current")
             ask("regress", "run", *archives, "--build", "0" * 64)
             ask("regress", "run", *archives, "--build", "current", "--policy", mission)
+            ask("regress", "run", "--pass", 99, "--build", "current")
+            ask("regress", "run", "--build", "current")
             ask("regress", "baseline", *archives)
             ask(
                 "regress",

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ground_service.regression.archives import check_archive
+from ground_service.regression.rendering import telemetry_only
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ParameterError, RecordError
 from payload_emulator.flight.payload import FlightParameters
@@ -95,6 +98,28 @@ def test_the_flown_build_says_of_every_frame_what_it_said_in_flight(archive: Pat
     flown, again = ((folder / "downlink.cadu").read_bytes() for folder in (archive, tmp_path / "out"))
     for name in ("detections", "navigation_state", "frame_outcome"):
         assert packets_of(name, again) == packets_of(name, flown), name
+
+
+def test_received_detections_replace_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:
+    """A replay from received detections reports the same detections; navigation differs by their resolution only."""
+    flown = (copy / "downlink.cadu").read_bytes()
+    kept = telemetry_only(replace(check_archive(copy), reason="no frames"))
+    assert kept.has_inputs
+    shutil.rmtree(copy / "frames")
+    replay_archive(copy, FlightBuild(), tmp_path / "out")
+    again = (tmp_path / "out/downlink.cadu").read_bytes()
+    assert packets_of("detections", again) == packets_of("detections", flown)
+    before, after = (decode(octets).tables()["navigation_state"].columns for octets in (flown, again))
+    assert len(before["image_ticks"]) == len(after["image_ticks"]) > FRAMES
+    # A resolution of 1/64 px is 3 m on the ground here.
+    assert np.nanmax(np.abs(before["latitude_deg"] - after["latitude_deg"])) < 1e-3
+    assert np.nanmax(np.abs(before["altitude_m"] - after["altitude_m"])) < 30.0
+
+
+def test_damaged_detections_are_refused(copy: Path, tmp_path: Path) -> None:
+    (copy / "payload/detections.jsonl").write_text('{"ticks": 1}\n')
+    with pytest.raises(RecordError, match="expected the detections of each image, found something else"):
+        replay_archive(copy, FlightBuild(), tmp_path / "out")
 
 
 def test_a_replay_asks_no_clock_for_what_it_says(archive: Path) -> None:

@@ -277,12 +277,17 @@ def upgrade() -> None:
         sa.Column("name", sa.Text(), nullable=False),
         sa.Column("manifest_sha256", sa.String(length=64), nullable=False),
         sa.Column("frames", sa.Integer(), nullable=False),
+        sa.Column("frames_stored", sa.Integer(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("reason", sa.Text(), nullable=False),
+        sa.Column("pass_id", sa.Integer(), nullable=True),
         sa.Column("octets", sa.BigInteger(), nullable=False),
         sa.Column("pinned", sa.SmallInteger(), nullable=False),
         sa.Column("used_utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("digest", name=op.f("pk_regression_archives")),
     )
+    op.create_index(op.f("ix_regression_archives_pass_id"), "regression_archives", ["pass_id"], unique=False)
     op.create_index(
         op.f("ix_regression_archives_used_utc_ns"), "regression_archives", ["used_utc_ns"], unique=False
     )

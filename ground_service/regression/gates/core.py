@@ -10,6 +10,8 @@ A gate compares paired samples of both builds and has three outcomes:
   passes, so this needs no correction for the number of gates (intersection-union test).
 - **inconclusive**: everything else, such as too few frames or a value that is unknown.
 
+A gate that needs frames is *not judged* on passes whose frames are not available, which the verdict does not count.
+
 Telemetry that is identical in every frame is compared exactly, as are deterministic metrics (packets that cannot be
 decoded, memory).
 
@@ -56,6 +58,10 @@ from ground_service.regression.gates.statistics import (
 )
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
+NOT_JUDGED = "not judged"
+
+FRAME_METRICS = ("detector.", "latency.", "memory")
+"""Beginnings of the names of the metrics that need frames: detector, CPU time and memory."""
 
 BIAS = "detector.bias"
 LATENCY = "latency."
@@ -133,7 +139,7 @@ class Gate:
     Attributes
     ----------
     outcome
-        "pass", "fail" or "inconclusive".
+        "pass", "fail", "inconclusive" or "not judged".
     pass_name
         Empty for a gate over the whole suite.
     baseline, candidate
@@ -222,8 +228,61 @@ def judge(
     return [_with_waiver(gate, policy.waivers, today) for gate in gates]
 
 
+def judge_without_frames(
+    baseline: Mapping[str, PassFrames],
+    candidate: Mapping[str, PassFrames],
+    policy: GatePolicy,
+    reason: str,
+    *,
+    today: str = "",
+) -> list[Gate]:
+    """Return the gates over passes that were replayed from received detections.
+
+    Only the metrics of navigation and telemetry are judged. The gates that need frames are not judged.
+    """
+    rules = tuple(rule for rule in policy.rules if not _needs_frames(rule.figure))
+    gates = judge(baseline, candidate, replace(policy, rules=rules), today=today)
+    label = _label(list(baseline))
+    judged = [
+        gate if gate.pass_name else replace(gate, pass_name=label)
+        for gate in gates
+        if not _needs_frames(gate.name)
+    ]
+    return [*judged, *not_judged(policy, list(baseline), reason, frames_only=True)]
+
+
+def not_judged(
+    policy: GatePolicy, names: Sequence[str], reason: str, *, frames_only: bool = False
+) -> list[Gate]:
+    """Return a gate that is not judged for each metric of a policy, or for each metric that needs frames."""
+    rules = {rule.figure: rule for rule in policy.rules if not frames_only or _needs_frames(rule.figure)}
+    return [
+        Gate(
+            rule.figure,
+            NOT_JUDGED,
+            math.nan,
+            math.nan,
+            rule.margin,
+            math.nan,
+            pass_name=_label(names),
+            resolution=math.inf,
+            reason=reason,
+        )
+        for rule in rules.values()
+    ]
+
+
+def _needs_frames(figure: str) -> bool:
+    return figure.startswith(FRAME_METRICS)
+
+
+def _label(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{len(names)} passes without frames"
+
+
 def verdict_of(gates: Sequence[Gate]) -> str:
-    """Return the verdict over the gates that are not waived: "fail", "pass" or (also without gates) "inconclusive"."""
+    """Return "fail", "pass" or (also without gates) "inconclusive" over the judged gates that are not waived."""
+    gates = [gate for gate in gates if gate.outcome != NOT_JUDGED]
     if any(gate.outcome == FAIL and not gate.waived for gate in gates):
         return FAIL
     return PASS if gates and all(gate.counts_as_passed for gate in gates) else INCONCLUSIVE

@@ -13,7 +13,7 @@ async function upload(path, file) {
 }
 
 const verdictMark = (verdict) => stateMark({ pass: "passed", fail: "failed" }[verdict] ?? verdict);
-const OUTCOMES = ["fail", "inconclusive", "pass"];
+const OUTCOMES = ["fail", "inconclusive", "not judged", "pass"];
 
 // What would decide an open gate, or why its outcome does not count.
 function remarkOf(gate) {

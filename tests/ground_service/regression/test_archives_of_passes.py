@@ -1,35 +1,66 @@
-"""Kept archives that are named by the pass that was imported from them."""
+"""Regression archives of passes: kept by a rule, named by the pass, rendered or without frames."""
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ground_service.automation.service import list_actions
 from ground_service.client.local import local_client
-from ground_service.ground import Ground
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground, open_ground
 from ground_service.http.times import UtcTime
+from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, read_manifest
-from ground_service.regression import store
-from ground_service.regression.model import ArchiveRecord
+from ground_service.passes.service import define_pass
+from ground_service.regression import rendering, store
+from ground_service.regression.archives import check_out, keep_archive, kept_archives
+from ground_service.regression.builds import build_of
+from ground_service.regression.documents import regression_junit, regression_text, verdict_document
+from ground_service.regression.gates.policy import load_policy
+from ground_service.regression.jobs import compared, missing_replays
+from ground_service.regression.model import ArchiveRecord, Comparison
+from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_pass, keep_pass
+from ground_service.regression.service import run_regression
 from linna.commands import regress
-from tests.ground_service.conftest import SyntheticPass
+from tests.ground_service.conftest import (
+    SPACECRAFT,
+    START,
+    FlyablePass,
+    SyntheticPass,
+    encode_downlink,
+    write_manifest,
+)
+
+STOP = START + 600_000_000_000
 
 
 @pytest.fixture(scope="module")
-def archive(make_pass: Callable[..., SyntheticPass]) -> Path:
-    return make_pass(frames=4, seed=3).folder
+def archive(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+    return make_pass(frames=4, seed=3)
 
 
-def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: Path) -> None:
-    _, digest = read_manifest(archive)
+@pytest.fixture(scope="module")
+def flown(make_flyable: Callable[..., FlyablePass]) -> FlyablePass:
+    return make_flyable(frames=4, seed=5)
+
+
+def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: SyntheticPass) -> None:
+    _, digest = read_manifest(archive.folder)
     record = ArchiveRecord(
         digest=digest,
         name="synthetic pass",
         frames=4,
+        frames_stored=4,
+        state="complete",
+        reason="",
         octets=1,
-        pinned=False,
+        pinned=True,
         kept_since=UtcTime(0),
         manifest_sha256="0" * 64,
     )
@@ -37,8 +68,185 @@ def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: Path) -> N
         store.keep_archive(connection, record)
     with local_client(either, "ann") as service:
         assert [one.pass_id for one in service.list_kept_archives()] == [None]
-        pass_id = import_archive(either, archive)
+        pass_id = import_archive(either, archive.folder)
         assert [one.pass_id for one in service.list_kept_archives()] == [pass_id]
         assert regress._kept(service, [str(pass_id)]) == ([digest], [])
         _, [unusable] = regress._kept(service, ["99"])
         assert "identity or the pass of one that is kept" in unusable["detail"]
+
+
+def test_an_imported_pass_is_kept_by_a_default_rule(either: Ground, flown: FlyablePass) -> None:
+    pass_id = import_archive(either, flown.folder)
+    _, digest = read_manifest(flown.folder)
+    [kept] = kept_archives(either)
+    assert (kept.digest, kept.pass_id, kept.state, kept.reason) == (digest, pass_id, "complete", "")
+    assert (kept.frames, kept.frames_stored) == (4, 4)
+    [action], _ = list_actions(either)
+    assert (action.rule, action.action, action.state) == (
+        "regression archive of an imported pass",
+        "keep_archive",
+        "done",
+    )
+    assert action.result == {"archive": digest, "frames": 4, "state": "complete", "reason": ""}
+    assert keep_pass(either, pass_id).digest == digest
+    assert len(kept_archives(either)) == 1
+    given = Comparison(candidate="current", passes=[pass_id])
+    assert compared(either, given)["archives"] == [digest]
+
+
+def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(
+    ground: Ground, archive: SyntheticPass
+) -> None:
+    pass_id = import_archive(ground, archive.folder)
+    [kept] = kept_archives(ground)
+    assert (kept.pass_id, kept.state, kept.reason) == (pass_id, "telemetry only", NO_INPUTS)
+
+
+def test_images_that_the_ground_did_not_store_are_left_out(
+    ground: Ground, flown: FlyablePass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ground_service.passes.archive_import.FRAMES_KEPT", 2)
+    pass_id = import_archive(ground, flown.folder)
+    [kept] = kept_archives(ground)
+    assert (kept.pass_id, kept.frames, kept.frames_stored, kept.state) == (pass_id, 4, 2, "telemetry only")
+    assert kept.reason.startswith("2 of 4 frames are not stored, the first 1, ")
+    assert kept.digest == read_manifest(flown.folder)[1]
+
+
+def test_a_live_pass_keeps_its_received_data_and_is_replaced_by_late_data(
+    either: Ground, archive: SyntheticPass, tmp_path: Path
+) -> None:
+    half = len(archive.packets) // 2
+    for number, packets in enumerate((archive.packets[:half], archive.packets)):
+        file = tmp_path / f"{number}.cadu"
+        file.write_bytes(encode_downlink(packets))
+        ingest_file(either, file, spacecraft_id=SPACECRAFT)
+        if number == 0:
+            pass_id = define_pass(
+                either, name="live", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=SPACECRAFT
+            )
+            first = archive_of_pass(either, pass_id)
+            assert archive_of_pass(either, pass_id).digest == first.digest
+    assert (first.pass_id, first.state, first.reason) == (pass_id, "telemetry only", LIVE)
+    second = keep_pass(either, pass_id)
+    assert second.digest != first.digest and second.frames == 4 > first.frames
+    assert [one.digest for one in kept_archives(either)] == [second.digest]
+    found = check_out(either, second.digest, tmp_path / "out")
+    assert len((tmp_path / "out/downlink.packets").read_bytes()) == sum(map(len, archive.packets))
+    assert not found.has_inputs
+    arguments = compared(either, Comparison(candidate="current", passes=[pass_id]))
+    assert missing_replays(either, arguments) == []
+
+
+def test_a_pass_without_telemetry_has_no_archive(ground: Ground) -> None:
+    pass_id = define_pass(ground, name="live", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=SPACECRAFT)
+    with pytest.raises(InvalidInput, match=f"pass {pass_id}: expected received telemetry, found none"):
+        keep_pass(ground, pass_id)
+
+
+@pytest.fixture
+def unrendered(flown: FlyablePass, tmp_path: Path) -> Path:
+    """An archive without two of its frames, whose scenario is not one."""
+    folder = tmp_path / "unrendered"
+    shutil.copytree(flown.folder, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]
+    (folder / "frames/000001.png").unlink()
+    (folder / "frames/000003.png").unlink()
+    write_manifest(folder, {**manifest, "scenario_toml": "no scenario"})
+    return folder
+
+
+def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
+    either: Ground, unrendered: Path, flown: FlyablePass, make_build: Callable, tmp_path: Path
+) -> None:
+    digest = keep_archive(either, unrendered).digest
+    [kept] = kept_archives(either)
+    assert (kept.frames, kept.frames_stored, kept.state, kept.reason) == (4, 2, "to render", "")
+    build = build_of(either, str(make_build("good", {"synthetic pass 5": flown.packets})))
+    outcome = run_regression(either, [digest], build, build, load_policy())
+    [kept] = kept_archives(either)
+    assert kept.state == "telemetry only"
+    assert kept.reason.startswith("the frames cannot be rendered: ")
+    assert str(tmp_path) not in kept.reason and str(either.home) not in kept.reason
+    [one] = outcome.passes
+    assert one.state == "not judged"
+    assert one.detail.startswith("good is a program, which needs frames: the frames cannot be rendered")
+    assert outcome.verdict == "inconclusive"
+    assert {gate.outcome for gate in outcome.gates} == {"not judged"}
+    assert not any(gate.passed for gate in outcome.gates)
+    assert "detector.recall" in {gate.name for gate in outcome.gates}
+    verdict = verdict_document(outcome)
+    assert "0 of 18 gates passed" in regression_text(verdict)
+    assert "not judged: detector.recall on synthetic pass 5: good is a program" in regression_text(verdict)
+    junit = regression_junit(verdict, 0)
+    assert 'failures="0" errors="0" skipped="19"' in junit
+    rows = [json.loads(line) for line in _detections(either, digest, tmp_path).splitlines()]
+    assert [row["quality"] for row in rows] == [0, 0, 0, 0]
+    assert all(len(row["u_px"]) == len(row["sigma_px"]) > 0 for row in rows)
+
+
+def _detections(ground: Ground, digest: str, folder: Path) -> str:
+    check_out(ground, digest, folder / "kept")
+    return (folder / "kept/payload/detections.jsonl").read_text()
+
+
+def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
+    ground: Ground, unrendered: Path, make_flyable: Callable, make_build: Callable
+) -> None:
+    whole = make_flyable(frames=30, seed=41)
+    build = build_of(ground, str(make_build("good", {"synthetic pass 41": whole.packets})))
+    outcome = run_regression(ground, [whole.folder, unrendered], build, build, load_policy())
+    assert [one.state for one in outcome.passes] == ["judged", "not judged"]
+    assert outcome.verdict == "pass"
+    alone = run_regression(ground, [whole.folder], build, build, load_policy())
+    judged = [gate.name for gate in outcome.gates if gate.outcome != "not judged"]
+    assert judged == [gate.name for gate in alone.gates]
+
+
+def test_a_rendering_that_takes_too_long_is_stopped(
+    ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendering, "RENDER_LIMIT_S", -1.0)
+    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
+    assert (kept.state, kept.reason) == ("telemetry only", "the frames were not rendered within -1 s")
+
+
+def test_an_archive_is_rendered_again_on_request(
+    ground: Ground, unrendered: Path, flown: FlyablePass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    digest = keep_archive(ground, unrendered).digest
+    assert rendering.settle_archive(ground, digest).state == "telemetry only"
+
+    def render(_ground: Ground, folder: Path, out: Path) -> str:
+        assert not (folder / "payload/detections.jsonl").exists()
+        shutil.copytree(flown.folder, out)
+        return ""
+
+    monkeypatch.setattr(rendering, "_render", render)
+    assert rendering.settle_archive(ground, digest).state == "telemetry only"
+    kept = rendering.settle_archive(ground, digest, again=True)
+    assert (kept.digest, kept.state, kept.reason, kept.frames_stored) == (digest, "complete", "", 4)
+    assert keep_archive(ground, unrendered).digest == digest
+    assert [one.state for one in kept_archives(ground)] == ["complete"]
+
+
+def test_an_archive_of_an_older_version_asks_for_another_import(
+    tmp_path: Path, archive: SyntheticPass
+) -> None:
+    with open_ground(tmp_path / "home") as ground:
+        pass_id = import_archive(ground, archive.folder)
+        ground.files.path(read_manifest(archive.folder)[1]).unlink()
+        with pytest.raises(InvalidInput, match="import the archive again"):
+            keep_pass(ground, pass_id)
+        import_archive(ground, archive.folder)
+        assert keep_pass(ground, pass_id).pass_id == pass_id
+
+
+def test_the_operations_keep_and_render_the_archive_of_a_pass(ground: Ground, flown: FlyablePass) -> None:
+    pass_id = import_archive(ground, flown.folder)
+    with local_client(ground, "ann") as service:
+        kept = service.keep_pass_archive(pass_id, pinned=True)
+        assert (kept.pass_id, kept.pinned) == (pass_id, True)
+        job: Any = service.wait(service.render_kept_archive(kept.digest).id)
+        assert job.result["state"] == "complete"

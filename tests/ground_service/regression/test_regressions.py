@@ -243,13 +243,13 @@ def rewritten(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
-def test_missing_frames_are_told_with_the_first_of_them(judge, passes, copy: Path) -> None:
+def test_a_program_does_not_replay_a_pass_without_frames(judge, passes, copy: Path) -> None:
     for number in (7, 9):
         (copy / f"frames/{number:06d}.png").unlink()
     rewritten(copy, lambda m: [m["files"].pop(f"frames/{n:06d}.png") for n in (7, 9)])
     outcome = judge(archives=[copy, passes[1].folder])
-    assert outcome.passes[0].state == "unusable"
-    assert "2 missing, the first 7" in outcome.passes[0].detail
+    assert outcome.passes[0].state == "not judged"
+    assert "2 of 30 frames are not stored, the first 7" in outcome.passes[0].detail
 
 
 def test_an_archive_of_another_camera_is_told(judge, passes, copy: Path) -> None:
