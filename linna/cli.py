@@ -41,6 +41,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "ingest": ("ingest", "ingest downlink files, pass archives or live telemetry"),
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
+    "performance": ("performance", "recall, drift and error over many passes, and monthly reports"),
     "export": ("export", "write a pass in the formats of other tools: ephemerides, SPICE, maps, tables"),
     "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
     "plan": ("plan", "search, enter, approve, uplink and exchange observation windows"),

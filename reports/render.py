@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 from reports.errors import UnknownReportKind
 from reports.json_form import to_json
 from reports.paper_values import PaperReport
-from reports.values import CampaignReport, DatasetReport, DetectorReport, PassReport, RegressionReport
+from reports.values import (
+    CampaignReport,
+    DatasetReport,
+    DetectorReport,
+    MonthlyReportValue,
+    PassReport,
+    RegressionReport,
+)
 
 if TYPE_CHECKING:
     from reports.document import Document
@@ -81,6 +88,10 @@ def _document(report: Any) -> Document:
             from reports.detector_report import detector_document
 
             return detector_document(report)
+        case MonthlyReportValue():
+            from reports.monthly_report import monthly_document
+
+            return monthly_document(report)
         case DatasetReport():
             from reports.dataset_report import dataset_document
 

@@ -775,3 +775,79 @@ class RegressionReport(ReportCommon):
     candidate_passes: tuple[CampaignPass, ...] = ()
     baseline_passes: tuple[CampaignPass, ...] = ()
     changed_frames: tuple[ChangedFrame, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class MonthPass:
+    """One pass of a monthly report; NaN and empty texts where unknown."""
+
+    pass_id: int
+    name: str
+    start_utc_ns: int
+    estimator: str
+    recall: float
+    drift_percent: float
+    median_error_m: float
+    altitude_km: float
+    sun_elevation_deg: float
+    terrain: str
+    build: str
+    packets: int
+    packets_lost: int
+    verdict_level: str
+
+
+@dataclass(frozen=True, slots=True)
+class MeanByGroup:
+    """Mean of a metric over the passes of a group and its 95 % interval; NaN where unknown."""
+
+    factor: str
+    group: str
+    metric: str
+    passes: int
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class LevelChange:
+    """Significant change of the level of a metric; `pass_id` is the first pass after it."""
+
+    metric: str
+    pass_id: int
+    utc_ns: int
+    before: float
+    after: float
+    passes_before: int
+    passes_after: int
+    p_value: float
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementOverTime:
+    """Requirement over the passes of a rolling window; the share of met ones is NaN where none was judged."""
+
+    name: str
+    unit: str
+    limit: float | None
+    passes: int
+    met: int
+    not_met: int
+    unknown: int
+    share_met: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class MonthlyReportValue(ReportCommon):
+    """Performance of a spacecraft in a month."""
+
+    month: str
+    passes: tuple[MonthPass, ...] = ()
+    groups: tuple[MeanByGroup, ...] = ()
+    changes: tuple[LevelChange, ...] = ()
+    requirements: tuple[RequirementOverTime, ...] = ()
+    window_days: float = 7.0
+    false_alarm_rate: float = 0.01

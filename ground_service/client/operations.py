@@ -39,6 +39,7 @@ from ground_service.passes.model import (
     States,
     Trend,
 )
+from ground_service.performance.model import MonthlyReport, Performance
 from ground_service.planning.model import Imported, Plan, SearchResult, Window
 from ground_service.planning.request_model import RequestPlan, StandingRequest
 from ground_service.regression.model import Build, KeptArchive, Pruned, Regression, RegressionSummary
@@ -266,6 +267,37 @@ class Client(Connection):
     def list_newest_reports(self, pass_ids: Sequence[int]) -> list[ReportSummary]:
         """List verdict and main figures of the newest report of each of these passes that has one."""
         return self._all(ReportSummary, "/reports", pass_id=[str(one) for one in pass_ids])
+
+    def get_performance(
+        self,
+        spacecraft_id: int,
+        *,
+        instance: str | None = None,
+        start: str | None = None,
+        stop: str | None = None,
+        window_days: float = 7.0,
+    ) -> Performance:
+        """Return recall, drift and error over the reported passes of a spacecraft, with changes of level."""
+        return self._get(
+            Performance,
+            f"/spacecraft/{spacecraft_id}/performance",
+            instance=instance,
+            start=start,
+            stop=stop,
+            window_days=window_days,
+        )
+
+    def create_monthly_report(self, spacecraft_id: int, month: str) -> MonthlyReport:
+        """Create the report of a month (YYYY-MM) of a spacecraft."""
+        return self._post(MonthlyReport, f"/spacecraft/{spacecraft_id}/monthly-reports/{_part(month)}")
+
+    def list_monthly_reports(self, *, spacecraft_id: int | None = None) -> Listing[MonthlyReport]:
+        """List monthly reports, newest month first."""
+        return self._list(MonthlyReport, "/monthly-reports", spacecraft_id=spacecraft_id)
+
+    def get_monthly_report(self, report_id: str, target: Path, *, kind: ReportKind = "html") -> None:
+        """Download a monthly report into a file."""
+        self._download(f"/monthly-reports/{_part(report_id)}", target, format=kind)
 
     def list_reports(self, pass_id: int) -> Listing[Report]:
         """List the reports of a pass, newest first, with the changes that a re-evaluation made."""

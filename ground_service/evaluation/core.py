@@ -120,6 +120,8 @@ class PassInputs:
         Where the pass refers to no mission description: what is missing and the remedy.
     cpu_percent
         Largest processor time of a step over the cadence.
+    build
+        Hashes of model and parameters on board.
     """
 
     pass_id: str
@@ -148,6 +150,7 @@ class PassInputs:
     limits: Limits = field(default_factory=Limits)
     no_mission: str = ""
     cpu_percent: float | None = None
+    build: str = ""
     frames_expected: int | None = None
     cadence_s: float | None = None
     housekeeping: tuple[HousekeepingParameter, ...] = ()

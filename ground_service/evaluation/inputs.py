@@ -143,6 +143,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
             limits=Limits(**mission.requirements.model_dump()),
             no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
+            build=_onboard_build(connection, span),
             cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
             frames_expected=manifest.get("frames_expected"),
             cadence_s=manifest.get("cadence_s"),
@@ -356,6 +357,15 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
     return tuple(
         HousekeepingParameter(name, unit, utc_ns, columns[name].astype(np.float64)) for name, unit in _TRENDS
     )
+
+
+def _onboard_build(connection: Connection, span: PassSpan) -> str:
+    """Return the hashes of model and parameters in the last housekeeping packet of a pass; empty without any."""
+    columns = passes.sample_arrays(connection, span, "housekeeping", ("model_hash", "parameters_hash"))
+    if len(columns["model_hash"]) == 0:
+        return ""
+    model, parameters = int(columns["model_hash"][-1]), int(columns["parameters_hash"][-1])
+    return f"model {model:08x}, parameters {parameters:08x}"
 
 
 def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:

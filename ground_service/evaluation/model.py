@@ -167,6 +167,15 @@ class InstrumentFigures(Entity):
     residuals: list[ResidualFigures]
 
 
+class PassConditions(Entity):
+    """Conditions of a pass for trends; null and empty texts: not known."""
+
+    altitude_km: float | None = Field(description="Median over the pass")
+    sun_elevation_deg: float | None = Field(description="Median at the sub-satellite point")
+    build: str = Field(description="Hashes of model and parameters in the last housekeeping packet")
+    estimator: str | None = Field(description="Estimator that the mission description judges")
+
+
 class PassFigures(Entity):
     """Figures of an evaluated pass; null: not known."""
 
@@ -186,6 +195,7 @@ class PassFigures(Entity):
     instruments: dict[str, InstrumentFigures] = Field(default_factory=dict)
     evidence_level: str
     data: list[str] = Field(description="Data sources")
+    conditions: PassConditions | None = Field(default=None, description="null: report of an older version")
 
 
 class ReportOverview(Entity):

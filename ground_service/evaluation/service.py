@@ -14,6 +14,7 @@ from typing import Any
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
 from ground_service.evaluation import store
+from ground_service.evaluation.conditions import conditions_of
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.model import ChangedFigure, StoredReport
@@ -66,7 +67,8 @@ def _evaluated(ground: Ground, inputs: PassInputs) -> PassReport:
 
 def pass_summary(ground: Ground, pass_id: int) -> dict[str, Any]:
     """The figures of a pass that a script asks for; see `summary_of`."""
-    return _summary(evaluate(ground, pass_id), pass_id)
+    inputs = load_pass_inputs(ground, pass_id)
+    return _summary(_evaluated(ground, inputs), inputs)
 
 
 def make_report(
@@ -95,7 +97,7 @@ def make_report(
     report = _evaluated(ground, inputs)
     documents = _documents(report, pdf=pdf)
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
-    summary = _summary(report, pass_id)
+    summary = _summary(report, inputs)
     with ground.database.writing() as connection:
         for kind, file in stored.items():
             register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
@@ -183,8 +185,12 @@ def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:
     return {"html": page.encode(), "json": data, "pdf": printed}
 
 
-def _summary(report: PassReport, pass_id: int) -> dict[str, Any]:
-    return {**plain(summary_of(report)), "pass_id": pass_id}
+def _summary(report: PassReport, inputs: PassInputs) -> dict[str, Any]:
+    return {
+        **plain(summary_of(report)),
+        "pass_id": int(inputs.pass_id),
+        "conditions": plain(conditions_of(inputs)),
+    }
 
 
 def plain(value: Any) -> Any:

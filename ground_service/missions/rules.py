@@ -37,6 +37,7 @@ ACTIONS: Final = (
     "keep_archive",
     "run_regression",
     "compute_trends",
+    "monthly_report",
     "notify",
 )
 
@@ -232,7 +233,7 @@ DEFAULT_RULES: Final = (
         when=Conditions(window_state=("executed",)),
         do=("align", "report", "mark_processed"),
     ),
-    Rule(name="trends", on="window processed", do=("compute_trends",)),
+    Rule(name="trends", on="window processed", do=("compute_trends", "monthly_report")),
     Rule(name="regression archive of a window", on="window processed", do=("keep_archive",)),
     Rule(name="regression archive of an imported pass", on="archive imported", do=("keep_archive",)),
 )

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.evaluation.store import reference_of
+from ground_service.evaluation.inputs import reference_of
 from ground_service.ground import Ground
 from ground_service.missions.service import mission_of_pass
 from ground_service.missions.store import detail

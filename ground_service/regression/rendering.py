@@ -92,7 +92,7 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
         reason = whole.reason or "the renderer left out frames"
     archive = replace(archive, state=TELEMETRY_ONLY, reason=reason)
     try:
-        return _with_detections(archive)
+        return with_detections(archive)
     except InvalidInput as error:
         return replace(archive, reason=f"{reason}; no received detections: {error}")
 
@@ -133,7 +133,7 @@ def _render(ground: Ground, folder: Path, out: Path) -> str:
     return f"the frames cannot be rendered: {told.replace(str(folder), 'archive')[:500]}"
 
 
-def _with_detections(archive: PassArchive) -> PassArchive:
+def with_detections(archive: PassArchive) -> PassArchive:
     """Add the received detections to an archive."""
     rows = recorded_detections(archive)
     octets = "".join(json.dumps(row) + "\n" for row in rows).encode()

@@ -548,6 +548,22 @@ table; NULL if unknown.
 """
 
 
+MONTHLY_REPORTS = Table(
+    "monthly_reports",
+    METADATA,
+    key("id", String(32)),
+    column("spacecraft_id", Integer, index=True),
+    column("month", String(7)),
+    column("passes", Integer),
+    column("verdict", Text),
+    column("html_sha256", ForeignKey("files.sha256")),
+    column("pdf_sha256", ForeignKey("files.sha256")),
+    column("json_sha256", ForeignKey("files.sha256")),
+    column("created_utc_ns", BigInteger),
+)
+"""A report of a month of a spacecraft; the id is the hash of its content."""
+
+
 PASS_FRAMES = Table(
     "pass_frames",
     METADATA,

@@ -24,6 +24,7 @@ from ground_service.evaluation.report_overview import get_report
 from ground_service.ground import Ground
 from ground_service.http.common import Key
 from ground_service.passes.series import PARAMETERS, STATE_VALUES
+from ground_service.performance.service import get_monthly_report
 from ground_service.regression.service import report_of
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY
@@ -136,6 +137,14 @@ def report_page(request: Request, report_id: Key) -> Response:
 def regression_page(request: Request, regression_id: Key) -> Response:
     """The report of a regression as a page with an address of its own."""
     return _document(request, lambda ground: report_of(ground, regression_id))
+
+
+@pages.get("/monthly-reports/{report_id}")
+def monthly_report_page(request: Request, report_id: Key) -> Response:
+    """A monthly report as a page with an address of its own."""
+    return _document(
+        request, lambda ground: ground.files.get(get_monthly_report(ground, report_id).html_sha256)
+    )
 
 
 def _html_file(ground: Ground, report_id: str) -> str:

@@ -217,6 +217,18 @@ def _compute_trends(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     return {"limits_broken": broken}
 
 
+def _monthly_report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    """Make the report of the last complete month; late data in that month give a new one."""
+    from ground_service.performance.service import due_report_of_vehicle
+
+    if action.vehicle_id is None:
+        raise EvaluationError("monthly_report: the event concerns no spacecraft")
+    made = due_report_of_vehicle(ground, action.vehicle_id)
+    return (
+        {"report": None} if made is None else {"report": made.id, "month": made.month, "passes": made.passes}
+    )
+
+
 def _notify(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     """Send the event over the channels of the rule; each gets it, also if another one fails."""
     rule = _rule(ground, action)
@@ -248,6 +260,7 @@ DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
     "keep_archive": _keep_archive,
     "run_regression": _run_regression,
     "compute_trends": _compute_trends,
+    "monthly_report": _monthly_report,
     "notify": _notify,
 }
 """Functions of the actions; each may be repeated without harm."""

@@ -18,10 +18,15 @@ EARLIER_VALUES: dict[tuple[str, str], Any] = {
     ("users", "state"): "active",
     ("tokens", "hint"): "",
     ("regressions", "missions"): [],
+    ("regression_archives", "state"): "complete",
+    ("regression_archives", "reason"): "",
 }
 """Values of columns missing in an earlier revision, if neither NULL nor the default of the column is correct."""
 
-EARLIER_COPIES = {("windows", "edited_by"): "created_by"}
+EARLIER_COPIES = {
+    ("windows", "edited_by"): "created_by",
+    ("regression_archives", "frames_stored"): "frames",
+}
 
 
 def exported_tables(connection: Connection, *, earlier: bool) -> list[Table]:

@@ -1,4 +1,4 @@
-"""What the service does by itself every night: trends with limit checks, and taking away what is no longer needed.
+"""Nightly job: trends with limit checks, reports of the last complete month, and removal of what is no longer needed.
 
 The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
 (the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`, tokens of
@@ -17,6 +17,7 @@ from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
+from ground_service.performance.service import make_due_reports
 from ground_service.store import events
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
@@ -57,8 +58,9 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     if broken:
         with ground.database.writing() as connection:
             publish(connection, LimitsBroken(broken=broken))
+    monthly = make_due_reports(ground)
     removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
-    return {"spacecraft": found, "limits_broken": broken, "removed": removed}
+    return {"spacecraft": found, "limits_broken": broken, "monthly_reports": monthly, "removed": removed}
 
 
 def broken_limits(ground: Ground, vehicle: int) -> list[dict[str, Any]]:

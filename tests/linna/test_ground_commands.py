@@ -328,6 +328,18 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("pass", "show", 2)
             do("report", 1, "--out", tmp_path / "report")
             ask("report", 2, "--out", tmp_path / "report")
+            ask("performance", "show", "--spacecraft-id", 76)
+            ask(
+                "performance",
+                "report",
+                "--spacecraft-id",
+                76,
+                "--month",
+                "2031-01",
+                "--out",
+                tmp_path / "month",
+            )
+            ask("performance", "list")
             ask("link", "list")
             ask("link", "contacts", "--since", "2029-08-07T00:00:00Z")
             ask("link", "send", "nothing")

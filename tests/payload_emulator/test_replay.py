@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ground_service.regression.archives import check_archive
-from ground_service.regression.rendering import telemetry_only
+from ground_service.regression.rendering import with_detections
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ParameterError, RecordError
 from payload_emulator.flight.payload import FlightParameters
@@ -103,7 +103,7 @@ def test_the_flown_build_says_of_every_frame_what_it_said_in_flight(archive: Pat
 def test_received_detections_replace_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:
     """A replay from received detections reports the same detections; navigation differs by their resolution only."""
     flown = (copy / "downlink.cadu").read_bytes()
-    kept = telemetry_only(replace(check_archive(copy), reason="no frames"))
+    kept = with_detections(replace(check_archive(copy), reason="no frames"))
     assert kept.has_inputs
     shutil.rmtree(copy / "frames")
     replay_archive(copy, FlightBuild(), tmp_path / "out")

@@ -823,6 +823,31 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("pass_id", "frame_number", name=op.f("pk_pass_frames")),
     )
     op.create_table(
+        "monthly_reports",
+        sa.Column("id", sa.String(length=32), nullable=False),
+        sa.Column("spacecraft_id", sa.Integer(), nullable=False),
+        sa.Column("month", sa.String(length=7), nullable=False),
+        sa.Column("passes", sa.Integer(), nullable=False),
+        sa.Column("verdict", sa.Text(), nullable=False),
+        sa.Column("html_sha256", sa.String(length=64), nullable=False),
+        sa.Column("pdf_sha256", sa.String(length=64), nullable=False),
+        sa.Column("json_sha256", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["html_sha256"], ["files.sha256"], name=op.f("fk_monthly_reports_html_sha256_files")
+        ),
+        sa.ForeignKeyConstraint(
+            ["json_sha256"], ["files.sha256"], name=op.f("fk_monthly_reports_json_sha256_files")
+        ),
+        sa.ForeignKeyConstraint(
+            ["pdf_sha256"], ["files.sha256"], name=op.f("fk_monthly_reports_pdf_sha256_files")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_monthly_reports")),
+    )
+    op.create_index(
+        op.f("ix_monthly_reports_spacecraft_id"), "monthly_reports", ["spacecraft_id"], unique=False
+    )
+    op.create_table(
         "reports",
         sa.Column("id", sa.String(length=32), nullable=False),
         sa.Column("pass_id", sa.Integer(), nullable=False),
@@ -952,6 +977,7 @@ def downgrade() -> None:
     op.drop_table("windows")
     op.drop_table("standing_requests")
     op.drop_table("reports")
+    op.drop_table("monthly_reports")
     op.drop_table("pass_frames")
     op.drop_table("passes")
     op.drop_table("parameter_samples")

@@ -55,4 +55,81 @@ byId("define").addEventListener(
   }),
 );
 
+const METRICS = { recall: ["Recall", ""], drift_percent: ["Drift", "% of path"], median_error_m: ["Median error", "m"] };
+const metricName = (metric) => METRICS[metric].filter(Boolean).join(", ");
+const between = (low, high) => (low == null || high == null ? "unknown" : `${figure(low)} to ${figure(high)}`);
+
+async function showPerformance() {
+  const spacecraft = byId("of").valueAsNumber;
+  const [found, monthly] = await Promise.all([
+    get(`spacecraft/${spacecraft}/performance`, { window_days: byId("days").value }),
+    get("monthly-reports", { spacecraft_id: spacecraft, limit: 24 }),
+  ]);
+  show(
+    "groups",
+    table(
+      "Mean of the passes by condition",
+      [
+        ["Condition", (row) => row.factor],
+        ["Group", (row) => row.group],
+        ["Metric", (row) => metricName(row.metric)],
+        ["Passes", (row) => figure(row.passes), "num"],
+        ["Mean", (row) => figure(row.mean), "num"],
+        ["95 % interval", (row) => between(row.low, row.high), "num"],
+      ],
+      found.groups,
+      "No pass has a report.",
+    ),
+  );
+  show(
+    "changes",
+    table(
+      "Changes of level",
+      [
+        ["Metric", (row) => metricName(row.metric)],
+        ["First pass", (row) => element("a", { href: `/passes/${row.pass_id}` }, row.pass_id)],
+        ["Time", (row) => timeText(row.time)],
+        ["Before", (row) => figure(row.before), "num"],
+        ["After", (row) => figure(row.after), "num"],
+        ["p", (row) => figure(row.p_value), "num"],
+      ],
+      found.changes,
+      "No metric changed significantly.",
+    ),
+  );
+  show(
+    "requirements",
+    table(
+      `Requirements over the last ${figure(found.window_days)} days`,
+      [
+        ["Requirement", (row) => row.name],
+        ["Limit", (row) => (row.limit == null ? "not stated" : `${figure(row.limit)} ${row.unit}`), "num"],
+        ["Met", (row) => figure(row.met), "num"],
+        ["Not met", (row) => figure(row.not_met), "num"],
+        ["Unknown", (row) => figure(row.unknown), "num"],
+        ["Share met, 95 % interval", (row) => (row.share_met == null ? "not judged" : `${figure(row.share_met)} (${between(row.low, row.high)})`)],
+      ],
+      found.requirements,
+      "No report has requirements.",
+    ),
+  );
+  show(
+    "monthly",
+    table(
+      "Monthly reports",
+      [
+        ["Month", (row) => row.month],
+        ["Passes", (row) => figure(row.passes), "num"],
+        ["Verdict", (row) => row.verdict],
+        ["Report", (row) => element("a", { href: `/monthly-reports/${row.id}`, target: "_blank" }, "open")],
+      ],
+      monthly.items,
+      "There is no monthly report.",
+    ),
+  );
+}
+
+byId("performance").addEventListener("toggle", () => byId("performance").open && showPerformance().catch(trouble));
+byId("trend").addEventListener("submit", acting(showPerformance));
+
 load().catch((error) => error.status === 401 || trouble(error));

@@ -1,0 +1,124 @@
+"""The performance of a month as a value for the report."""
+
+from __future__ import annotations
+
+import math
+
+from ground_service.performance.model import PassPerformance, Performance
+from reports.values import (
+    HeadlineFigure,
+    LevelChange,
+    MeanByGroup,
+    MonthlyReportValue,
+    MonthPass,
+    RequirementOverTime,
+)
+
+
+def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
+    """Return the report of a month as a value; it follows from the performance alone."""
+    bad = sum(one.not_met > 0 for one in found.requirements)
+    open_ = sum(one.met + one.not_met == 0 and one.limit is not None for one in found.requirements)
+    judged = [one for one in found.requirements if one.met + one.not_met]
+    if bad:
+        verdict, level = f"{bad} of {len(judged)} judged requirements were not met in every pass", "bad"
+    elif judged and not open_:
+        verdict, level = f"all {len(judged)} judged requirements were met in every pass", "good"
+    else:
+        verdict, level = "no requirement was missed, but some are unknown", "caution"
+    verdict += f" of the last {found.window_days:g} days"
+    if found.changes:
+        count = len(found.changes)
+        verdict += f"; {count} {'change' if count == 1 else 'changes'} of level"
+    levels = sorted({one.terrain for one in found.passes})
+    return MonthlyReportValue(
+        title=f"Spacecraft {found.spacecraft_id}, {month}",
+        month=month,
+        verdict=verdict,
+        verdict_level=level,
+        evidence_level=levels[0] if len(levels) == 1 else "",
+        headline=_headline(found),
+        passes=tuple(_month_pass(one) for one in found.passes),
+        groups=tuple(
+            MeanByGroup(
+                one.factor,
+                one.group,
+                one.metric,
+                one.passes,
+                _number(one.mean),
+                _number(one.low),
+                _number(one.high),
+            )
+            for one in found.groups
+        ),
+        changes=tuple(
+            LevelChange(
+                one.metric,
+                one.pass_id,
+                one.time.utc_ns,
+                one.before,
+                one.after,
+                one.passes_before,
+                one.passes_after,
+                one.p_value,
+            )
+            for one in found.changes
+        ),
+        requirements=tuple(
+            RequirementOverTime(
+                one.name,
+                one.unit,
+                one.limit,
+                one.passes,
+                one.met,
+                one.not_met,
+                one.unknown,
+                _number(one.share_met),
+                _number(one.low),
+                _number(one.high),
+            )
+            for one in found.requirements
+        ),
+        window_days=found.window_days,
+        false_alarm_rate=found.false_alarm_rate,
+        provenance={"reports": f"the newest report of each of {len(found.passes)} passes"},
+        data_sources=tuple(level for level in levels if level),
+    )
+
+
+def _headline(found: Performance) -> tuple[HeadlineFigure, ...]:
+    def mean(name: str) -> float | None:
+        known = [float(value) for one in found.passes if (value := getattr(one, name)) is not None]
+        return sum(known) / len(known) if known else None
+
+    recall = mean("recall")
+    return (
+        HeadlineFigure("Passes", len(found.passes)),
+        HeadlineFigure("Packets lost", sum(one.packets_lost for one in found.passes)),
+        HeadlineFigure("Recall", None if recall is None else 100.0 * recall, "%", "mean of the passes"),
+        HeadlineFigure("Drift", mean("drift_percent"), "% of path", "mean of the passes"),
+        HeadlineFigure("Median error", mean("median_error_m"), "m", "mean of the passes"),
+    )
+
+
+def _month_pass(one: PassPerformance) -> MonthPass:
+    return MonthPass(
+        one.pass_id,
+        one.name,
+        one.start.utc_ns,
+        one.estimator or "",
+        _number(one.recall),
+        _number(one.drift_percent),
+        _number(one.median_error_m),
+        _number(one.altitude_km),
+        _number(one.sun_elevation_deg),
+        one.terrain,
+        one.build,
+        one.packets,
+        one.packets_lost,
+        one.verdict_level,
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

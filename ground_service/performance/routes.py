@@ -1,0 +1,80 @@
+"""HTTP operations on the performance over many passes and on monthly reports."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import Path, Query, Response
+
+from ground_service.access.security import Operator, Viewer
+from ground_service.http.common import GroundOf, Key, PagingOf
+from ground_service.http.model import InstanceName, PageOf, SpacecraftNumber
+from ground_service.http.requests import operations
+from ground_service.http.times import GivenTime
+from ground_service.performance import service
+from ground_service.performance.model import MonthlyReport, Performance
+
+REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
+
+Spacecraft = Annotated[int, Path(ge=0, le=1023)]
+Month = Annotated[str, Path(pattern=r"^2[0-9]{3}-(0[1-9]|1[0-2])$", examples=["2029-08"])]
+
+reports = operations("reports")
+
+
+@reports.get("/spacecraft/{spacecraft_id}/performance")
+def get_performance(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: Spacecraft,
+    instance: Annotated[
+        InstanceName | None, Query(description="Default: all, imported passes included")
+    ] = None,
+    start: GivenTime | None = None,
+    stop: GivenTime | None = None,
+    window_days: Annotated[
+        float, Query(gt=0.0, le=3660.0, description="Length of the rolling window of the requirements")
+    ] = service.WINDOW_DAYS,
+) -> Performance:
+    """Return recall, drift and error over the reported passes, by condition, with changes of level."""
+    return service.performance(
+        ground,
+        spacecraft_id,
+        instance=instance,
+        start_utc_ns=None if start is None else start.utc_ns,
+        stop_utc_ns=None if stop is None else stop.utc_ns,
+        window_days=window_days,
+    )
+
+
+@reports.post("/spacecraft/{spacecraft_id}/monthly-reports/{month}", status_code=201)
+def create_monthly_report(
+    ground: GroundOf, _: Operator, spacecraft_id: Spacecraft, month: Month
+) -> MonthlyReport:
+    """Create the report of a month; the same content gives the same report."""
+    return service.make_monthly_report(ground, spacecraft_id, month)
+
+
+@reports.get("/monthly-reports")
+def list_monthly_reports(
+    ground: GroundOf, _: Viewer, paging: PagingOf, spacecraft_id: SpacecraftNumber | None = None
+) -> PageOf[MonthlyReport]:
+    """List the monthly reports, newest month first."""
+    items, total = service.list_monthly_reports(
+        ground, spacecraft_id=spacecraft_id, limit=paging.limit, offset=paging.offset
+    )
+    return paging.page(items, total)
+
+
+@reports.get(
+    "/monthly-reports/{report_id}",
+    response_class=Response,
+    responses={200: {"content": {media: {} for media in REPORT_MEDIA.values()}, "description": "The report"}},
+)
+def get_monthly_report(
+    ground: GroundOf, _: Viewer, report_id: Key, format: Literal["html", "pdf", "json"] = "html"
+) -> Response:
+    """Return a monthly report as HTML, PDF or JSON."""
+    sha256 = str(getattr(service.get_monthly_report(ground, report_id), f"{format}_sha256"))
+    media = REPORT_MEDIA[format] + ("; charset=utf-8" if format == "html" else "")
+    return Response(ground.files.get(sha256), media_type=media)

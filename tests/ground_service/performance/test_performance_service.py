@@ -1,0 +1,277 @@
+"""Performance over stored reports, and monthly reports by operation, command, rule and nightly job."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.automation.service import list_actions
+from ground_service.client.local import local_client
+from ground_service.errors import InvalidInput
+from ground_service.evaluation.model import StoredReport
+from ground_service.evaluation.store import add_report
+from ground_service.evaluation.service import make_report
+from ground_service.events import WindowChanged, publish
+from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.service import define_pass
+from ground_service.performance.service import (
+    last_month,
+    list_monthly_reports,
+    make_due_report,
+    make_monthly_report,
+    month_span,
+    performance,
+)
+from ground_service.store import repository
+from ground_service.store.stored_files import register_file
+from ground_service.worker.upkeep import nightly
+from linna.cli import run
+from lunar.timescales import parse_utc
+from tests.ground_service.conftest import ALTITUDE_M, SPACECRAFT, SyntheticPass
+
+DAY_NS = 86_400_000_000_000
+FIRST = parse_utc("2029-08-02T06:00:00Z")
+
+
+@pytest.fixture(scope="module")
+def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+    return make_pass(frames=30, seed=9)
+
+
+def add_pass(ground: Ground, number: int, **changes: Any) -> int:
+    """Add a pass with a report, one a day."""
+    start = FIRST + number * DAY_NS
+    pass_id = define_pass(
+        ground,
+        name=f"pass {number}",
+        start_utc_ns=start,
+        stop_utc_ns=start + 10**12,
+        spacecraft_id=SPACECRAFT,
+    )
+    blob = ground.files.put_octets(b"x")
+    values: dict[str, Any] = {
+        "recall": 0.70 + 0.01 * (number % 3),
+        "drift": 0.10,
+        "error": 80.0,
+        "altitude": 25.0,
+        "status": "met",
+        "build": "a",
+        **changes,
+    }
+    errors = dict.fromkeys(("p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "end_of_pass_m"))
+    summary = {
+        "pass_id": pass_id,
+        "frames": 10,
+        "packets": 50,
+        "packets_lost": 1,
+        "packets_expected": 51,
+        "detector": {"precision": 0.8, "recall": values["recall"], "loc_px": 1.0, "per_class": []},
+        "navigation": {
+            "anchored": {"median_3d_m": values["error"], "drift_percent": values["drift"], **errors},
+            "paper": {"median_3d_m": 9e3, "drift_percent": 9.0, **errors},
+        },
+        "smoothed": {},
+        "baselines": {},
+        "verdict": "met",
+        "verdict_level": "good",
+        "requirements": [
+            {
+                "key": "accuracy.median", "name": "median 3-D error", "value": values["error"], "limit": 100.0,
+                "relation": "<=", "unit": "m", "margin": 1.0, "status": values["status"], "note": "",
+            }
+        ],
+        "error_budget": {},
+        "evidence_level": "2 (procedural Moon)",
+        "data": [],
+        "conditions": {
+            "altitude_km": values["altitude"], "sun_elevation_deg": 20.0, "build": values["build"],
+            "estimator": "anchored",
+        },
+    }  # fmt: skip
+    with ground.database.writing() as connection:
+        register_file(connection, blob, "report", "x", 1)
+        report = StoredReport(
+            id=f"{number:032x}",
+            pass_id=pass_id,
+            html_sha256=blob.sha256,
+            json_sha256=blob.sha256,
+            pdf_sha256=None,
+            summary=summary,
+            mission_id=None,
+            event_number=None,
+            previous_id=None,
+            changes=None,
+            created_utc_ns=start,
+        )
+        add_report(connection, report)
+    return pass_id
+
+
+def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: SyntheticPass) -> None:
+    pass_id = import_archive(either, flown.folder)
+    made = make_report(either, pass_id)
+    conditions = made.summary["conditions"]
+    assert conditions["altitude_km"] == pytest.approx(ALTITUDE_M / 1e3, abs=0.1)
+    assert -90.0 <= conditions["sun_elevation_deg"] <= 90.0
+    [one] = performance(either, SPACECRAFT).passes
+    assert (one.pass_id, one.report_id) == (pass_id, made.report_id)
+    assert one.altitude_km == conditions["altitude_km"]
+    assert one.recall == made.summary["detector"]["recall"] is not None
+    assert performance(either, SPACECRAFT, instance="flight").passes == []
+
+
+def test_passes_are_grouped_and_changes_found(either: Ground) -> None:
+    low = {"recall": 0.4, "altitude": 35.0, "build": "b", "status": "not met", "error": 120.0}
+    for number in range(20):
+        add_pass(either, number, **(low if number >= 12 else {}))
+    found = performance(either, SPACECRAFT, instance="flight")
+    assert [one.estimator for one in found.passes] == ["anchored"] * 20
+    groups = {(one.factor, one.group, one.metric): one for one in found.groups}
+    by_altitude = [groups["altitude", name, "recall"] for name in ("20 to 30 km", "30 to 40 km")]
+    assert [(one.passes, round(one.mean or 0.0, 3)) for one in by_altitude] == [(12, 0.71), (8, 0.4)]
+    assert by_altitude[0].low is not None and by_altitude[0].low < 0.71 < (by_altitude[0].high or 0.0)
+    assert groups["build", "b", "median_error_m"].mean == 120.0
+    assert ("sun elevation", "15 to 30 °", "drift_percent") in groups
+    assert ("terrain", "2 (procedural Moon)", "recall") in groups
+    assert [(one.metric, one.pass_id) for one in found.changes] == [
+        ("median_error_m", found.passes[12].pass_id),
+        ("recall", found.passes[12].pass_id),
+    ]
+    [requirement] = found.requirements
+    assert (requirement.passes, requirement.met, requirement.not_met) == (7, 0, 7)
+    assert (requirement.share_met, requirement.lowest_share) == (0.0, 0.0)
+    earlier = performance(either, SPACECRAFT, stop_utc_ns=FIRST + 12 * DAY_NS)
+    assert len(earlier.passes) == 12 and earlier.changes == []
+    [requirement] = earlier.requirements
+    assert (requirement.met, requirement.share_met, requirement.high) == (7, 1.0, 1.0)
+    assert 0.6 < (requirement.low or 0.0) < 0.7
+
+
+def test_unknown_values_stay_unknown(ground: Ground) -> None:
+    add_pass(ground, 0, recall=None, altitude=None, status="unknown", build="")
+    found = performance(ground, SPACECRAFT)
+    groups = {(one.factor, one.group, one.metric): one for one in found.groups}
+    assert groups["altitude", "unknown", "recall"].mean is None
+    assert groups["build", "not stated", "drift_percent"].mean == 0.10
+    [requirement] = found.requirements
+    assert (requirement.unknown, requirement.share_met, requirement.low) == (1, None, None)
+
+
+def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: Ground) -> None:
+    for number in range(3):
+        add_pass(either, number)
+    first = make_monthly_report(either, SPACECRAFT, "2029-08")
+    assert make_monthly_report(either, SPACECRAFT, "2029-08") == first
+    assert (first.passes, first.month) == (3, "2029-08")
+    assert first.verdict.startswith("all 1 judged requirements were met")
+    add_pass(either, 5, status="not met")
+    second = make_monthly_report(either, SPACECRAFT, "2029-08")
+    assert second.id != first.id and second.verdict.startswith("1 of 1 judged requirements were not met")
+    assert {one.id for one in list_monthly_reports(either)[0]} == {first.id, second.id}
+    with pytest.raises(InvalidInput, match="2029-09: expected passes with a report, found none"):
+        make_monthly_report(either, SPACECRAFT, "2029-09")
+
+
+def test_months() -> None:
+    assert month_span("2028-02") == (parse_utc("2028-02-01T00:00:00Z"), parse_utc("2028-03-01T00:00:00Z"))
+    assert last_month(parse_utc("2029-01-01T00:00:00Z")) == "2028-12"
+    assert last_month(parse_utc("2029-03-31T23:59:59Z")) == "2029-02"
+    with pytest.raises(InvalidInput, match="expected a month such as 2029-08, found 2029-13"):
+        month_span("2029-13")
+
+
+@pytest.fixture
+def september(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "ground_service.performance.service.utc_now_ns", lambda: parse_utc("2029-09-01T00:00:05Z")
+    )
+
+
+def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Ground, september: None) -> None:
+    add_pass(ground, 0)
+    assert make_due_report(ground, 5) is None
+    with ground.database.writing() as connection:
+        row = connection.execute(repository.PASSES.select()).mappings().one()
+        values = {
+            "vehicle_id": row["vehicle_id"],
+            "pass_id": row["id"],
+            "name": "w",
+            "start_utc_ns": FIRST,
+            "stop_utc_ns": FIRST + 10**12,
+            "cadence_s": 15.0,
+            "state": "processed",
+            "version": 1,
+            "decision": "approved",
+            "data_octets": 1,
+            "predicted": {},
+            "closed": 0,
+            "created_by": "a",
+            "edited_by": "a",
+            "created_utc_ns": 1,
+            "changed_utc_ns": 1,
+        }
+        window = repository.add(connection, repository.WINDOWS, **values)
+        publish(connection, WindowChanged(id=int(window), state="processed"))
+    [made] = list_monthly_reports(ground)[0]
+    assert (made.month, made.passes, made.spacecraft_id) == ("2029-08", 1, SPACECRAFT)
+    found = {one.action: one for one in list_actions(ground)[0]}
+    assert found["monthly_report"].result == {"report": made.id, "month": "2029-08", "passes": 1}
+    assert nightly(ground, {})["monthly_reports"] == [
+        {"spacecraft_id": SPACECRAFT, "month": "2029-08", "report": made.id}
+    ]
+    assert len(list_monthly_reports(ground)[0]) == 1
+
+
+def test_operations_and_commands_give_the_same_report(
+    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(14):
+        add_pass(ground, number, **({"recall": 0.3} if number >= 7 else {}))
+    with local_client(ground, "ann") as service:
+        made = service.create_monthly_report(SPACECRAFT, "2029-08")
+        assert [one.id for one in service.list_monthly_reports(spacecraft_id=SPACECRAFT)] == [made.id]
+        assert list(service.list_monthly_reports(spacecraft_id=1)) == []
+        for kind in ("html", "pdf", "json"):
+            service.get_monthly_report(made.id, tmp_path / f"api.{kind}", kind=kind)
+        found = service.get_performance(SPACECRAFT, start=str(UtcTime(FIRST)), window_days=3.0)
+        assert (len(found.passes), found.window_days) == (14, 3.0)
+    page = (tmp_path / "api.html").read_text()
+    assert "Changes of level" in page and "Monthly report" in page and "20 to 30 km" in page
+    assert (tmp_path / "api.pdf").read_bytes().startswith(b"%PDF")
+    document = json.loads((tmp_path / "api.json").read_text())
+    assert document["kind"] == "MonthlyReportValue"
+    assert [one["metric"] for one in document["changes"]] == ["recall"]
+    home = ("--home", str(ground.home))
+    spacecraft = ("--spacecraft-id", str(SPACECRAFT))
+    assert (
+        run(
+            [
+                "performance",
+                "report",
+                *spacecraft,
+                "--month",
+                "2029-08",
+                "--out",
+                str(tmp_path / "cli"),
+                *home,
+            ]
+        )
+        == 0
+    )
+    assert (tmp_path / "cli/report.html").read_text() == page
+    capsys.readouterr()
+    assert run(["performance", "show", *spacecraft, *home]) == 0
+    told = capsys.readouterr().out
+    assert "change of recall at pass 8" in told and "14 passes with a report" in told
+    assert run(["performance", "list", *home, "--json"]) == 0
+    assert [one["id"] for one in json.loads(capsys.readouterr().out)["reports"]] == [made.id]
+    assert (
+        run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
+    )
+    assert "expected passes with a report, found none" in capsys.readouterr().err
