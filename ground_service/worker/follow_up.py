@@ -228,6 +228,17 @@ DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
 _ORDER = {name: number for number, name in enumerate(DOING)}
 
 
+_here = threading.local()
+
+
+def _draining() -> set[int]:
+    """Return the grounds whose events this thread handles now; waiting for itself, it would wait for ever."""
+    if not hasattr(_here, "grounds"):
+        _here.grounds = set()
+    grounds: set[int] = _here.grounds
+    return grounds
+
+
 class FollowUp:
     """Consumer of the event log in this process."""
 
@@ -235,7 +246,6 @@ class FollowUp:
         self._ground = ground
         self._start = start or (lambda job_id: run_job(ground, job_id))
         self._lock = threading.Lock()
-        self._here = threading.local()
 
     def __call__(self, kinds: frozenset[str]) -> None:
         """Handle the events of a commit; the commit has succeeded, so errors are logged."""
@@ -244,8 +254,8 @@ class FollowUp:
 
     def drain(self) -> None:
         """Handle all events so far, or wait until another thread or process has handled them."""
-        if getattr(self._here, "draining", False):
-            return  # an event of the work itself, which the loop below handles
+        if id(self._ground) in _draining():
+            return  # an event of the work itself, which the loop below handles, also that of another consumer
         try:
             for job_id in self._drained():
                 self._start(job_id)
@@ -260,12 +270,12 @@ class FollowUp:
         while True:
             with self._lock, database.alone(LOCK) as alone:
                 if alone:
-                    self._here.draining = True
+                    _draining().add(id(self._ground))
                     try:
                         while self._handle_batch(jobs):
                             pass
                     finally:
-                        self._here.draining = False
+                        _draining().discard(id(self._ground))
                     return jobs
             with database.reading() as connection:
                 if events.position_of(connection, CONSUMER) >= last:

@@ -8,7 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from ground_service.automation.service import list_actions
 from ground_service.client.local import local_client
@@ -103,14 +105,22 @@ def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(
 
 
 def test_images_that_the_ground_did_not_store_are_left_out(
-    ground: Ground, flown: FlyablePass, monkeypatch: pytest.MonkeyPatch
+    ground: Ground, flown: FlyablePass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    folder = tmp_path / "pass"
+    shutil.copytree(flown.folder, folder)
+    for number in range(4):
+        image = Image.fromarray(np.full((512, 512), 90 + number, np.uint8))
+        image.save(folder / f"frames/{number:06d}.png")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]
+    write_manifest(folder, manifest)
     monkeypatch.setattr("ground_service.passes.archive_import.FRAMES_KEPT", 2)
-    pass_id = import_archive(ground, flown.folder)
+    pass_id = import_archive(ground, folder)
     [kept] = kept_archives(ground)
     assert (kept.pass_id, kept.frames, kept.frames_stored, kept.state) == (pass_id, 4, 2, "telemetry only")
     assert kept.reason.startswith("2 of 4 frames are not stored, the first 1, ")
-    assert kept.digest == read_manifest(flown.folder)[1]
+    assert kept.digest == read_manifest(folder)[1]
 
 
 def test_a_live_pass_keeps_its_received_data_and_is_replaced_by_late_data(
