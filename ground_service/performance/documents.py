@@ -21,12 +21,14 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
     open_ = sum(one.met + one.not_met == 0 and one.limit is not None for one in found.requirements)
     judged = [one for one in found.requirements if one.met + one.not_met]
     if bad:
-        verdict, level = f"{bad} of {len(judged)} judged requirements were not met in every pass", "bad"
+        verdict, level = f"requirements not met in every pass: {bad} of {len(judged)} judged", "bad"
     elif judged and not open_:
-        verdict, level = f"all {len(judged)} judged requirements were met in every pass", "good"
+        verdict, level = f"requirements met in every pass: {len(judged)} of {len(judged)} judged", "good"
     else:
-        verdict, level = "no requirement was missed, but some are unknown", "caution"
-    verdict += f" of the last {found.window_days:g} days"
+        verdict, level = (
+            f"requirements judged: {len(judged)} of {len(found.requirements)}, none missed",
+            "caution",
+        )
     if found.changes:
         count = len(found.changes)
         verdict += f"; {count} {'change' if count == 1 else 'changes'} of level"
@@ -81,8 +83,11 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
         ),
         window_days=found.window_days,
         false_alarm_rate=found.false_alarm_rate,
-        provenance={"reports": f"the newest report of each of {len(found.passes)} passes"},
-        data_sources=tuple(level for level in levels if level),
+        provenance={
+            "reports": f"the newest report of each of {len(found.passes)} passes",
+            "evidence levels": "; ".join(one or "not stated" for one in levels),
+        },
+        not_available={"data_sources": "stated in the reports of the passes"},
     )
 
 

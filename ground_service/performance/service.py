@@ -211,7 +211,13 @@ def make_monthly_report(ground: Ground, spacecraft_id: int, month: str) -> Month
         This is not a month, or it has no pass with a report.
     """
     start_utc_ns, stop_utc_ns = month_span(month)
-    found = performance(ground, spacecraft_id, start_utc_ns=start_utc_ns, stop_utc_ns=stop_utc_ns)
+    found = performance(
+        ground,
+        spacecraft_id,
+        start_utc_ns=start_utc_ns,
+        stop_utc_ns=stop_utc_ns,
+        window_days=(stop_utc_ns - start_utc_ns) / DAY_NS,
+    )
     if not found.passes:
         raise InvalidInput(
             f"monthly report of spacecraft {spacecraft_id}", month, "passes with a report", "none"
