@@ -287,8 +287,8 @@ class Client(Connection):
             window_days=window_days,
         )
 
-    def create_monthly_report(self, spacecraft_id: int, month: str) -> MonthlyReport:
-        """Create the report of a month (YYYY-MM) of a spacecraft."""
+    def add_monthly_report(self, spacecraft_id: int, month: str) -> MonthlyReport:
+        """Add the report of a month (YYYY-MM) of a spacecraft."""
         return self._post(MonthlyReport, f"/spacecraft/{spacecraft_id}/monthly-reports/{_part(month)}")
 
     def list_monthly_reports(self, *, spacecraft_id: int | None = None) -> Listing[MonthlyReport]:

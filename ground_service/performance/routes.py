@@ -48,10 +48,10 @@ def get_performance(
 
 
 @reports.post("/spacecraft/{spacecraft_id}/monthly-reports/{month}", status_code=201)
-def create_monthly_report(
+def add_monthly_report(
     ground: GroundOf, _: Operator, spacecraft_id: Spacecraft, month: Month
 ) -> MonthlyReport:
-    """Create the report of a month; the same content gives the same report."""
+    """Add the report of a month; the same content gives the same report."""
     return service.make_monthly_report(ground, spacecraft_id, month)
 
 

@@ -100,7 +100,7 @@ def performance_lines(found: Performance) -> list[str]:
 
 def _report(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
-        made = service.create_monthly_report(arguments.spacecraft_id, arguments.month)
+        made = service.add_monthly_report(arguments.spacecraft_id, arguments.month)
         for kind in ("html", "pdf", "json"):
             service.get_monthly_report(made.id, arguments.out / f"report.{kind}", kind=kind)
     page = str(arguments.out / "report.html")

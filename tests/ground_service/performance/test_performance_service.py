@@ -234,7 +234,7 @@ def test_operations_and_commands_give_the_same_report(
     for number in range(14):
         add_pass(ground, number, **({"recall": 0.3} if number >= 7 else {}))
     with local_client(ground, "ann") as service:
-        made = service.create_monthly_report(SPACECRAFT, "2029-08")
+        made = service.add_monthly_report(SPACECRAFT, "2029-08")
         assert [one.id for one in service.list_monthly_reports(spacecraft_id=SPACECRAFT)] == [made.id]
         assert list(service.list_monthly_reports(spacecraft_id=1)) == []
         for kind in ("html", "pdf", "json"):
