@@ -235,6 +235,12 @@ DEFAULT_RULES: Final = (
     ),
     Rule(name="trends", on="window processed", do=("compute_trends", "monthly_report")),
     Rule(name="regression archive of a window", on="window processed", do=("keep_archive",)),
+    Rule(
+        name="regression archive after late data",
+        on="report done",
+        when=Conditions(reevaluation=True),
+        do=("keep_archive",),
+    ),
     Rule(name="regression archive of an imported pass", on="archive imported", do=("keep_archive",)),
 )
 """Rules of a mission description that states none."""

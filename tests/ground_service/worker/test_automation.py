@@ -26,6 +26,8 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.planning import store as windows
 from ground_service.planning.model import UploadedState, WindowUploads
 from ground_service.planning.service import WindowEntry, add_window, change_window, get_window
+from ground_service.regression.archives import kept_archives
+from ground_service.regression.pass_archives import LIVE
 from ground_service.worker import actions
 from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.follow_up import FollowUp, follow_in_process
@@ -141,9 +143,13 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(
         ("report of a complete window", "align", "done"),
         ("report of a complete window", "report", "done"),
         ("trends", "compute_trends", "done"),
+        ("trends", "monthly_report", "done"),
+        ("regression archive of a window", "keep_archive", "done"),
     ]
     found, _ = list_actions(either, pass_id=window.pass_id)
     log = {one.number: one for one in events.read_events(either.database, 0, 1000)}
+    kept = found[0].result
+    assert kept is not None and (kept["state"], kept["reason"]) == ("telemetry only", LIVE)
     aligned = found[-1]
     assert log[aligned.event].payload == {"id": window_id, "state": "downlinked"}
     assert aligned.result is not None and set(aligned.result["missing"]) == {"correlation"}
@@ -177,9 +183,14 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
         ("report", "done"),
         ("mark_processed", "done"),
         ("compute_trends", "done"),
+        ("monthly_report", "done"),
+        ("keep_archive", "done"),
     ]
     first = report_of(either, window.pass_id)
+    [kept] = kept_archives(either)
     receive(either, flown.packets[lost], tmp_path)
+    [replaced] = kept_archives(either)
+    assert replaced.pass_id == kept.pass_id == window.pass_id and replaced.octets > kept.octets
     again = report_of(either, window.pass_id)
     assert again["packets"]["lost"] < first["packets"]["lost"]
     assert get_window(either, window_id).state == "processed"
@@ -290,6 +301,9 @@ def test_rules_in_force_show_which_are_default(ground: Ground, flown: SyntheticP
         (None, "report of a complete window", True),
         (None, "report of an incomplete window", True),
         (None, "trends", True),
+        (None, "regression archive of a window", True),
+        (None, "regression archive after late data", True),
+        (None, "regression archive of an imported pass", True),
     ]
 
 
