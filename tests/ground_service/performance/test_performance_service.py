@@ -13,8 +13,8 @@ from ground_service.automation.service import list_actions
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import StoredReport
-from ground_service.evaluation.store import add_report
 from ground_service.evaluation.service import make_report
+from ground_service.evaluation.store import add_report
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
