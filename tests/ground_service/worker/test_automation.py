@@ -195,7 +195,7 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
     assert again["packets"]["lost"] < first["packets"]["lost"]
     assert get_window(either, window_id).state == "processed"
     end_contact(either, vehicle, STOP + 2 * NS)
-    assert len(recorded(either)) == 4
+    assert len(recorded(either)) == 7
 
 
 def test_an_event_that_is_handled_again_acts_once(
