@@ -152,7 +152,7 @@ def test_a_parameter_is_found_in_the_tree_and_its_plot_is_drawn(mct):
     tree.get_by_label("Expand housekeeping linna.packet").click()
     with mct.expect_response(lambda answer: "/telemetry/temperature_c?" in answer.url) as received:
         tree.get_by_label("Navigate to temperature linna.parameter").click()
-    assert len(received.value.json()["buckets"]) == 40  # the whole pass is in the interval
+    assert len(received.value.json()["buckets"]) >= 40  # the whole pass is in the interval
     expect(mct.locator(".c-plot").get_by_text("temperature °C")).to_be_visible(timeout=WAIT_MS)
     expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible(timeout=WAIT_MS)
 
@@ -178,6 +178,17 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     )
     (alarm,) = json.loads(ask(f"{shown.url}/api/v1/alarms")[1])["items"]
     assert (alarm["name"], alarm["state"]) == ("temperature_c", "acknowledged")
+
+
+def test_the_layout_of_a_payload_engineer_shows_states_series_and_images(mct, shown):
+    name = "payload-engineer"
+    instance = spacecraft(shown.url)["instance"]
+    mct.goto(f"/mct#/browse/linna:spacecraft/linna:vehicle~76~{instance}/linna:{name}~76~{instance}")
+    row = mct.get_by_label("lad row").filter(has=mct.get_by_text("frames processed", exact=True))
+    expect(row).to_contain_text("2029-08-07", timeout=WAIT_MS)
+    # The estimator of the newest state, of the series of all estimators.
+    expect(mct.get_by_text("altitude, spherical").first).to_be_visible(timeout=WAIT_MS)
+    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible(timeout=WAIT_MS)
 
 
 def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
