@@ -93,14 +93,18 @@ def spacecraft(url):
 
 
 def receive(url, temperature_c, second):
-    """Upload a housekeeping packet, later than those of the pass."""
+    """Upload a housekeeping packet and a camera fault, later than the packets of the pass."""
     zeros = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values = zeros | {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c, "mode": 1}
     ticks = int(ticks_from_utc_ns(parse_utc("2029-08-07T06:15:00Z"))) + second * 65_536
-    packet = DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=900 + second)
+    fault = {"event_id": 20, "frame_number": second, "value_1": 0.0, "value_2": 0.0}
+    packets = [
+        DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=900 + second),
+        DICTIONARY.pack("event_high", fault, ticks=ticks, sequence_count=900 + second),
+    ]
     request = urllib.request.Request(
         f"{url}/api/v1/telemetry?name=live-{second}.cadu&instance={spacecraft(url)['instance']}",
-        data=encode_cadus([packet], spacecraft_id=76),
+        data=encode_cadus(packets, spacecraft_id=76),
         headers={"Content-Type": "application/octet-stream"},
     )
     with urllib.request.urlopen(request, timeout=20) as answer:
@@ -176,8 +180,10 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible(
         timeout=WAIT_MS
     )
-    (alarm,) = json.loads(ask(f"{shown.url}/api/v1/alarms")[1])["items"]
-    assert (alarm["name"], alarm["state"]) == ("temperature_c", "acknowledged")
+    found = {one["name"]: one["state"] for one in json.loads(ask(f"{shown.url}/api/v1/alarms")[1])["items"]}
+    assert found == {"temperature_c": "acknowledged", "camera_fault": "raised"}
+    event = mct.locator(".c-telemetry-table tr").filter(has_text="camera fault")
+    expect(event).to_contain_text("high", timeout=WAIT_MS)
 
 
 def test_the_layout_of_a_payload_engineer_shows_states_series_and_images(mct, shown):

@@ -38,9 +38,9 @@ function timesOf(values) {
   };
 }
 
-export async function installClocks(openmct, spacecraft) {
-  const found = spacecraft ? timesOf(await newest(spacecraft)) : { last: null, mission: null };
-  let offset = found.mission === null ? 0 : found.mission - Date.now();
+export async function installClocks(openmct, spacecraft, session) {
+  let offset = milliseconds(session.time) - Date.now();
+  const found = spacecraft ? timesOf(await newest(spacecraft)) : { last: null };
   const mission = new Clock("mission", "Mission time", "Clock of the service: UTC, or the time of a simulated mission.", Date.now() + offset);
   const data = new Clock("newest", "Newest telemetry", "Spacecraft time of the newest telemetry received.", found.last ?? mission.value);
   setInterval(() => mission.tick(Date.now() + offset), TICK_MS);

@@ -69,10 +69,10 @@ export function installLayouts(openmct) {
   addPlot("payload-navigation", "On-board estimator", navigationNames);
   addLayout(SHIFT, "Layout: pass shift", [
     [64, [["shift-values", 36], ["shift-plot", 34], [FAULTS, 30]]],
-    [36, [["plan", 100]]],
+    [36, [["plan", 55], ["events", 45]]],
   ]);
   addLayout("payload-engineer", "Layout: payload engineer", [
     [60, [["payload-values", 30], ["payload-navigation", 38], ["payload-plot", 32]]],
-    [40, [["images", 100]]],
+    [40, [["detections", 50], ["events", 50]]],
   ]);
 }

@@ -2,6 +2,7 @@
 import { get } from "../api.js";
 import { installClocks } from "./clocks.js";
 import { addressOf, allSpacecraft, installDictionary } from "./dictionary.js";
+import { installEvents } from "./events.js";
 import { installFaults } from "./faults.js";
 import { onState, startFeed } from "./feed.js";
 import { installImagery } from "./imagery.js";
@@ -60,11 +61,12 @@ async function start() {
   installTelemetry(openmct);
   installLayouts(openmct);
   installPlan(openmct);
+  installEvents(openmct);
   installImagery(openmct);
   installFaults(openmct, session);
   installStored(openmct, session);
   startFeed();
-  const last = await installClocks(openmct, spacecraft);
+  const last = await installClocks(openmct, spacecraft, session);
   // The time system is needed before the conductor.
   installConductor(last);
   installIndicators(session);

@@ -1,0 +1,64 @@
+// Event reports of a spacecraft as a table.
+import { get } from "../api.js";
+import { addExtra } from "./dictionary.js";
+import { listen, milliseconds } from "./feed.js";
+
+const PAGE = 1000;
+const MOST = 5000; // newest events of an interval that are shown
+
+const text = (key, name, range) => ({ key, source: key, name, format: "string", hints: range ? { range } : {} });
+const METADATA = {
+  values: [
+    { key: "utc", source: "utc", name: "Spacecraft time", format: "utc", hints: { domain: 1 } },
+    text("severity", "Severity", 2),
+    text("event", "Event", 1),
+    text("detail", "Detail", 3),
+  ],
+};
+const COLOUR = { high: "is-limit--upr is-limit--red", medium: "is-limit--upr is-limit--yellow" };
+
+// Tables of Open MCT use the keys id and name themselves.
+const datum = (one) => ({ id: `${one.time} ${one.name} ${one.detail}`, utc: milliseconds(one.time), severity: one.severity, event: one.name.replaceAll("_", " "), detail: one.detail });
+
+async function request({ spacecraft }, { start, end, size, signal }) {
+  const wanted = Math.min(size ?? MOST, MOST);
+  const query = { ...spacecraft, start: new Date(Math.max(start, 0)).toISOString(), stop: new Date(Math.max(end, 0)).toISOString() };
+  const found = [];
+  for (let offset = 0; offset < wanted; offset += PAGE) {
+    const page = await get("events", { ...query, limit: Math.min(PAGE, wanted - offset), offset }, { signal });
+    found.push(...page.items.map(datum));
+    if (found.length >= page.total) break;
+  }
+  return found.reverse();
+}
+
+function subscribe(openmct, object, callback) {
+  let last = openmct.time.getBounds().end;
+  return listen("telemetry", async () => {
+    try {
+      const found = await request(object, { start: last + 1, end: Date.UTC(2129, 0) });
+      if (!found.length) return;
+      last = found.at(-1).utc;
+      callback(found);
+    } catch (error) {
+      console.warn(`${object.name}: ${error.message}`);
+    }
+  });
+}
+
+export function installEvents(openmct) {
+  const isEvents = (object) => object.type === "linna.events";
+  openmct.types.addType("linna.events", { name: "Events", cssClass: "icon-tabular-realtime", creatable: false });
+  addExtra("events", () => ({ type: "linna.events", name: "Events", telemetry: METADATA }));
+  openmct.telemetry.addProvider({
+    supportsRequest: isEvents,
+    request,
+    supportsSubscribe: isEvents,
+    subscribe: (object, callback) => subscribe(openmct, object, callback),
+    supportsLimits: isEvents,
+    getLimitEvaluator: () => ({
+      evaluate: (found, metadata) => (metadata?.key === "severity" && COLOUR[found.severity] ? { cssClass: COLOUR[found.severity], name: found.severity } : undefined),
+    }),
+    getLimits: () => ({ limits: async () => ({}) }),
+  });
+}
