@@ -51,8 +51,6 @@ def acquire(connection: Connection, name: str, owner: str, duration_ns: int) -> 
     Processes compare the end of the lease with the clock of the database, so that hosts with different clocks agree.
     """
     now = database_now_ns(connection)
-    if _held_by_another(connection, name, owner, now):
-        return False
     repository.add_new(connection, _LEASES, name=name, owner=None, lease_utc_ns=0)
     return renew_or_take(connection, _LEASES, name, owner, now_utc_ns=now, until_utc_ns=now + duration_ns)
 
@@ -77,9 +75,3 @@ def database_now_ns(connection: Connection) -> int:
         return utc_now_ns()
     query = text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")
     return 1000 * int(connection.execute(query).scalar_one())
-
-
-def _held_by_another(connection: Connection, name: str, owner: str, now_utc_ns: int) -> bool:
-    """Return whether another process has a lease, without a write."""
-    row = connection.execute(select(_LEASES).where(_LEASES.c.name == name)).mappings().first()
-    return row is not None and row["owner"] not in (None, owner) and row["lease_utc_ns"] >= now_utc_ns

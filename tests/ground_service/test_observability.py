@@ -259,6 +259,16 @@ def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass
     assert key == (76, "flight") and 4000.0 <= age_s < 5000.0
 
 
+def test_the_status_counts_jobs_of_all_kinds_by_state(either: Ground) -> None:
+    enter_job(either, "report", {"pass_id": 1})
+    run_job(either, enter_job(either, "plan", {}))
+    enter_job(either, "plan", {})
+    enter_job(either, "plan", {})
+    seen = condition.service_status(either, None)
+    assert seen.jobs == {"queued": 3, "done": 1} and seen.backup_age_s is None
+    assert seen.complaints[0] == "No process does the recurring work."
+
+
 def test_the_newest_complete_backup_counts(ground: Ground, tmp_path: Path) -> None:
     assert newest_backup_utc_ns(tmp_path / "none") is None
     for name, made in (("a", 3000 * S), ("b", 2000 * S)):

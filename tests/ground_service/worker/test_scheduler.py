@@ -89,6 +89,7 @@ def test_a_lease_is_not_given_back_by_somebody_else(either: Ground) -> None:
 def test_the_nightly_job_is_entered_once_after_half_past_midnight(
     ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
     one, work = make(ground)
     midnight = parse_utc("2029-08-07T00:00:00Z")
     for minute, entered in ((29, 0), (30, 1), (31, 1), (1439, 1), (1440 + 29, 1), (1440 + 30, 2)):
