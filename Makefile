@@ -21,7 +21,7 @@ SEED   ?= 1
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces terrain exports,requirements/$(name).txt)
 
-.PHONY: demo test check openmct docs links sbom licences package bench mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures links sbom licences package bench mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -52,6 +52,10 @@ openmct: deploy/openmct/node_modules/.package-lock.json
 deploy/openmct/node_modules/.package-lock.json: deploy/openmct/package.json deploy/openmct/package-lock.json
 	npm ci --prefix deploy/openmct --ignore-scripts --no-audit --no-fund
 	touch $@
+
+# Pictures of the pages in the documentation, taken by the test of a shift.
+pictures: $(VENV)/.dev
+	LINNA_PICTURES=docs/pictures $(BIN)/python -m pytest -q tests/ground_service/web/test_shift.py
 
 # Software bill of materials of the runtime, CycloneDX.
 sbom: $(VENV)/.dev

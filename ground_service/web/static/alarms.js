@@ -74,7 +74,7 @@ for (const name of ["state", "severity"]) {
     await reload.first();
   }));
 }
-watch((message) => message.kind === "alarm" && reload().catch(trouble));
+watch((message) => message.kind === "alarm" && reload().catch(trouble), reload);
 byId("state").value = stated("state") === "any" ? "" : (stated("state") ?? "open");
 byId("severity").value = stated("severity") === "any" ? "" : (stated("severity") ?? "");
 reload().catch((error) => error.status === 401 || trouble(error));

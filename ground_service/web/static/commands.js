@@ -190,6 +190,6 @@ let pending = null;
 watch(() => {
   clearTimeout(pending);
   pending = setTimeout(() => Promise.all([load(), loadLinks()]).catch(trouble), 300);
-});
+}, () => Promise.all([load(), loadLinks()]));
 loadLinks().catch((error) => error.status === 401 || trouble(error));
 load().catch((error) => error.status === 401 || trouble(error));

@@ -208,8 +208,13 @@ byId("menu").addEventListener("click", () => {
   byId("menu").setAttribute("aria-expanded", open);
 });
 
+// `again` reads anew what a page shows: what happened before the feed connected came with no message.
 const watchers = [];
-export const watch = (onMessage) => watchers.push(onMessage);
+const readers = [];
+export function watch(onMessage, again = null) {
+  watchers.push(onMessage);
+  if (again) readers.push(again);
+}
 
 // The session of the user; pages that differ by role wait for it.
 export const session = signedIn();
@@ -222,6 +227,7 @@ session
       (message) => watchers.forEach((onMessage) => onMessage(message)),
       (connected) => {
         byId("feed-light").classList.toggle("on", connected);
+        if (connected) readers.forEach((again) => Promise.resolve(again()).catch(trouble));
         byId("feed-light").setAttribute("aria-label", `live feed: ${connected ? "connected" : "not connected"}`);
       },
     ),

@@ -165,6 +165,6 @@ watch((message) => {
   if (!message.kind.startsWith("job")) return;
   clearTimeout(pending);
   pending = setTimeout(() => loadRegressions().catch(trouble), 400);
-});
+}, loadRegressions);
 for (const name of ["candidate", "baseline"]) byId(name).addEventListener("change", () => keep(name));
 load().catch((error) => error.status === 401 || trouble(error));

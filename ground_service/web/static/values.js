@@ -88,6 +88,6 @@ export async function showLive() {
   byId("spacecraft").addEventListener("change", acting(refresh));
   bind("spacecraft", "packet");
   byId("packet").addEventListener("change", draw);
-  watch((message) => message.kind === "telemetry" && soon());
+  watch((message) => message.kind === "telemetry" && soon(), soon);
   setInterval(draw, 5000);
 }

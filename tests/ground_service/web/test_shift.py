@@ -1,0 +1,298 @@
+"""A shift of one operator in Chromium, from the sign-in to the sign-out, with a ground station in the test.
+
+LINNA_PICTURES=FOLDER keeps the pictures of the documentation: `make pictures`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
+
+from ground_service.access.service import add_user
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.ground import open_ground
+from ground_service.missions.service import add_mission
+from ground_service.passes.archive_import import import_archive
+from ground_service.regression.archives import keep_archive
+from ground_service.regression.builds import load_build, register_build
+from lunar.ephemeris import ephemeris_from_states
+from lunar.oem import save_oem
+from lunar.timescales import ticks_from_utc_ns
+from tests.ground_service.conftest import circular_states
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import DownlinkEncoder
+from tmtc.uplink import UplinkDecoder
+
+NS = 1_000_000_000
+SPACECRAFT = 76
+PATIENCE_MS = 60_000
+
+MISSION = """name = "selenita"
+[spacecraft]
+id = 76
+[camera]
+fov_deg = 120.0
+width_px = 512
+height_px = 512
+[approval]
+windows = "manual"
+[link.stations.madrid]
+latitude_deg = 40.43
+longitude_deg = -4.25
+minimum_elevation_deg = 0.0
+[link.stations.canberra]
+latitude_deg = -35.4
+longitude_deg = 149.0
+minimum_elevation_deg = 0.0
+[[links]]
+name = "madrid"
+kind = "tcp"
+station = "madrid"
+send = "manual"
+downlink = "127.0.0.1:{down}"
+uplink = "127.0.0.1:{up}"
+silence_s = 2.0
+[[links]]
+name = "canberra"
+kind = "tcp"
+station = "canberra"
+send = "manual"
+uplink = "127.0.0.1:{up}"
+"""
+
+
+@dataclass
+class Spacecraft:
+    """A station and a payload behind it: reports what it is told to, and verifies every telecommand it receives."""
+
+    down: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
+    up: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
+    _encoder: DownlinkEncoder = field(default_factory=lambda: DownlinkEncoder(SPACECRAFT))
+    _listener: socket.socket | None = None
+    _count: int = 0
+    _sending: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        for task in (self._accept_listeners, self._take_telecommands):
+            threading.Thread(target=task, daemon=True).start()
+
+    def report(self, name: str, **values: Any) -> None:
+        """Send a packet to the service, which has connected."""
+        zeros = {one.name: 0 for one in DICTIONARY.packet(name).fields if one.size == 1}
+        with self._sending:
+            self._count += 1
+            ticks = int(ticks_from_utc_ns(time.time_ns())) + self._count
+            packet = DICTIONARY.pack(name, zeros | values, ticks=ticks, sequence_count=self._count)
+            octets = self._encoder.encode([packet])
+        until = time.monotonic() + PATIENCE_MS / 1e3
+        while self._listener is None:
+            assert time.monotonic() < until, "the service has not connected"
+            time.sleep(0.02)
+        self._listener.sendall(octets)
+
+    def _accept_listeners(self) -> None:
+        while True:
+            try:
+                self._listener = self.down.accept()[0]
+            except OSError:
+                return
+
+    def _take_telecommands(self) -> None:
+        while True:
+            try:
+                connection, _ = self.up.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._verify, args=(connection,), daemon=True).start()
+
+    def _verify(self, connection: socket.socket) -> None:
+        decoder = UplinkDecoder(SPACECRAFT)
+        while octets := connection.recv(1 << 16):
+            for packet in decoder.decode(octets).packets:
+                request = int.from_bytes(packet[:4], "big")
+                for stage in ("accepted", "started", "completed"):
+                    self.report(f"verification_{stage}", request_id=request)
+
+    def close(self) -> None:
+        self.down.close()
+        self.up.close()
+
+
+@dataclass
+class Shift:
+    """The service of the shift, its spacecraft, and the token of the operator."""
+
+    url: str
+    token: str
+    spacecraft: Spacecraft
+
+
+@pytest.fixture
+def shift(
+    tmp_path: Path,
+    synthetic_pass: Any,
+    make_flyable: Callable[..., Any],
+    make_build: Callable[..., Path],
+    console: Any,
+    serve: Any,
+) -> Iterator[Shift]:
+    """A service with users, a mission, an ephemeris of the coming days, one pass, and two builds over its archive."""
+    spacecraft = Spacecraft()
+    flyable = make_flyable(frames=12, seed=61)
+    every = time.time_ns() // NS * NS - 3 * 3600 * NS + np.arange(0, 3 * 86_400, 60, dtype=np.int64) * NS
+    save_oem(ephemeris_from_states(every, *circular_states(every)), tmp_path / "coming.oem")
+    ports = {"down": spacecraft.down.getsockname()[1], "up": spacecraft.up.getsockname()[1]}
+    home = tmp_path / "home"
+    with open_ground(home) as ground:
+        add_user(ground, "root", "admin")
+        token = add_user(ground, "ann", "operator")
+        add_mission(ground, MISSION.format(**ports).encode(), actor="root")
+        stored = ground.files.put_file(tmp_path / "coming.oem")
+        add_ephemeris(ground, stored, name="coming.oem", precedence=0, actor="root")
+        import_archive(ground, synthetic_pass.folder)
+        keep_archive(ground, flyable.folder)
+        for name, program in (("good", None), ("broken", "raise SystemExit(4)")):
+            options = {} if program is None else {"program": program}
+            path = make_build(name, {"synthetic pass 61": flyable.packets}, **options)
+            register_build(ground, load_build(path.parent), actor="root")
+    running = serve(home, home / "serve.log", console.port)
+    yield Shift(running.url, token, spacecraft)
+    spacecraft.close()
+    running.stop()
+
+
+class Pictures:
+    """Pictures of the pages, 1280 px wide, in 128 colours."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def take(self, page: Page, name: str, part: str = "body") -> None:
+        """Take the upper 800 px of a part of the page."""
+        picture = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
+        picture = picture.crop((0, 0, picture.width, min(picture.height, 800)))
+        assert np.asarray(picture).std() > 5.0, f"{name}: nothing but background"
+        picture.quantize(128).save(self.folder / f"{name}.png", optimize=True)
+
+
+@pytest.fixture
+def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
+    """The operator's browser; the test fails if a script fails or the console shows an error."""
+    context = browser.new_context(base_url=shift.url, viewport={"width": 1280, "height": 800})
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
+    expect.set_options(timeout=PATIENCE_MS)
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    yield page
+    expect.set_options(timeout=5_000)
+    context.close()
+    assert errors == []
+
+
+def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path) -> None:
+    page, spacecraft = operator, shift.spacecraft
+    pictures = Pictures(Path(os.environ.get("LINNA_PICTURES") or tmp_path))
+
+    # Sign in.
+    page.goto("/")
+    page.get_by_label("Token").fill(shift.token)
+    page.locator("dialog").get_by_role("button", name="Sign in").click()
+    expect(page.locator("#user")).to_have_text("ann, operator")
+
+    # The mission in force.
+    page.goto("/missions")
+    page.get_by_role("link", name="selenita").click()
+    expect(page.locator("#approval tr", has_text="windows")).to_contain_text("manual")
+
+    # A standing request becomes windows in mission time and in daylight.
+    page.goto("/planner")
+    expect(page.locator("#daylight")).to_contain_text("Sun above the horizon")
+    page.get_by_text("Add a standing request").click()
+    page.locator("#request-name").fill("low Sun")
+    page.locator("#request-windows").fill("3")
+    page.locator("#request-period").fill("2")
+    page.locator("#request-horizon").fill("1")
+    page.locator("#add-request").get_by_role("button", name="Add").click()
+    expect(page.locator("#requests tbody tr")).to_contain_text("3 draft")
+    page.locator("#requests").get_by_role("button", name="Plan", exact=True).click()
+    expect(page.locator("#request-plan")).to_contain_text("the number of windows of its period is planned")
+    page.locator("#timeline .window.draft").first.click()
+    expect(page.locator("#selected")).to_contain_text("Sun elevation")
+    page.evaluate("document.querySelectorAll('#notices .notice').forEach((one) => one.remove())")
+    pictures.take(page, "planner")
+
+    # Approve and release.
+    page.locator("#selected").get_by_role("button", name="Approve").click()
+    page.locator("#selected").get_by_role("button", name="Uplink").click()
+    expect(page.locator("#notices")).to_contain_text("telecommands released")
+
+    # Send, and follow the verification.
+    spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=21.5)
+    page.goto("/commands")
+    row = page.locator("#links tbody tr", has_text="madrid")
+    expect(row.get_by_role("button", name="Send now")).to_be_enabled()
+    row.get_by_role("button", name="Send now").click()
+    command = page.locator("#commands tbody tr", has_text="insert activity").first
+    expect(command.locator(".state")).to_have_text("completed")
+    expect(command.get_by_role("img", name="accepted, started, completed")).to_be_visible()
+    expect(command).to_contain_text("by ann")
+    pictures.take(page, "commands", "section[aria-labelledby=queue-title]")
+
+    # Live telemetry.
+    page.goto("/telemetry?spacecraft=76+flight&packet=housekeeping")
+    value = page.locator("#live tr", has_text="temperature")
+    expect(value).to_contain_text("21.5 °C")
+    spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=70.25)
+    expect(value).to_contain_text("70.25 °C")
+    expect(value.locator(".state.warning")).to_be_visible()
+
+    # An alarm.
+    spacecraft.report("event_high", event_id=20, frame_number=7)
+    page.goto("/alarms")
+    alarm = page.locator("#alarms tbody tr", has_text="camera fault")
+    alarm.get_by_role("button", name="Acknowledge").click()
+    page.get_by_label("State").select_option("cleared")  # the condition had ended
+    expect(alarm).to_contain_text("ann")
+    pictures.take(page, "alarms")
+
+    # The report of a pass.
+    page.goto("/passes")
+    page.get_by_role("link", name="synthetic pass").click()
+    page.get_by_role("button", name="Make a report").click()
+    expect(page.locator("#verdict .verdict")).not_to_be_empty()
+    with page.expect_popup() as opened:
+        page.get_by_role("link", name="Open report").click()
+    expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
+    assert re.search(r"/reports/[0-9a-f]{32}$", opened.value.url)
+    opened.value.close()
+
+    # A regression with its verdict.
+    page.goto("/regression")
+    for select, build in (("#candidate", "broken"), ("#baseline", "good")):
+        option = page.locator(f"{select} option", has_text=build)
+        page.locator(select).select_option(option.get_attribute("value"))
+    page.get_by_role("button", name="Run", exact=True).click()
+    verdict = page.locator("#regressions tbody tr").first
+    expect(verdict.locator(".state.failed, .state.inconclusive")).to_be_visible()
+    expect(verdict).to_contain_text("broken")
+    expect(verdict.locator(".reasons li").first).to_contain_text("exit")
+    pictures.take(page, "regression")
+
+    # Sign out: the next request needs a sign-in.
+    page.locator("#caller").click()
+    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+    assert page.request.get("/api/v1/passes").status == 401
