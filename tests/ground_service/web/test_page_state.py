@@ -1,0 +1,250 @@
+"""Pages keep their state in the address, differ by role, and show what was flown, in Chromium."""
+
+import csv
+import re
+
+import pytest
+from playwright.sync_api import expect
+
+from ground_service.access.service import add_user
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.ground import open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
+from ground_service.passes.archive_import import import_archive
+from tests.ground_service.web.test_in_browser import PATHS, camera_fault, receive, settled
+from tmtc.downlink import encode_cadus
+
+WIDTHS = (1280, 820, 390)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_page_scrolls_sideways_or_reports_an_error(page, width):
+    errors = []
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.set_viewport_size({"width": width, "height": 844})
+    for path in PATHS:
+        settled(page, path)
+        page.wait_for_load_state("networkidle")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        assert errors == [], path
+
+
+def test_the_navigation_of_a_telephone_is_one_button_until_it_is_opened(page):
+    page.set_viewport_size({"width": 390, "height": 844})
+    settled(page, "/planner")
+    assert page.locator("header").bounding_box()["height"] < 100.0
+    link = page.get_by_role("link", name="Telemetry")
+    expect(link).to_be_hidden()
+    page.get_by_role("button", name="Menu").press("Enter")
+    link.click()
+    expect(page).to_have_url(re.compile("/telemetry"))
+    page.set_viewport_size({"width": 1280, "height": 844})
+    expect(page.get_by_role("button", name="Menu")).to_be_hidden()
+    expect(page.get_by_role("link", name="Planner")).to_be_visible()
+
+
+def test_zoom_and_charts_are_in_the_address(page):
+    settled(page, "/telemetry")
+    chart = page.locator(".chart").first
+    expect(chart.locator("canvas")).to_be_visible()
+    page.locator("#parameter").select_option("bus_voltage_v")
+    page.locator("#chart").select_option("0")
+    page.get_by_role("button", name="Add").click()
+    expect(page.get_by_label("chart: temperature and bus voltage")).to_be_visible()
+    expect(page.locator(".chart")).to_have_count(1)
+    scales = page.evaluate("document.querySelector('.chart').plot.series.map((one) => one.scale)")
+    assert {"y", "second"} <= set(scales)
+    page.locator(".chart").first.focus()
+    page.keyboard.press("+")
+    expect(page).to_have_url(re.compile("zoom="))
+    wanted = page.evaluate("(({min, max}) => [min, max])(document.querySelector('.chart').plot.scales.x)")
+    page.reload()
+    expect(page.get_by_label("chart: temperature and bus voltage")).to_be_visible()
+    found = page.evaluate("(({min, max}) => [min, max])(document.querySelector('.chart').plot.scales.x)")
+    assert found == pytest.approx(wanted, abs=1.0)
+    page.locator(".chart").first.focus()
+    page.keyboard.press("0")
+    expect(page).not_to_have_url(re.compile("zoom="))
+
+
+def test_codes_are_steps_with_their_names_and_hashes_are_listed(page):
+    settled(page, "/telemetry?chart=1:mode&chart=1:model_hash")
+    expect(page.get_by_label("chart: mode")).to_be_visible()
+    stepped = page.evaluate(
+        """() => {
+            const plot = document.querySelector(".chart").plot;
+            const texts = plot.axes[1].values(plot, [0, 2]);
+            return {texts, path: plot.series[1].paths.toString() === uPlot.paths.stepped({align: 1}).toString()};
+        }"""
+    )
+    assert stepped["path"] and stepped["texts"][1] == "observing"
+    listed = page.get_by_label("values: model hash")
+    expect(listed.locator("code").first).to_have_text(re.compile("^[0-9a-f]{8}$"))
+    expect(listed.locator("canvas")).to_have_count(0)
+
+
+def test_a_csv_file_has_every_sample(page):
+    settled(page, "/telemetry")
+    link = page.get_by_role("link", name="CSV of all samples")
+    expect(page.locator("#charts")).to_contain_text("40 samples")
+    with page.expect_download() as started:
+        link.click()
+    with open(started.value.path(), newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 40
+    assert "temperature_c" in rows[0]
+
+
+def test_events_of_all_passes_are_filtered_in_the_address(page):
+    receive(page, [camera_fault(second) for second in range(900, 903)])
+    settled(page, "/events?spacecraft=77+flight&name=camera")
+    expect(page.locator("#events tbody tr").first).to_contain_text("camera fault")
+    page.get_by_label("Severity").select_option("medium")
+    expect(page).to_have_url(re.compile("severity=medium"))
+    expect(page.locator("#events tbody tr").first).to_contain_text("high")
+    page.get_by_label("Event contains").fill("nothing of the kind")
+    page.get_by_role("button", name="Show").click()
+    expect(page.locator("#events")).to_contain_text("No event matches.")
+
+
+def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
+    settled(page, "/passes/1")
+    expect(page.locator("#terrain")).to_contain_text("Terrain:")
+    expect(page.locator("#terrain")).to_contain_text("craters of the catalogue of the pass")
+    expect(page.locator("#map-legend li")).to_have_count(2)
+    expect(page.locator("#map")).to_have_class(
+        re.compile("bare")
+    )  # no picture of the Moon under other terrain
+    expect(page.locator("#map img")).to_have_count(0)
+    page.locator("#map-legend").get_by_label("spherical").uncheck()
+    expect(page.locator("#map-legend").get_by_label("spherical")).not_to_be_checked()
+
+
+def test_the_automation_page_lists_the_rules(page):
+    settled(page, "/automation")
+    expect(page.locator("#rules tbody tr").first).to_be_visible()
+
+
+def test_passes_without_a_kept_archive_are_listed_with_what_to_do(page):
+    settled(page, "/regression")
+    row = page.locator("#archives label", has_text="synthetic pass").filter(has_text="pass 1,")
+    expect(row).to_contain_text("no archive with its images is kept")
+    expect(row.locator("input")).to_be_disabled()
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory, console, serve, synthetic_pass):
+    """A service with a viewer and an operator, one pass and an alarm."""
+    home = tmp_path_factory.mktemp("roles") / "home"
+    faults = home.with_name("faults.cadu")
+    faults.write_bytes(encode_cadus([camera_fault(second) for second in range(3)], spacecraft_id=77))
+    with open_ground(home) as ground:
+        tokens = {role: add_user(ground, role, role) for role in ("viewer", "operator")}
+        import_archive(ground, synthetic_pass.folder)
+        ingest_file(ground, faults)
+    running = serve(home, home / "serve.log", console.port)
+    yield running.url, tokens
+    running.stop()
+
+
+@pytest.fixture
+def signed_in(browser, guarded):
+    """A page of a signed-in user: ``signed_in(role)``."""
+    contexts = []
+
+    def open_page(role):
+        context = browser.new_context(base_url=guarded[0])
+        contexts.append(context)
+        headers = {"Content-Type": "application/json"}
+        context.request.post("/api/v1/session", data={"token": guarded[1][role]}, headers=headers)
+        return context.new_page()
+
+    yield open_page
+    for one in contexts:
+        one.close()
+
+
+def test_no_button_that_a_viewer_sees_is_refused(signed_in):
+    operator = signed_in("operator")
+    operator.goto("/")
+    window = {"name": "draft", "start": "2029-08-07T07:00:00Z", "stop": "2029-08-07T07:20:00Z"}
+    for path, body in (
+        ("windows", {**window, "spacecraft_id": 76}),
+        ("telecommands", {"name": "test_connection", "spacecraft_id": 76}),
+    ):
+        made = operator.evaluate(
+            """async ([path, body]) => (await fetch(`/api/v1/${path}`, {method: "POST", body: JSON.stringify(body),
+            headers: {"Content-Type": "application/json"}})).status""",
+            [path, body],
+        )
+        assert made == 201, path
+    page = signed_in("viewer")
+    refused = []
+    page.on("response", lambda answer: refused.append(answer.url) if answer.status == 403 else None)
+    pressed = 0
+    for path in PATHS:
+        if "{revision}" in path or path == "/audit":
+            continue
+        page.goto(path)
+        expect(page.locator("#user")).to_have_text("viewer, viewer")
+        page.wait_for_load_state("networkidle")
+        buttons = page.locator("main button:visible:enabled, main [role=button]:visible")
+        for index in range(min(buttons.count(), 12)):
+            if index < buttons.count():
+                buttons.nth(index).click(no_wait_after=True, timeout=3_000)
+                pressed += 1
+        page.wait_for_load_state("networkidle")
+        assert refused == [], path
+    assert pressed > 20
+    expect(page.get_by_role("link", name="Audit")).to_be_hidden()
+
+
+def test_the_planner_opens_in_the_time_of_the_ephemeris_and_searches_for_its_spacecraft(
+    browser, tmp_path, console, serve, day_of_orbits
+):
+    home = tmp_path / "home"
+    with open_ground(home) as ground:
+        text = 'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n'
+        add_mission(ground, text.encode(), actor="ann")
+        stored = ground.files.put_file(day_of_orbits)
+        add_ephemeris(ground, stored, name="orbits", precedence=0, actor="ann")
+    running = serve(home, home / "serve.log", console.port)
+    try:
+        page = browser.new_page(base_url=running.url, viewport={"width": 390, "height": 844})
+        page.goto("/planner")
+        expect(page.locator("#timeline")).to_contain_text("01-01")
+        expect(page.locator("#from")).to_have_attribute("placeholder", "2030-01-01T00:00:00Z")
+        expect(page.locator("#daylight")).to_contain_text("Sun above the horizon")
+        page.locator("#latitude-min").fill("-90")
+        page.locator("#latitude-max").fill("90")
+        page.get_by_role("button", name="Search").click()
+        rows = page.locator("#candidates tbody tr")
+        expect(rows.first).to_be_visible(timeout=30_000)
+        for row in range(rows.count()):
+            least = rows.nth(row).locator("td").nth(4).inner_text().split(" to ")[0]
+            assert float(least) >= -0.5, least  # degrees, rounded
+        page.get_by_role("button", name="Closer").click()
+        expect(page).to_have_url(re.compile("view=2030-01-01"))
+        expect(page).to_have_url(re.compile("latitude-min=-90"))
+        page.reload()
+        expect(page.locator("#latitude-min")).to_have_value("-90")
+    finally:
+        running.stop()
+
+
+def test_a_live_view_takes_matches_from_the_payload(page, console, live_frames):
+    settled(page, "/live")
+    expect(page.locator("#state")).to_have_text("connected")
+    message = live_frames[4] | {"terrain": {"name": "procedural (seed 5)", "real": False}}
+    near = {"u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0, "score": 0.9}  # on a crater, not identified
+    message["detections"] = [near, {**near, "u_px": 300.0, "crater_id": 7}]
+    console.say(message)
+    expect(page.locator("#numbers")).to_contain_text("2, 1 matched")
+    expect(page.locator("#terrain")).to_have_text("Terrain: procedural (seed 5).")
+    expect(page.locator("#frame")).to_have_attribute("data-shown", re.compile("[1-9]"))
+    ring = "([u, v]) => Array.from(document.getElementById('frame').getContext('2d').getImageData(u, v, 1, 1).data)"
+    matched = page.evaluate(ring, [321, 121])
+    unmatched = page.evaluate(ring, [122, 121])
+    assert matched[1] > 150 and matched[0] < 200 and matched[2] < 200, matched  # green
+    assert unmatched[2] > 150, unmatched  # blue
