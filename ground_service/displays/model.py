@@ -12,6 +12,9 @@ from ground_service.http.times import UtcTime
 from ground_service.text import LINE_PATTERN_JSON
 
 DOCUMENT_LIMIT_OCTETS = 256 << 10
+DEPTH_LIMIT = 64
+"""Largest number of objects and lists inside each other in a document."""
+
 OBJECTS_LIMIT = 2000
 """Largest number of stored objects."""
 
@@ -54,6 +57,12 @@ def packed(document: dict[str, Any]) -> str:
 
 
 def _small(document: dict[str, Any]) -> dict[str, Any]:
+    level: list[Any] = [document]
+    for _ in range(DEPTH_LIMIT):
+        inside = [one.values() if isinstance(one, dict) else one for one in level]
+        level = [value for values in inside for value in values if isinstance(value, dict | list)]
+    if level:
+        raise ValueError(f"expected at most {DEPTH_LIMIT} levels of objects and lists, found more")
     octets = len(packed(document).encode())
     if octets > DOCUMENT_LIMIT_OCTETS:
         raise ValueError(f"expected at most {DOCUMENT_LIMIT_OCTETS} octets, found {octets}")

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from ground_service.access.audit_log import list_entries
 from ground_service.displays import service
-from ground_service.displays.model import DOCUMENT_LIMIT_OCTETS, DisplayIn
+from ground_service.displays.model import DEPTH_LIMIT, DOCUMENT_LIMIT_OCTETS, DisplayIn
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import read_events
 from ground_service.ground import Ground
@@ -78,3 +78,15 @@ def test_documents_and_their_number_are_limited(either: Ground, monkeypatch: pyt
     with pytest.raises(InvalidInput, match="at most 1 stored objects"):
         service.keep_display(either, "other", layout(), actor="eva")
     assert keep(either, layout(1)) == 2  # a change adds none
+
+
+def nested(levels: int) -> list[object]:
+    return [nested(levels - 1)] if levels > 1 else []
+
+
+def test_the_depth_of_documents_is_limited(either: Ground) -> None:
+    assert keep(either, layout(items=nested(DEPTH_LIMIT - 1))) == 1
+    with pytest.raises(ValidationError, match=f"expected at most {DEPTH_LIMIT} levels"):
+        layout(items=nested(DEPTH_LIMIT))
+    with pytest.raises(ValidationError, match="levels"):
+        layout(items=nested(900))

@@ -60,7 +60,7 @@ def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Groun
         tmp_path,
         [
             *large_data(octets, 1, later),
-            *large_data(b"map", 2, later + 100, table="landmark_map"),
+            *large_data(thumbnail(9, TICKS + SECOND)[1], 2, later + 100, table="landmark_map"),
             *large_data(others, 3, later + 200),
             *large_data(incomplete, 4, later + 300)[:-1],
         ],
