@@ -423,7 +423,7 @@ def steady(value: Any) -> Any:
         "revoked",
         "time",
     }
-    random = {"token", "hint", "sha256", "previous_sha256", "report_id", "number"}
+    random = {"token", "hint", "sha256", "previous_sha256", "report_id", "number", "event"}
     if isinstance(value, dict):
         return {key: None if key in times | random else steady(item) for key, item in value.items()}
     if isinstance(value, list):
