@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,9 @@ from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import parse_scenario
+from studies.mission_run.checkpoints import Checkpoints
+from studies.mission_run.figures import contacts_until, trend
+from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import RunTerms, run_mission
 
 SCENARIO = """
@@ -34,27 +39,87 @@ estimators = ["spherical"]
 """
 
 
+TERMS = RunTerms(days=0.25, windows_per_day=1, window_s=600.0)
+
+
 def test_six_hours_are_planned_flown_received_and_reported_without_a_person(tmp_path: Path) -> None:
-    terms = RunTerms(days=0.25, windows_per_day=1, window_s=600.0)
     said: list[str] = []
-    figures = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, terms, said.append)
+    figures = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     windows = figures["windows"]
-    assert windows["requested"] == 2  # one on each of two days
-    assert windows["flown"] >= 1 and windows["failed"] == 0
-    assert windows["processed"] == windows["flown"] == figures["reports"]
-    assert figures["packets_lost"] == 0 and figures["interventions"] == 0
-    flown = [row for row in figures["trend"] if row["state"] == "processed"]
-    assert all(38 <= row["frames"] <= 42 for row in flown)  # 600 s / 15 s
-    assert figures["frames"] == sum(row["frames"] for row in flown)
+    assert windows["requested"] == windows["flown"] == windows["processed"] == figures["reports"] == 1
+    assert windows["failed"] == 0 and figures["incidents"] == []
+    assert figures["packets_lost"] == 0 and figures["packets_received"] == figures["packets"] > 0
+    (flown,) = figures["trend"]
+    assert 38 <= flown["frames"] <= 42 and flown["recall"] is not None  # 600 s / 15 s
+    assert figures["frames"] == figures["frames_received"] == flown["frames"]
+    assert flown["contacts_to_processed"] == 1
+    # All that was posted is the set-up: catalogue, mission, ephemeris, commissioning, standing request.
+    assert figures["interventions"] == 0 and figures["interventions_list"] == []
+    for name in ("ground", "spacecraft"):
+        memory = figures["memory_mib"][name]
+        assert 50.0 < memory["first"] <= memory["peak"] and memory["last"] <= memory["peak"]
+        assert figures["cpu_s"][name] > 0.1
     assert json.loads((tmp_path / "report.json").read_text())["windows"] == windows
     assert "six-hours" in (tmp_path / "report.html").read_text()
     # The same again prints the figures of the run that has ended; other terms need another folder.
-    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, terms, said.append)
+    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     assert again["windows"] == windows and "this run has ended" in said[-1]
     with pytest.raises(ScenarioError, match="expected a new folder, or the same scenario and options"):
         run_mission(
-            parse_scenario(SCENARIO), DataFolder(None), tmp_path, replace(terms, days=0.5), said.append
+            parse_scenario(SCENARIO), DataFolder(None), tmp_path, replace(TERMS, days=0.5), said.append
         )
+
+
+def test_a_trend_needs_three_known_values() -> None:
+    assert trend([0.0, 1.0], [1.0, None]) == {
+        "passes": 1, "first_third": 1.0, "last_third": 1.0, "slope_per_day": None,
+    }  # fmt: skip
+    found = trend([0.0, 1.0, 2.0, 3.0], [5.0, 7.0, None, 11.0])
+    assert found["slope_per_day"] == pytest.approx(2.0) and found["last_third"] == 11.0
+
+
+def test_contacts_count_from_the_end_of_a_window_to_its_processing() -> None:
+    assert contacts_until(100, 200, [90, 100, 150, 200, 210]) == 2
+
+
+def test_what_a_person_does_after_the_posts_is_an_intervention(tmp_path: Path) -> None:
+    clock = tmp_path / "clock"
+    ground = EmbeddedGround.open(tmp_path / "home", DataFolder(None), clock)
+    try:
+        ground.client.add_mission(b'name = "x"\n[spacecraft]\nid = 76\n')
+        posted = (1, ground.audit_head())
+        assert ground.interventions([posted]) == []
+        assert len(ground.interventions([])) == 1
+        command = ground.client.enter_telecommand("test_connection", {}, spacecraft_id=76)
+        ground.client.release_telecommand(command.id)
+        assert [one["text"].split(":")[0] for one in ground.interventions([posted])] == ["mission-run"] * 2
+    finally:
+        ground.close()
+
+
+def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment(tmp_path: Path) -> None:
+    home, snapshot, progress = tmp_path / "ground", tmp_path / "exact", tmp_path / "progress.json"
+    (home / "incoming").mkdir(parents=True)
+    checkpoints = Checkpoints(tmp_path, home, snapshot)
+
+    def write(number: int) -> None:
+        snapshot.write_text(str(number))
+        progress.write_text(str(number))
+        with closing(sqlite3.connect(home / "linna.db")) as connection, connection:
+            connection.execute("create table if not exists one (number)")
+            connection.execute("insert into one values (?)", (number,))
+
+    for number in (1, 2):
+        write(number)
+        checkpoints.keep(progress)
+    write(3)
+    (home / "incoming" / "segment").touch()
+    kept = checkpoints.restore()
+    assert kept is not None and kept.read_text() == snapshot.read_text() == "2"
+    with closing(sqlite3.connect(home / "linna.db")) as connection:
+        assert connection.execute("select number from one").fetchall() == [(1,), (2,)]
+    assert not (home / "incoming").exists()
+    assert Checkpoints(tmp_path / "other", home, snapshot).restore() is None and not home.exists()
 
 
 @pytest.mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"]])
@@ -63,3 +128,35 @@ def test_impossible_options_are_refused_in_one_line(
 ) -> None:
     assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_stopped_run_continues_and_ends_with_the_same_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 0.0)
+    terms = replace(TERMS, days=0.5, windows_per_day=2)
+    whole = run_mission(
+        parse_scenario(SCENARIO), DataFolder(None), tmp_path / "whole", terms, lambda line: None
+    )
+    lines: list[str] = []
+
+    def stop(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 4:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, terms, stop)
+    assert (folder / "checkpoint" / "archive.db").exists()
+    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, terms, lines.append)
+    assert any("continues from 2029-08-07T" in line for line in lines)
+    assert again["starts"] == 2 and again["interventions"] == 0
+    differ = {
+        "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "interventions_list",
+    }  # fmt: skip
+    assert {key: value for key, value in again.items() if key not in differ} == {
+        key: value for key, value in whole.items() if key not in differ
+    }

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from pathlib import Path
+
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.ephemerides import store
@@ -12,6 +15,7 @@ from ground_service.ground import Ground
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
+from lunar.ephemeris import Ephemeris as States
 from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 
@@ -49,6 +53,22 @@ def add_ephemeris(
             ),
         )
         return added
+
+
+def open_ephemeris(ground: Ground, reference: Ephemeris) -> States:
+    """Return the states of a reference ephemeris; callers share one object for each file.
+
+    Raises
+    ------
+    LunarError
+        The file cannot be read.
+    """
+    return _loaded(str(ground.files.path(reference.sha256)))
+
+
+@functools.lru_cache(maxsize=8)
+def _loaded(path: str) -> States:
+    return load_ephemeris(Path(path))
 
 
 def list_ephemerides(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[Ephemeris], int]:

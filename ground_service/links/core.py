@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lunar.arrays import BoolArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris
 from lunar.visibility import GroundStation, find_windows, link
@@ -15,6 +15,9 @@ STEP_S = 120.0
 """A contact behind the limb lasts an hour and more; shorter ones than this may be missed."""
 
 EDGE_S = 1.0
+BLOCK_NS = 6 * 3600 * NS
+"""Visibility is computed once for each block of time; a query is a cut of blocks."""
+
 LIGHT_MARGIN_NS = 3 * NS
 """A contact is evaluated at reception, so the ephemeris has to reach back by the light time (1.3 s)."""
 
@@ -56,14 +59,39 @@ def predict_contacts(
         return ()
     found = []
     for station in stations:
-
-        def visible(epochs: IntArray, station: GroundStation = station) -> BoolArray:
-            return link(ephemeris, epochs, station).visible
-
         closed = (outages or {}).get(station.name, ())
-        for span in find_windows(visible, begin, end, STEP_S, EDGE_S):
+        for span in _visible_spans(ephemeris, station, begin, end):
             found += [PredictedContact(station.name, *part) for part in without(span, closed)]
     return tuple(sorted(found, key=lambda one: (one.start_utc_ns, one.station)))
+
+
+def _visible_spans(
+    ephemeris: Ephemeris, station: GroundStation, start_utc_ns: int, stop_utc_ns: int
+) -> list[Span]:
+    """Return the spans between two times in which a station sees the spacecraft, in order of time."""
+    spans: list[Span] = []
+    for block in range(start_utc_ns // BLOCK_NS, -(-stop_utc_ns // BLOCK_NS)):
+        for first, last in _spans_of_block(ephemeris, station, block):
+            begin, end = max(first, start_utc_ns), min(last, stop_utc_ns)
+            if begin >= end:
+                continue
+            if spans and spans[-1][1] >= begin:  # a span across the edge of two blocks
+                spans[-1] = (spans[-1][0], end)
+            else:
+                spans.append((begin, end))
+    return spans
+
+
+@functools.lru_cache(maxsize=256)
+def _spans_of_block(ephemeris: Ephemeris, station: GroundStation, block: int) -> tuple[Span, ...]:
+    """Return the spans in which a station sees the spacecraft in a block, as far as the ephemeris reaches."""
+    first = max(block * BLOCK_NS, ephemeris.start_utc_ns + LIGHT_MARGIN_NS)
+    last = min((block + 1) * BLOCK_NS, ephemeris.stop_utc_ns)
+    if last <= first:
+        return ()
+    return tuple(
+        find_windows(lambda epochs: link(ephemeris, epochs, station).visible, first, last, STEP_S, EDGE_S)
+    )
 
 
 def without(span: Span, closed: Sequence[Span]) -> list[Span]:

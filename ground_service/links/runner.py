@@ -47,10 +47,11 @@ INCOMING = "incoming"
 
 @dataclass(slots=True)
 class _Progress:
-    """Octets of the link in this process: received, and of these ingested."""
+    """Octets of the link in this process: received, and of these ingested; sent."""
 
     received: int = 0
     ingested: int = 0
+    sent: int = 0
     heard_utc_ns: int | None = None
     cut_utc_ns: dict[str, int] = field(default_factory=dict)
 
@@ -88,9 +89,20 @@ class LinkRunner:
         return self._progress.ingested
 
     @property
+    def octets_sent(self) -> int:
+        """Octets of telecommands that were sent to the station since the start."""
+        return self._progress.sent
+
+    @property
     def commands_unsent(self) -> int:
         """Telecommands that could be sent now."""
         return service.unsent(self._ground, self.declared)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether no contact is open that was silent for so long that it has to end."""
+        heard = self._progress.heard_utc_ns
+        return self._contact is None or heard is None or not self._silent(heard, mission_now_ns())
 
     @property
     def alive(self) -> bool:
@@ -265,6 +277,7 @@ class LinkRunner:
         for one in service.take_transmissions(self._ground, self.declared, self._owner):
             if not self._up.send(one.octets):
                 return
+            self._progress.sent += len(one.octets)
             self._note_transmitted(one)
         if requested:
             service.note_sent_request(self._ground, self._name, self._owner, number)

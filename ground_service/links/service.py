@@ -8,9 +8,8 @@ of a command that it has accepted.
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from sqlalchemy import Connection
 
@@ -19,6 +18,7 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding import service as commanding
 from ground_service.commanding.store import count_released
 from ground_service.ephemerides import store as ephemerides
+from ground_service.ephemerides.service import open_ephemeris
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.ground import Ground
@@ -32,8 +32,6 @@ from ground_service.missions.model import Link as LinkSection
 from ground_service.missions.model import StationConnection
 from ground_service.missions.places import outages_of, station_of
 from ground_service.store.vehicles import get_vehicle, vehicle_id
-from lunar.ephemeris import Ephemeris
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 
 ACTOR = "link"
@@ -162,7 +160,7 @@ def predict(
         return (), "no reference ephemeris covers the time"
     outages = outages_of(declared.stations)
     try:
-        ephemeris = _loaded(str(ground.files.path(references[0].sha256)))
+        ephemeris = open_ephemeris(ground, references[0])
         return core.predict_contacts(ephemeris, [station], start_utc_ns, stop_utc_ns, outages), None
     except LunarError as error:
         return (), f"reference ephemeris {references[0].name}: {error}"
@@ -279,7 +277,10 @@ def note_reception(
 
 
 def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: int, why: str) -> int:
-    """Record the predicted contacts before a mission time in which nothing was received; return their number."""
+    """Record the predicted contacts before a mission time in which nothing was received; return their number.
+
+    A contact is not missed while another station received the spacecraft, which has one transmitter.
+    """
     name = declared.link.name
     with ground.database.reading() as connection:
         found = store.find_link(connection, name)
@@ -299,8 +300,12 @@ def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: 
     with ground.database.writing() as connection:
         if not store.change_link(connection, name, owner, considered_utc_ns=considered):
             return 0
-        rows = store.contacts_between(connection, since - PREDICT_LIMIT_NS, now_utc_ns, name)
-        missed = [one for one in over if not any(_belongs(row, one) for row in rows)]
+        rows = store.contacts_between(connection, since - 3 * MARGIN_NS, now_utc_ns)
+        mine = [row for row in rows if row.link == name]
+        elsewhere = _of_other_links(connection, declared, rows)
+        missed = [
+            one for one in over if not any(_belongs(row, one) for row in mine) and _is_unheard(one, elsewhere)
+        ]
         vehicle = vehicle_id(connection, declared.spacecraft_id, declared.link.instance) if missed else 0
         for one in missed:
             _add_missed(connection, declared, vehicle, one, why)
@@ -528,12 +533,33 @@ def _predicted(declared: DeclaredLink, contact: PredictedContact) -> LinkContact
     )
 
 
+def _of_other_links(
+    connection: Connection, declared: DeclaredLink, rows: Sequence[ContactRow]
+) -> list[core.Span]:
+    """Return the spans, with margins, of the contacts over the other links of a spacecraft."""
+    names = {
+        name
+        for name, one in _declared(connection).items()
+        if (one.spacecraft_id, one.link.instance) == (declared.spacecraft_id, declared.link.instance)
+        and name != declared.link.name
+    }
+    return [
+        (
+            row.start_utc_ns - MARGIN_NS,
+            MARGIN_NS + (mission_now_ns() if row.stop_utc_ns is None else row.stop_utc_ns),
+        )
+        for row in rows
+        if row.link in names and row.state != "missed"
+    ]
+
+
+def _is_unheard(contact: PredictedContact, elsewhere: Sequence[core.Span]) -> bool:
+    """Return whether a part of a contact that counts lies outside all spans."""
+    parts = core.without((contact.start_utc_ns, contact.stop_utc_ns), elsewhere)
+    return any(stop - start >= MISSED_SHORTEST_NS for start, stop in parts)
+
+
 def _belongs(row: ContactRow, contact: PredictedContact) -> bool:
     """Return whether a stored contact is a predicted one."""
     stop = row.stop_utc_ns if row.stop_utc_ns is not None else max(row.start_utc_ns, contact.start_utc_ns)
     return row.start_utc_ns <= contact.stop_utc_ns + MARGIN_NS and contact.start_utc_ns - MARGIN_NS <= stop
-
-
-@functools.lru_cache(maxsize=8)
-def _loaded(path: str) -> Ephemeris:
-    return load_ephemeris(Path(path))

@@ -25,7 +25,7 @@ from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation, spherical_from_mcmf
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
-from lunar.visibility import GroundStation, find_windows, link, sun_elevation_azimuth, sunlit_fraction
+from lunar.visibility import GroundStation, find_windows, sun_elevation_azimuth, sunlit_fraction
 from tmtc.dictionary import DICTIONARY
 
 Range = tuple[float, float]
@@ -33,10 +33,6 @@ TerrainAt = Callable[[FloatArray, FloatArray], BoolArray]
 """Latitudes and longitudes (n,) in rad to whether the ground there is mare (n,)."""
 
 NS = NANOSECONDS_PER_SECOND
-LIGHT_MARGIN_NS = 3 * NS
-"""A contact is evaluated at reception, so the ephemeris has to reach back by the light time (1.3 s)."""
-
-CONTACT_STEP_S = 120.0
 CONTACT_HORIZON_S = 86_400.0
 """Data that are not down a day after their window are taken to stay on board."""
 
@@ -242,18 +238,8 @@ class Planner:
 
     def contacts(self, start_utc_ns: int, stop_utc_ns: int) -> tuple[Contact, ...]:
         """When a station sees the spacecraft, in order of time."""
-        begin = max(start_utc_ns, self.ephemeris.start_utc_ns + LIGHT_MARGIN_NS)
-        if stop_utc_ns <= begin:
-            return ()
-        found = []
-        for station in self.resources.stations:
-
-            def visible(epochs: IntArray, station: GroundStation = station) -> BoolArray:
-                return link(self.ephemeris, epochs, station).visible
-
-            for a, b in find_windows(visible, begin, stop_utc_ns, CONTACT_STEP_S, EDGE_TOLERANCE_S):
-                found.append(Contact(station.name, a, b))
-        return tuple(sorted(found, key=lambda contact: (contact.start_utc_ns, contact.station)))
+        found = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
+        return tuple(Contact(one.station, one.start_utc_ns, one.stop_utc_ns) for one in found)
 
     def _geometry(self, utc_ns: IntArray) -> _Geometry:
         position, _ = self.ephemeris.at(utc_ns)

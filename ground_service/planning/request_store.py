@@ -161,12 +161,8 @@ def assign_window(connection: Connection, window_id: int, request_id: int) -> No
 
 
 def windows_around(connection: Connection, vehicle: int, since_utc_ns: int) -> list[WindowRecord]:
-    """Return the windows of a vehicle that end after a time, and those of its requests in the current periods."""
-    return records_where(
-        connection,
-        _WINDOWS.c.vehicle_id == vehicle,
-        (_WINDOWS.c.stop_utc_ns > since_utc_ns) | _WINDOWS.c.request_id.is_not(None),
-    )
+    """Return the windows of a vehicle that end after a time."""
+    return records_where(connection, _WINDOWS.c.vehicle_id == vehicle, _WINDOWS.c.stop_utc_ns > since_utc_ns)
 
 
 def unfinished_windows(connection: Connection, until_utc_ns: int) -> list[WindowRecord]:

@@ -17,6 +17,7 @@ from ground_service.commanding import service as commanding
 from ground_service.commanding import store as commands
 from ground_service.ephemerides import store as ephemerides
 from ground_service.ephemerides.model import Ephemeris
+from ground_service.ephemerides.service import open_ephemeris
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
@@ -52,11 +53,9 @@ from ground_service.store.vehicles import vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
-from lunar import ephemeris
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import EphemerisCoverageError
 
 NS = NANOSECONDS_PER_SECOND
@@ -355,7 +354,7 @@ def _preparation(
     orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
     activities, state = prepare_window(
         mission.uploads,
-        _load(ground, whole[0]) if whole else None,
+        open_ephemeris(ground, whole[0]) if whole else None,
         orientation,
         start,
         stop,
@@ -452,7 +451,12 @@ def planner_of(
     stated = Mission(name="not stated") if mission is None else mission
     orientation = declared_frames(stated.frames, ground.data).orientation or ground.orientation
     return Planner(
-        _load(ground, reference), orientation, resources, camera_of(stated.camera), catalogue, mare
+        open_ephemeris(ground, reference),
+        orientation,
+        resources,
+        camera_of(stated.camera),
+        catalogue,
+        mare,
     )
 
 
@@ -560,17 +564,6 @@ def _check_entry(entry: WindowEntry) -> None:
         raise InvalidInput("window", "stop", "a time after the start", "one before it")
     if duration > 86_400:
         raise InvalidInput("window", "stop", "at most a day after the start", f"{duration:.0f} s")
-
-
-def _load(ground: Ground, reference: Ephemeris) -> ephemeris.Ephemeris:
-    return _loaded(str(ground.files.path(reference.sha256)))
-
-
-@functools.lru_cache(maxsize=4)
-def _loaded(path: str) -> ephemeris.Ephemeris:
-    from pathlib import Path
-
-    return load_ephemeris(Path(path))
 
 
 def _catalogue(ground: Ground, sha256: str | None) -> CraterCatalogue | None:

@@ -250,7 +250,7 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
         end = now + round(request.terms.horizon_days * DAY_NS)
         mission = missions.mission_in_force(connection, request.spacecraft_id)
         last = store.get_plan(connection, request_id)
-        windows = store.windows_around(connection, request.vehicle_id, now - DAY_NS)
+        windows = store.windows_around(connection, request.vehicle_id, _first_needed(request, now))
         situation = _Situation(
             request,
             Mission(name="not stated") if mission is None else mission,
@@ -308,6 +308,12 @@ def _quota(situation: _Situation, start: int, end: int) -> dict[int, int]:
 
 def _period(request: RequestRecord, utc_ns: int) -> int:
     return (utc_ns - request.anchor_utc_ns) // round(request.terms.period_days * DAY_NS)
+
+
+def _first_needed(request: RequestRecord, now: int) -> int:
+    """Return the time from which windows count for a plan: the begin of the present period, at least a day ago."""
+    period_ns = round(request.terms.period_days * DAY_NS)
+    return min(now - DAY_NS, request.anchor_utc_ns + _period(request, now) * period_ns)
 
 
 def _candidates(ground: Ground, situation: _Situation, start: int, end: int) -> list[tuple[int, int]]:

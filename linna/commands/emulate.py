@@ -104,7 +104,16 @@ def _add_continuous(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="stations keep telemetry until the client acknowledges it",
     )
+    endless.add_argument(
+        "--end-with-console", action="store_true", help="end when the last connection of the console ends"
+    )
     endless.add_argument("--state", type=Path, metavar="FILE", help="state to go on from, kept up to date")
+    endless.add_argument(
+        "--snapshot",
+        type=Path,
+        metavar="FILE",
+        help="exact state of the simulation, written on save on the console; a start goes on from it",
+    )
     endless.add_argument("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
     endless.add_argument(
         "--craters", type=Path, metavar="FILE", help="crater catalogue with rim heights, on board from launch"
@@ -254,8 +263,10 @@ def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
         mission_port=arguments.mission_port,
         station_ports=_station_ports(arguments.station_port, scenario.link.stations),
         checkpoint_file=arguments.state,
+        snapshot_file=arguments.snapshot,
         clock_file=arguments.clock_file,
         keeps=arguments.keep_unacknowledged,
+        ends_with_console=arguments.end_with_console,
         catalogue=load_catalogue(arguments.craters) if arguments.craters else None,
         mission=lambda world, ports: operations_mission_text(
             world, data, arguments.host, ports, further, arguments.keep_unacknowledged

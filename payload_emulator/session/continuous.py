@@ -6,7 +6,8 @@ Telecommands reach the spacecraft in contacts alone, at the rate of the uplink; 
 downlink. The orbit is propagated a day at a time.
 
 Ports: a telemetry and a telecommand port for each station (`StationPorts`), the mission description, and a console
-with one JSON object a line out and one word a line in: `run`, `pause`, `state`, `until UTC`, `rate X`, `quit`. With
+with one JSON object a line out and one word a line in: `run`, `pause`, `state`, `save`, `until UTC`,
+`rate X`, `quit`. With
 `holds`, simulated time stands still at the beginning and at the end of each contact until `run`, so that a ground
 service can send its telecommands and finish its work however fast the simulation is.
 """
@@ -50,6 +51,7 @@ from payload_emulator.session.live import TelecommandBuffer
 from payload_emulator.session.live_ports import Server
 from payload_emulator.session.loading import LoadedPayload, launch_payload
 from payload_emulator.session.scenario import Scenario
+from payload_emulator.session.snapshot import pack_snapshot, unpack_snapshot
 from payload_emulator.session.spacecraft import Spacecraft, new_board
 from payload_emulator.session.station_ports import KEPT_LIMIT_OCTETS, StationPorts
 from payload_emulator.session.world import (
@@ -87,6 +89,11 @@ _FIRST_DOWNLINK_S = 2.0
 _NO_ATTITUDE = np.full(7, np.nan)
 _CLOCK = struct.Struct("<q")
 _ARCS_KEPT = 2
+_EXACT = (
+    "utc_ns", "spacecraft", "account", "contact", "_contacts", "_planned_until_ns", "_receiver",
+    "_transmitter", "_uplinks", "_uplinked", "_last_heard_ns", "_waiting",
+)  # fmt: skip
+"""Fields of a session that make up its exact state outside of observations, with the flight."""
 
 
 @dataclass(slots=True, eq=False)
@@ -103,10 +110,14 @@ class ContinuousSession:
         End of the session; None: none.
     checkpoint_file
         Where the state is kept between contacts and at the end.
+    snapshot_file
+        Where the exact state is written when the console says `save`, and read at the start if it exists.
     clock_file
         Where the mission time is written for the ground (`LINNA_CLOCK_FILE`).
     keeps
         Whether the stations keep records until they are acknowledged.
+    ends_with_console
+        Whether the session ends when the last connection of the console ends.
     catalogue
         Craters of the anchoring catalogue that is loaded at launch; None: none.
     mission
@@ -124,8 +135,10 @@ class ContinuousSession:
     mission_port: int = 0
     station_ports: dict[str, tuple[int, int]] = field(default_factory=dict)
     checkpoint_file: Path | None = None
+    snapshot_file: Path | None = None
     clock_file: Path | None = None
     keeps: bool = False
+    ends_with_console: bool = False
     catalogue: CraterCatalogue | None = None
     mission: Callable[[World, dict[str, tuple[int, int]]], str] = lambda world, ports: ""
     stopping: threading.Event = field(default_factory=threading.Event)
@@ -144,6 +157,7 @@ class ContinuousSession:
     _transmitter: Transmitter = field(init=False)
     _uplinks: dict[int, TelecommandBuffer] = field(default_factory=dict)
     _uplinked: deque[tuple[int, bytes]] = field(default_factory=deque)
+    _uplinked_octets: dict[str, int] = field(default_factory=dict)
     _bench: InstrumentBench = field(init=False)
     _executor: ThreadPoolExecutor = field(init=False)
     _next_image: tuple[int, Future[Exposure]] | None = None
@@ -174,8 +188,11 @@ class ContinuousSession:
         )
         if checkpoint is not None:
             self._restore(checkpoint)
+        if self.snapshot_file is not None and self.snapshot_file.exists():
+            self._continue_exactly(self.snapshot_file.read_bytes())
         self._bench = InstrumentBench(self.world)
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
+        self._write_clock()
         self._open_ports()
 
     @property
@@ -204,7 +221,6 @@ class ContinuousSession:
     # Time
 
     def _fly(self, selector: selectors.BaseSelector) -> None:
-        self._write_clock()
         self._turn()
         while not self.stopping.is_set():
             if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
@@ -298,9 +314,13 @@ class ContinuousSession:
             "mode": self.spacecraft.payload.mode.name,
             "waiting": self._waiting if self.contact is not None else self.spacecraft.payload.waiting,
             "sent": {name: one.sent for name, one in self.stations.items()},
+            "uplinked": dict(self._uplinked_octets),
             "frames": self.account.frames,
             "packets": self.account.packets,
             "telecommands": self.account.telecommands,
+            "packets_lost_on_link": self.account.packets_lost_on_link,
+            "telecommand_octets_lost": self.account.telecommand_octets_lost,
+            "resets": self.account.resets,
         }
 
     def _plan_ahead(self) -> None:
@@ -308,7 +328,7 @@ class ContinuousSession:
         world = self.world
         while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * _NS) + _NS * 600:
             truth, burns = extended_flight(world, CHUNK_S)
-            world = self.world = replace(world, truth=_pruned(truth), burns=(*world.burns, *burns))
+            world = self.world = replace(world, truth=pruned(truth, _ARCS_KEPT), burns=(*world.burns, *burns))
             self._bench.world = world
         if self._planned_until_ns < self.utc_ns + round(_AHEAD_S * _NS / 2):
             self._plan_contacts()
@@ -460,7 +480,7 @@ class ContinuousSession:
             self.console_port,
             self.host,
             self._take_words,
-            lambda number: self._words.pop(number, None),
+            self._end_console,
         )
         used = {name: (one.telemetry.port, one.telecommand.port) for name, one in self.stations.items()}
         text = self.mission(self.world, used)
@@ -481,6 +501,7 @@ class ContinuousSession:
     def _take_telecommands(self, station: str, number: int, octets: bytes) -> None:
         """Take octets that a station is to send up; without a contact of that station they are lost."""
         connection = hash((station, number))
+        self._uplinked_octets[station] = self._uplinked_octets.get(station, 0) + len(octets)
         if self.contact is None or self.contact.station != station:
             self.account.telecommand_octets_lost += len(octets)
         elif octets:
@@ -492,11 +513,19 @@ class ContinuousSession:
         for line in lines:
             self._execute(line.decode("utf-8", "replace").split())
 
+    def _end_console(self, number: int) -> None:
+        """Forget what a connection of the console has not finished, and end the session with the last one."""
+        self._words.pop(number, None)
+        if self.ends_with_console and not self.console.clients:
+            self.stopping.set()
+
     def _execute(self, words: list[str]) -> None:
         if words == ["run"]:
             self._held = self.paused = False
         elif words == ["pause"]:
             self.paused = True
+        elif words == ["save"]:
+            self._save_exactly()
         elif words == ["quit"]:
             self.stopping.set()
         elif words == ["state"]:
@@ -513,7 +542,7 @@ class ContinuousSession:
                 self._send_message({"kind": "error", "text": str(error)})
         elif words:
             text = " ".join(words)[:80]
-            expected = "expected run, pause, state, until UTC, rate X or quit"
+            expected = "expected run, pause, state, save, until UTC, rate X or quit"
             self._send_message({"kind": "error", "text": f"{expected}, found {text!r}"})
 
     def _send_message(self, message: dict[str, Any]) -> None:
@@ -551,6 +580,35 @@ class ContinuousSession:
             ),
         )
 
+    def _save_exactly(self) -> None:
+        """Write the exact state, outside of observations; say whether it was written."""
+        idle = self.spacecraft.payload.mode is not PayloadMode.observing
+        if self.snapshot_file is not None and idle:
+            values = {name: getattr(self, name) for name in _EXACT}
+            values |= {"truth": self.world.truth, "burns": self.world.burns}
+            octets = pack_snapshot(self.scenario.name, values, self._known_objects())
+            beside = self.snapshot_file.with_name(self.snapshot_file.name + ".new")
+            beside.write_bytes(octets)
+            beside.replace(self.snapshot_file)
+        self._send_message({"kind": "saved", "saved": self.snapshot_file is not None and idle})
+
+    def _continue_exactly(self, octets: bytes) -> None:
+        """Continue from an exact state as if the process had not ended."""
+        values = unpack_snapshot(octets, self.scenario.name, self._known_objects())
+        self.world = replace(self.world, truth=values.pop("truth"), burns=values.pop("burns"))
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    def _known_objects(self) -> dict[str, object]:
+        """Return the objects that every session of the scenario makes alike."""
+        loaded = self._loaded
+        return {
+            "loaded": loaded,
+            "detector": loaded.detector,
+            "tables": loaded.tables,
+            "orientation": self.world.truth.orientation,
+        }
+
     def _restore(self, state: Checkpoint) -> None:
         """Go on where a checkpoint was made."""
         self.utc_ns = self._planned_until_ns = state.utc_ns
@@ -568,17 +626,15 @@ class ContinuousSession:
         self.world = replace(start, truth=longer, burns=burns)
 
 
-def _pruned(truth: Truth) -> Truth:
-    """Return a flight without its arcs of former days."""
+def pruned(truth: Truth, days: int) -> Truth:
+    """Return a flight without its arcs of former days; the last ones, two or more, are kept."""
     arcs = truth.state_icrf
-    if not isinstance(arcs, Spliced) or len(arcs.arcs) <= _ARCS_KEPT:
+    if not isinstance(arcs, Spliced) or len(arcs.arcs) <= days:
         return truth
-    joints = arcs.joints_tdb_s[-_ARCS_KEPT + 1 :]
-    start_ns = truth.stop_utc_ns - round(_ARCS_KEPT * CHUNK_S * _NS)
+    joints = arcs.joints_tdb_s[-days + 1 :]
+    start_ns = truth.stop_utc_ns - round(days * CHUNK_S * _NS)
     breaks = tuple(one for one in truth.breaks_utc_ns if one >= start_ns)
-    return Truth(
-        Spliced(joints, arcs.arcs[-_ARCS_KEPT:]), start_ns, truth.stop_utc_ns, truth.orientation, breaks
-    )
+    return Truth(Spliced(joints, arcs.arcs[-days:]), start_ns, truth.stop_utc_ns, truth.orientation, breaks)
 
 
 def _number(text: str) -> float | None:

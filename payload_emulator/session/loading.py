@@ -86,9 +86,6 @@ class LoadedPayload:
     def boot(self, board: Board, detector: Detector | None = None) -> Payload:
         """Flight software started on a board, in standby; `detector` in place of the network."""
 
-        def from_octets(octets: bytes) -> Detector:
-            return OnnxDetector(octets, self.parameters.detector) if detector is None else detector
-
         return Payload(
             self.detector if detector is None else detector,
             self.parameters.flight,
@@ -97,8 +94,19 @@ class LoadedPayload:
             model_octets=self.model,
             board=board,
             mode=PayloadMode.standby,
-            make_detector=from_octets,
+            make_detector=_DetectorMaker(self.parameters.detector, detector),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _DetectorMaker:
+    """Function from the octets of a network to its detector; `detector` stands for all networks if it is given."""
+
+    parameters: DetectorParameters
+    detector: Detector | None
+
+    def __call__(self, octets: bytes) -> Detector:
+        return OnnxDetector(octets, self.parameters) if self.detector is None else self.detector
 
 
 def load_payload(

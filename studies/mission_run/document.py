@@ -12,6 +12,16 @@ _STYLE = (
     "td,th{border-bottom:1px solid #ccc;padding:.25em .8em;text-align:left}"
 )
 
+SECTIONS = (
+    "windows", "navigation", "detector", "verdicts", "requirements", "trends", "evidence", "reports_lack",
+    "memory_mib", "cpu_s",
+)  # fmt: skip
+COLUMNS = (
+    "window", "start", "state", "contacts_to_processed", "frames", "packets_lost", "verdict", "recall",
+    "median_m", "drift_percent", "nees_inside_percent", "not_met", "lacks", "evidence",
+)  # fmt: skip
+INCIDENT = ("utc", "kind", "text", "recovery")
+
 
 def save_document(figures: Mapping[str, Any], path: Path) -> None:
     """Write the page of closing figures."""
@@ -22,16 +32,23 @@ def save_document(figures: Mapping[str, Any], path: Path) -> None:
         f"<h1>Mission run {_text(figures['scenario'])}, {figures['days']:g} days</h1>",
         _table(("figure", "value"), plain),
     ]
-    for name in ("windows", "navigation", "detector", "verdicts", "memory_mib"):
+    for name in SECTIONS:
         rows = [(key, _flat(value)) for key, value in figures[name].items()]
         parts += [f"<h2>{_text(name.replace('_', ' '))}</h2>", _table(("", "value"), rows)]
     trend = figures["trend"]
-    columns = ("window", "start", "state", "frames", "packets_lost", "verdict", "recall", "median_m")
     parts += [
         "<h2>Windows in order of time</h2>",
-        _table(columns, [[_flat(row.get(column)) for column in columns] for row in trend]),
+        _table(COLUMNS, [[_flat(row.get(column)) for column in COLUMNS] for row in trend]),
         "<h2>Incidents</h2>",
-        _table(("time", "incident"), [(one["utc"], one["text"]) for one in figures["incidents"]]),
+        _table(
+            INCIDENT,
+            [
+                [_flat(one[column]) if column != "recovery" else one[column] or "none" for column in INCIDENT]
+                for one in figures["incidents"]
+            ],
+        ),
+        "<h2>Interventions</h2>",
+        _table(("utc", "text"), [(one["utc"], one["text"]) for one in figures["interventions_list"]]),
         "</body></html>\n",
     ]
     path.write_text("\n".join(parts), encoding="utf-8")
@@ -48,6 +65,8 @@ def _flat(value: Any) -> str:
         return ", ".join(f"{name} {_flat(one)}" for name, one in value.items())
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
     return "unknown" if value is None else str(value)
 
 

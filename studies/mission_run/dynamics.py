@@ -14,7 +14,7 @@ from lunar.catalogue import save_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.oem import save_oem
-from payload_emulator.session.continuous import CHUNK_S
+from payload_emulator.session.continuous import CHUNK_S, pruned
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world import (
     World,
@@ -27,6 +27,9 @@ from payload_emulator.session.world import (
 DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
 AHEAD_NS = 54 * 3600 * NS
+ARCS_KEPT = 4
+"""Days of the flight that are kept: more than an orbit determination spans."""
+
 CATALOGUE_MARGIN_DEG = 5.0
 """Half the field of view of the camera at 60 km altitude, beyond the latitudes of the windows."""
 
@@ -49,10 +52,11 @@ class FlightDynamics:
         stop = now_utc_ns + AHEAD_NS
         while self.world.truth.stop_utc_ns < stop + 600 * NS:
             truth, burns = extended_flight(self.world, CHUNK_S)
-            self.world = replace(self.world, truth=truth, burns=(*self.world.burns, *burns))
-        flown = sample_truth(self.world.truth, np.array([start, stop], dtype=np.int64))
+            flown = pruned(truth, ARCS_KEPT)
+            self.world = replace(self.world, truth=flown, burns=(*self.world.burns, *burns))
+        arc = sample_truth(self.world.truth, np.array([start, stop], dtype=np.int64))
         day = (now_utc_ns - scenario.epoch_utc_ns) // DAY_NS
-        save_oem(with_reference_error(flown, scenario.reference, scenario.seed + 1_000 * (1 + day)), path)
+        save_oem(with_reference_error(arc, scenario.reference, scenario.seed + 1_000 * (1 + day)), path)
         return path
 
     def save_craters(self, latitude_limit_deg: float, path: Path) -> int:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-import resource
+import os
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,32 @@ from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.flying import SPACECRAFT_ID
 from payload_emulator.session.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
+from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.dynamics import DAY_NS, FlightDynamics
 from studies.mission_run.figures import closing_figures
-from studies.mission_run.ground import EmbeddedGround, PlanTerms, fill_plan
+from studies.mission_run.ground import POLL_S, EmbeddedGround, PlanTerms
+from studies.mission_run.processes import cpu_s, resident_mib
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
 
 DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 """Stations where the scenario names none: the Moon is always above the horizon of one of them."""
 
-SETTLE_NS = round(1.2 * SILENCE_S) * NS
-"""Mission time after a contact at which the ground has noticed its end."""
+SETTLE_NS = (round(SILENCE_S) + 5) * NS
+"""Mission time after a contact at which the ground notices its end."""
+
+LAST_NS = 4 * 3600 * NS
+"""No windows so long before the end of the run, so that the data of the last one are down and evaluated."""
+
+CHECKPOINT_S = 60.0
+"""Wall time between two checkpoints."""
+
+SOCKET_S = 10.0
+"""Longest wait for octets that were sent to reach the spacecraft; what is lost the ground sends again."""
+
+COUNTED = (
+    "frames", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
+)  # fmt: skip
+"""What the spacecraft counts itself."""
 
 ORBIT_S = 6_672.0
 """Orbital period of the scenarios of this project, for the latitudes of windows of a given length."""
@@ -69,7 +86,19 @@ class RunTerms:
 
 @dataclass(slots=True)
 class Progress:
-    """What the runner has seen; kept in the folder of the run."""
+    """What the runner has seen; kept in the folder of the run and in its checkpoints.
+
+    Attributes
+    ----------
+    posts
+        First and last number of the entries of the audit log for the posts of each start.
+    contact_stops
+        Ends of the contacts, UTC.
+    processed
+        Mission time at which a window was first seen as processed, by the id of the window.
+    memory_mib, cpu_s
+        Resident memory at the end of each contact, and processor time, by process.
+    """
 
     wall_s: float = 0.0
     utc: str = ""
@@ -77,12 +106,18 @@ class Progress:
     contacts: int = 0
     frames: int = 0
     packets: int = 0
+    packets_lost_on_link: int = 0
     telecommands: int = 0
-    interventions: int = 0
+    telecommand_octets_lost: int = 0
+    resets: int = 0
     reference_day: int = -1
+    request_id: int | None = None
     finished: bool = False
-    incidents: list[dict[str, str]] = field(default_factory=list)
-    memory_mib: list[float] = field(default_factory=list)
+    posts: list[tuple[int, int]] = field(default_factory=list)
+    contact_stops: list[str] = field(default_factory=list)
+    processed: dict[str, str] = field(default_factory=dict)
+    memory_mib: dict[str, list[float]] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict)
 
 
 def run_mission(
@@ -114,20 +149,22 @@ class MissionRun:
         self._scenario, self._data, self._folder, self._terms, self._say = scenario, data, folder, terms, say
         self._files = SpacecraftFiles(
             folder / "scenario.toml",
-            folder / "spacecraft.state",
             folder / "clock",
             folder / "craters.csv",
             folder / "operations.toml",
             folder / "spacecraft.log",
+            folder / "spacecraft.snapshot",
         )
+        self._checkpoints = Checkpoints(folder, folder / "ground", self._files.snapshot)
         self._progress_file = folder / "progress.json"
         self._progress = Progress()
-        self._begun_s = time.monotonic()
+        self._begun_s = self._kept_s = time.monotonic()
         self._wall_before_s = 0.0
+        self._cpu_before_s: dict[str, float] = {}
 
     def run(self) -> dict[str, Any]:
-        """Run until the days are over; after an interruption the next call goes on."""
-        self._folder.mkdir(parents=True, exist_ok=True)
+        """Run until the days are over; after an interruption the next call continues from the last checkpoint."""
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._load()
         if self._progress.finished:
             self._say(f"{self._folder}: this run has ended; its report is {self._folder / 'report.html'}")
@@ -145,50 +182,93 @@ class MissionRun:
             ground = EmbeddedGround.open(self._folder / "ground", self._data, self._files.clock)
             try:
                 self._operate(spacecraft, ground, dynamics)
-                figures = self._close(ground)
+                return self._close(ground)
             finally:
                 ground.close()
         finally:
             spacecraft.stop()
             self._save()
-        return figures
 
     def _operate(
         self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, dynamics: FlightDynamics
     ) -> None:
-        held = ground.client.add_catalogue(self._files.craters)
-        text = spacecraft.mission_text().decode()
-        ground.add_mission(text.replace("[catalogue]\n", f'[catalogue]\nsha256 = "{held.sha256}"\n').encode())
-        self._deliver_reference(ground, dynamics, self._scenario.epoch_utc_ns)
-        commissioned = self._progress.contacts > 0
-        for message in spacecraft.messages():
+        self._post(spacecraft, ground, dynamics)
+        spacecraft.order("run")
+        messages = spacecraft.messages()
+        for message in messages:
             kind = message["kind"]
-            if kind == "end":
-                return
             if kind == "contact":
                 self._note(message)
                 now = parse_utc(message["utc"])
                 if message["state"] == "started":
-                    if not commissioned:
-                        self._commission(ground)
-                        commissioned = True
                     self._deliver_reference(ground, dynamics, now)
-                    self._plan(ground, now)
                     ground.wait_sent()
-                    time.sleep(0.1)
+                    self._wait_uplinked(spacecraft, ground, messages)
                     spacecraft.order("run")
                 else:
+                    # The ground has everything before time goes on, so that a run gives the same at any speed.
+                    ground.wait_received(message["sent"])
+                    self._progress.contact_stops.append(message["utc"])
                     spacecraft.order(f"until {format_utc(now + SETTLE_NS)}")
             elif kind == "paused":
                 spacecraft.order("state")
             elif kind in ("state", "finished"):
                 self._note({**message, "state": kind})
                 ground.wait_received(message["sent"])
-                self._watch(ground, message)
+                ground.wait_settled()
+                if message["station"]:
+                    ground.wait_sent()
+                    self._wait_uplinked(spacecraft, ground, messages)
+                self._watch(ground, spacecraft, message)
+                if kind == "finished":
+                    return
+                due = time.monotonic() - self._kept_s >= CHECKPOINT_S
+                spacecraft.order("save" if due else "run")
+            elif kind == "saved":
+                if message["saved"]:
+                    self._checkpoints.keep(self._progress_file)
+                    self._kept_s = time.monotonic()
                 spacecraft.order("run")
             elif kind == "error":
                 raise LinkError(f"spacecraft: {message['text']}")
         raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
+
+    def _wait_uplinked(
+        self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, messages: Iterator[dict[str, Any]]
+    ) -> None:
+        """Wait until the stations of the spacecraft, whose time stands still, have what the links have sent."""
+        until = time.monotonic() + SOCKET_S
+        while time.monotonic() < until:
+            spacecraft.order("state")
+            found = next(one for one in messages if one["kind"] == "state")["uplinked"]
+            if all(found.get(name, 0) >= count for name, count in ground.octets_sent().items()):
+                return
+            time.sleep(POLL_S)
+
+    def _post(self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, dynamics: FlightDynamics) -> None:
+        """Post what a user posts: catalogue, mission description, ephemeris, commissioning, standing request.
+
+        A later start posts the mission description only, which names the ports of the spacecraft.
+        """
+        before = ground.audit_head()
+        held = ground.client.add_catalogue(self._files.craters)
+        text = spacecraft.mission_text().decode()
+        ground.add_mission(text.replace("[catalogue]\n", f'[catalogue]\nsha256 = "{held.sha256}"\n').encode())
+        if self._progress.request_id is None:
+            path = dynamics.save_reference(self._scenario.epoch_utc_ns, self._folder / "reference.oem")
+            ground.client.add_ephemeris(path, name="orbit determination of day 0", precedence=0)
+            self._progress.reference_day = 0
+            self._commission(ground)
+            terms = PlanTerms(
+                self._terms.windows_per_day,
+                self._terms.latitude_limit_deg,
+                self._terms.window_s,
+                self._scenario.camera.frame_interval_s,
+                format_utc(self._scenario.epoch_utc_ns),
+                format_utc(self._scenario.epoch_utc_ns + round(self._terms.days * DAY_NS) - LAST_NS),
+            )
+            self._progress.request_id = ground.client.add_request(terms.request(SPACECRAFT_ID)).id
+        self._progress.posts.append((before + 1, ground.audit_head()))
 
     def _commission(self, ground: EmbeddedGround) -> None:
         """Send what a new spacecraft is told once: reports of time, how often memory is checked."""
@@ -203,18 +283,8 @@ class MissionRun:
         """Give the ground the orbit determination of the day."""
         day = (now - self._scenario.epoch_utc_ns) // DAY_NS
         if day > self._progress.reference_day:
-            path = dynamics.save_reference(now, self._folder / "reference.oem")
-            ground.client.add_ephemeris(path, name=f"orbit determination of day {day}", precedence=day)
+            ground.deliver_reference(dynamics.save_reference(now, self._folder / "reference.oem"), day)
             self._progress.reference_day = day
-
-    def _plan(self, ground: EmbeddedGround, now: int) -> None:
-        terms = PlanTerms(
-            self._terms.windows_per_day,
-            self._terms.latitude_limit_deg,
-            self._terms.window_s,
-            self._scenario.camera.frame_interval_s,
-        )
-        fill_plan(ground, terms, now, self._scenario.epoch_utc_ns, SPACECRAFT_ID)
 
     # What is seen
 
@@ -222,15 +292,26 @@ class MissionRun:
         progress = self._progress
         progress.utc = message["utc"]
         progress.contacts += message["state"] == "started"
-        progress.frames, progress.packets = message["frames"], message["packets"]
-        progress.telecommands = message["telecommands"]
+        for name in COUNTED:
+            setattr(progress, name, message[name])
 
-    def _watch(self, ground: EmbeddedGround, message: dict[str, Any]) -> None:
+    def _watch(self, ground: EmbeddedGround, spacecraft: SpacecraftProcess, message: dict[str, Any]) -> None:
         progress = self._progress
-        progress.memory_mib.append(round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1))
+        for name, process in (("ground", os.getpid()), ("spacecraft", spacecraft.process.pid)):
+            used = resident_mib(process)
+            if used is not None:
+                progress.memory_mib.setdefault(name, []).append(used)
+            spent = cpu_s(process)
+            if spent is not None:
+                progress.cpu_s[name] = round(self._cpu_before_s.get(name, 0.0) + spent, 1)
+        windows = ground.windows()
+        for window in windows:
+            if window.state == "processed":
+                progress.processed.setdefault(str(window.id), message["utc"])
         self._save()
         days = (parse_utc(message["utc"]) - self._scenario.epoch_utc_ns) / DAY_NS
-        states = ", ".join(f"{count} {state}" for state, count in sorted(ground.state_counts().items()))
+        counts = Counter(one.state for one in windows)
+        states = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
         self._say(
             f"day {days:6.2f} of {self._terms.days:g}, {progress.wall_s:6.0f} s: {progress.contacts} contacts, "
             f"{progress.frames} frames, {progress.packets} packets, windows: {states or 'none'}"
@@ -249,7 +330,7 @@ class MissionRun:
     # State
 
     def _load(self) -> None:
-        text = format_scenario(self._scenario)
+        text, known_folder = format_scenario(self._scenario), self._files.scenario.exists()
         terms_file = self._folder / "terms.json"
         terms = json.dumps(asdict(self._terms))
         if self._files.scenario.exists():
@@ -261,17 +342,28 @@ class MissionRun:
                 )
         self._files.scenario.write_text(text)
         terms_file.write_text(terms)
+        if not known_folder:
+            return
         if self._progress_file.exists():
-            self._progress = Progress(**json.loads(self._progress_file.read_text()))
-            self._wall_before_s = self._progress.wall_s
-            if not self._progress.finished:
-                self._say(f"{self._folder}: goes on from {self._progress.utc or 'the start'}")
+            self._progress = _read_progress(self._progress_file)
+        if self._progress.finished:
+            return
+        kept = self._checkpoints.restore()
+        self._progress = Progress() if kept is None else _read_progress(kept)
+        self._wall_before_s = self._progress.wall_s
+        self._cpu_before_s = dict(self._progress.cpu_s)
+        self._say(f"{self._folder}: continues from {self._progress.utc or 'the start'}")
 
     def _save(self) -> None:
         self._progress.wall_s = round(self._wall_before_s + time.monotonic() - self._begun_s, 1)
         new_file = self._progress_file.with_name(self._progress_file.name + ".new")
         new_file.write_text(json.dumps(asdict(self._progress)))
         new_file.replace(self._progress_file)
+
+
+def _read_progress(path: Path) -> Progress:
+    stated = json.loads(path.read_text())
+    return Progress(**{**stated, "posts": [(first, last) for first, last in stated["posts"]]})
 
 
 __all__ = ["GroundError", "RunTerms", "run_mission"]

@@ -33,11 +33,11 @@ class SpacecraftFiles:
     """Files of a spacecraft under the folder of a run."""
 
     scenario: Path
-    state: Path
     clock: Path
     craters: Path
     operations: Path
     log: Path
+    snapshot: Path
 
 
 class SpacecraftProcess:
@@ -47,9 +47,10 @@ class SpacecraftProcess:
         console, mission, *station_ports = free_ports(2 + 2 * len(stations))
         self.mission_port = mission
         words = ["emulate", files.scenario, "--continuous", "--days", days, "--rate", rate, "--hold-contacts"]
-        words += ["--console-port", console, "--mission-port", mission, "--state", files.state]
+        words += ["--console-port", console, "--mission-port", mission, "--snapshot", files.snapshot]
         words += ["--clock-file", files.clock, "--operations", files.operations, "--craters", files.craters]
-        words += ["--keep-unacknowledged", "--json"]
+        words += ["--keep-unacknowledged", "--paused", "--end-with-console"]
+        words += ["--json"]
         for k, name in enumerate(stations):
             words += ["--station-port", f"{name}:{station_ports[2 * k]}:{station_ports[2 * k + 1]}"]
         command = [sys.executable, "-m", "linna", *map(str, words)]

@@ -83,6 +83,7 @@ class Ground:
         self.contacts: list[dict[str, Any]] = []
         self.records = b""
         self.count = 0
+        self.saved: list[bool] = []
         self._lock = threading.Lock()
         self._telemetry = self._connect("telemetry madrid")
         self._telecommand = self._connect("telecommand madrid")
@@ -105,6 +106,8 @@ class Ground:
             if message["kind"] == "contact":
                 self.contacts.append(message)
                 self.act(self, message)
+            if message["kind"] == "saved":
+                self.saved.append(message["saved"])
             if message["kind"] in ("contact", "finished"):
                 self._console.sendall(b"run\n")
 
@@ -112,6 +115,10 @@ class Ground:
         """Send telecommands, and wait until the station has them."""
         self._telecommand.sendall(b"".join(packets))
         time.sleep(0.1)
+
+    def order(self, word: str) -> None:
+        """Send a word to the console."""
+        self._console.sendall(word.encode() + b"\n")
 
     def command(self, name: str, **values: object) -> bytes:
         self.count += 1
@@ -292,6 +299,57 @@ def test_a_session_goes_on_from_its_state(tmp_path: Path) -> None:
     whole.run()
     there, here = second.world.truth.states(second.utc_ns), whole.world.truth.states(whole.utc_ns)
     assert np.linalg.norm(there[0] - here[0]) < 1.0
+
+
+def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_path: Path) -> None:
+    """The state is written between the uplink of a window and the window; it has the schedule of the payload."""
+    snapshot = tmp_path / "exact"
+
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and ground.count == 0:
+            ground.send(
+                ground.command("set_time_report_rate", rate_exponent=0),
+                ground.at(EPOCH + 5 * HOUR_NS, ground.function("start_observation", 600.0, 15.0)),
+            )
+        elif contact["state"] == "ended":
+            ground.order("save")
+
+    whole, heard = flown(scenario(SHORT), 24.0, act)
+    first, before = flown(scenario(SHORT), 4.5, act, snapshot_file=snapshot)
+    assert first.account.frames == 0
+    second, after = flown(scenario(SHORT), 24.0, snapshot_file=snapshot)
+    assert second.spacecraft.resets == []
+    assert second.account == whole.account and whole.account.frames == 40
+    assert before.records + after.records == heard.records and len(after.records) > 0
+
+
+def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path: Path) -> None:
+    """At 64 bit/s most of 60 telecommands reach the spacecraft after the state was written."""
+    slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 64.0") + SHORT)
+
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and ground.count == 0:
+            ground.send(*(ground.command("test_connection") for _ in range(60)))
+            ground.order("save")
+
+    whole, heard = flown(slow, 5.0, act)
+    first, _ = flown(slow, 3.5, act, snapshot_file=tmp_path / "exact")
+    assert first.account.telecommands < 60 == whole.account.telecommands
+    second, after = flown(slow, 5.0, snapshot_file=tmp_path / "exact")
+    assert second.account == whole.account
+    assert heard.records.endswith(after.records) and len(after.records) > 0
+
+
+def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
+    session = ContinuousSession(scenario(), DataFolder(None), paused=True, ends_with_console=True)
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    with socket.create_connection(("127.0.0.1", session.ports["console"])) as console:
+        console.sendall(b"state\n")
+        assert json.loads(console.makefile("r").readline())["kind"] == "state"
+        assert thread.is_alive()
+    thread.join(20)
+    assert not thread.is_alive()
 
 
 def test_a_damaged_or_foreign_state_is_refused_in_one_line(tmp_path: Path) -> None:

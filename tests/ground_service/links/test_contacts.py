@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ground_service.links.core import (
+    BLOCK_NS,
     CLOCK_LIMIT_S,
     NS,
     PredictedContact,
@@ -25,6 +26,7 @@ from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
 
 DAY = 86_400 * NS
+ALWAYS = GroundStation("above the horizon", 0.0, 0.0, 0.0, np.radians(-90.0))
 MADRID = GroundStation("madrid", np.radians(40.43), np.radians(-4.25), 840.0, np.radians(10.0))
 
 
@@ -43,6 +45,22 @@ def test_the_station_sees_the_spacecraft_within_contacts_only(orbit: Ephemeris) 
         for edge, step in ((one.start_utc_ns, -3 * NS), (one.stop_utc_ns, 3 * NS)):
             if START + 10 * NS < edge < START + DAY - 10 * NS:
                 assert not link(orbit, np.array([edge + step]), MADRID).visible[0]
+
+
+def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit: Ephemeris) -> None:
+    whole = predict_contacts(orbit, [MADRID], START, START + DAY)
+    block = BLOCK_NS * (START // BLOCK_NS + 1)
+    crossing = predict_contacts(orbit, [ALWAYS], block - BLOCK_NS // 2, block + BLOCK_NS // 2)
+    assert any(one.start_utc_ns < block < one.stop_utc_ns for one in crossing)
+    for start, stop in (
+        (START + 3 * NS, START + DAY),
+        (whole[0].start_utc_ns + NS, whole[-1].stop_utc_ns - NS),
+    ):
+        found = predict_contacts(orbit, [MADRID], start, stop)
+        cut = [(max(one.start_utc_ns, start), min(one.stop_utc_ns, stop)) for one in whole]
+        assert [(one.start_utc_ns, one.stop_utc_ns) for one in found] == [
+            span for span in cut if span[0] < span[1]
+        ]
 
 
 def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit: Ephemeris) -> None:

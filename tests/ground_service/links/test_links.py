@@ -313,6 +313,35 @@ def test_the_file_is_not_read_again_by_the_next_process(
         assert runner.octets_received == 0
 
 
+@pytest.mark.parametrize(("share", "missed"), [(1.0, 0), (0.3, 1)])
+def test_a_contact_in_which_another_station_received_is_not_missed(
+    ground: Ground, station: Station, synthetic_pass: Any, share: float, missed: int
+) -> None:
+    from ground_service.ephemerides.service import add_ephemeris
+    from tests.ground_service.conftest import START
+
+    both = station.link('station = "here"') + station.link('station = "here"').replace('"lab"', '"other"')
+    declare(ground, PLACES + both)
+    stored = ground.files.put_file(synthetic_pass.folder / "reference.oem")
+    add_ephemeris(ground, stored, name="reference", precedence=0, actor="ann")
+    lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
+    now = [START - 500 * 10**9]
+    set_mission_clock(lambda: now[0])
+    try:
+        (contact, _) = service.list_contacts(ground, now[0], START + 1000 * 10**9).contacts
+        assert contact.stop is not None
+        start, stop = contact.start.utc_ns, contact.stop.utc_ns
+        assert all(service.acquire(ground, one, "me", 15_000_000_000) for one in (lab, other))
+        now[0] = start
+        row = service.start_contact(ground, other, start)
+        assert row is not None
+        service.end_contact(ground, row.id, "other", start + round(share * (stop - start)))
+        now[0] = stop + service.MARGIN_NS + 2 * 10**9
+        assert service.note_missed(ground, lab, "me", now[0], "nothing was received") == missed
+    finally:
+        set_mission_clock(None)
+
+
 def test_missed_contacts_are_recorded_once_with_the_reason(
     either: Ground, station: Station, synthetic_pass: Any
 ) -> None:

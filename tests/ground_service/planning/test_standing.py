@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock
 from ground_service.commanding.service import list_commands
 from ground_service.ephemerides.service import add_ephemeris
@@ -17,7 +19,7 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
-from ground_service.planning import request_store, standing
+from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
 from ground_service.store.database import prepare_database
@@ -26,6 +28,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
 
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 NS = 10**9
 HOUR = 3600 * NS
 DAYS = 3
@@ -175,6 +178,24 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
     assert standing.get_request(either, key).windows == {"approved": 4, "failed": 1}
 
 
+def test_windows_of_the_present_period_count_long_after_they_ended(
+    ground: Ground, oem: Path, now: Now
+) -> None:
+    prepare(ground, oem)
+    key = request(ground, windows=1)
+    standing.plan_tick(ground, now.utc_ns)
+    with ground.database.writing() as connection:
+        (window,) = request_store.windows_around(connection, 1, now.utc_ns)
+        assert store.change_window(connection, window, state="processed")
+    later = window.stop.utc_ns + 30 * HOUR
+    with ground.database.reading() as connection:
+        assert request_store.windows_around(connection, 1, later) == []
+    assert standing.plan_tick(ground, later)["added"] == 0
+    terms = RequestTerms(windows=1, period_days=1.0, horizon_days=1.0)
+    standing.change_request(ground, key, StandingRequestChange(terms=terms), actor="ann")
+    assert standing.plan_tick(ground, later)["added"] >= 1  # that window belongs to an earlier period
+
+
 def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(
     ground: Ground, oem: Path, now: Now
 ) -> None:
@@ -246,6 +267,26 @@ def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, 
     assert [one.request_id for one in planning.list_windows(ground)[0]] == [None]
     with pytest.raises(NotFound):
         standing.get_request(ground, key)
+
+
+def test_the_posts_of_the_documentation_give_released_windows(
+    tmp_path: Path,
+    oem: Path,
+    now: Now,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The Python block of the page on mission runs, run as written on an empty service."""
+    (block,) = re.findall(r"```python\n(.*?)```", (DOCS / "mission-run.md").read_text(), re.DOTALL)
+    (tmp_path / "mission.toml").write_text(MISSION.format(extra=AUTOMATIC + LINKS))
+    (tmp_path / "reference.oem").write_bytes(oem.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    local = local_client(open_ground(tmp_path / "home"), "ann")
+    monkeypatch.setattr("ground_service.client.Client", lambda url, token: local)
+    exec(compile(block, "mission-run.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert said.count("'planned'") == said.count(" approved ") == 2
+    assert "6 telecommands wait for a contact" in said and "('a', 'waiting', " in said
 
 
 def test_contradictory_terms_are_refused(ground: Ground) -> None:

@@ -1,0 +1,70 @@
+"""Checkpoints of a mission run: spacecraft, archive and progress of one moment at which the ground is idle."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+SPACECRAFT, ARCHIVE, PROGRESS = "spacecraft", "archive.db", "progress.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoints:
+    """The newest checkpoint in the folder of a run.
+
+    Attributes
+    ----------
+    folder
+        Folder of the run.
+    home
+        Folder of the ground service.
+    snapshot
+        File of the exact state of the spacecraft.
+    """
+
+    folder: Path
+    home: Path
+    snapshot: Path
+
+    def keep(self, progress: Path) -> None:
+        """Make a checkpoint of the present files in place of the one before.
+
+        Files of the archive are named by their content and never change, so its database is enough.
+        """
+        new = self.folder / "checkpoint.new"
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir(mode=0o700)
+        shutil.copyfile(self.snapshot, new / SPACECRAFT)
+        shutil.copyfile(progress, new / PROGRESS)
+        with (
+            closing(sqlite3.connect(self.home / "linna.db")) as source,
+            closing(sqlite3.connect(new / ARCHIVE)) as target,
+        ):
+            source.backup(target)
+        old = self.folder / "checkpoint.old"
+        shutil.rmtree(old, ignore_errors=True)
+        if self._place.exists():
+            self._place.rename(old)
+        new.rename(self._place)
+        shutil.rmtree(old, ignore_errors=True)
+
+    def restore(self) -> Path | None:
+        """Put spacecraft and archive back to the newest checkpoint, or to nothing without one; return its progress."""
+        found = next((one for one in (self._place, self.folder / "checkpoint.old") if one.exists()), None)
+        self.snapshot.unlink(missing_ok=True)
+        shutil.rmtree(self.home / "incoming", ignore_errors=True)
+        for suffix in ("", "-wal", "-shm"):
+            (self.home / f"linna.db{suffix}").unlink(missing_ok=True)
+        if found is None:
+            shutil.rmtree(self.home, ignore_errors=True)
+            return None
+        shutil.copyfile(found / SPACECRAFT, self.snapshot)
+        shutil.copyfile(found / ARCHIVE, self.home / "linna.db")
+        return found / PROGRESS
+
+    @property
+    def _place(self) -> Path:
+        return self.folder / "checkpoint"
