@@ -167,6 +167,7 @@ class ContinuousSession:
     _waiting: int = 0
     _until_ns: int | None = None
     _clock_map: Any = None
+    _is_continued: bool = False
 
     def __post_init__(self) -> None:
         scenario = self.scenario
@@ -221,7 +222,8 @@ class ContinuousSession:
     # Time
 
     def _fly(self, selector: selectors.BaseSelector) -> None:
-        self._turn()
+        if not self._is_continued:
+            self._turn()
         while not self.stopping.is_set():
             if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
                 self._held = self.holds
@@ -598,6 +600,7 @@ class ContinuousSession:
         self.world = replace(self.world, truth=values.pop("truth"), burns=values.pop("burns"))
         for name, value in values.items():
             setattr(self, name, value)
+        self._is_continued = True
 
     def _known_objects(self) -> dict[str, object]:
         """Return the objects that every session of the scenario makes alike."""
