@@ -324,8 +324,8 @@ def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_pat
 
 
 def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path: Path) -> None:
-    """At 64 bit/s most of 60 telecommands reach the spacecraft after the state was written."""
-    slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 64.0") + SHORT)
+    """At 16 bit/s most of 60 telecommands reach the spacecraft after the state was written."""
+    slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 16.0") + SHORT)
 
     def act(ground: Ground, contact: dict[str, Any]) -> None:
         if contact["state"] == "started" and ground.count == 0:
