@@ -20,7 +20,7 @@ from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import RunTerms, run_mission
 
 SCENARIO = """
-name = "six-hours"
+name = "half-a-day"
 seed = 3
 [orbit]
 epoch = "2029-08-07T00:00:00Z"
@@ -39,10 +39,10 @@ estimators = ["spherical"]
 """
 
 
-TERMS = RunTerms(days=0.25, windows_per_day=1, window_s=600.0)
+TERMS = RunTerms(days=0.5, windows_per_day=1, window_s=600.0)
 
 
-def test_six_hours_are_planned_flown_received_and_reported_without_a_person(tmp_path: Path) -> None:
+def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_path: Path) -> None:
     said: list[str] = []
     figures = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     windows = figures["windows"]
@@ -60,13 +60,13 @@ def test_six_hours_are_planned_flown_received_and_reported_without_a_person(tmp_
         assert 50.0 < memory["first"] <= memory["peak"] and memory["last"] <= memory["peak"]
         assert figures["cpu_s"][name] > 0.1
     assert json.loads((tmp_path / "report.json").read_text())["windows"] == windows
-    assert "six-hours" in (tmp_path / "report.html").read_text()
+    assert "half-a-day" in (tmp_path / "report.html").read_text()
     # The same again prints the figures of the run that has ended; other terms need another folder.
     again = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     assert again["windows"] == windows and "this run has ended" in said[-1]
     with pytest.raises(ScenarioError, match="expected a new folder, or the same scenario and options"):
         run_mission(
-            parse_scenario(SCENARIO), DataFolder(None), tmp_path, replace(TERMS, days=0.5), said.append
+            parse_scenario(SCENARIO), DataFolder(None), tmp_path, replace(TERMS, days=0.75), said.append
         )
 
 
@@ -136,7 +136,7 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 0.0)
-    terms = replace(TERMS, days=0.5, windows_per_day=2)
+    terms = replace(TERMS, windows_per_day=2)
     whole = run_mission(
         parse_scenario(SCENARIO), DataFolder(None), tmp_path / "whole", terms, lambda line: None
     )
