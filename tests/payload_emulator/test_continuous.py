@@ -314,10 +314,10 @@ def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_pat
         elif contact["state"] == "ended":
             ground.order("save")
 
-    whole, heard = flown(scenario(SHORT), 24.0, act)
+    whole, heard = flown(scenario(SHORT), 29.0, act)
     first, before = flown(scenario(SHORT), 4.5, act, snapshot_file=snapshot)
     assert first.account.frames == 0
-    second, after = flown(scenario(SHORT), 24.0, snapshot_file=snapshot)
+    second, after = flown(scenario(SHORT), 29.0, snapshot_file=snapshot)
     assert second.spacecraft.resets == []
     assert second.account == whole.account and whole.account.frames == 40
     assert before.records + after.records == heard.records and len(after.records) > 0
