@@ -288,7 +288,9 @@ def list_spacecraft_parameters(
     return PageOf.all_of(parameters.spacecraft_parameters(ground, spacecraft_id, instance))
 
 
-PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}}}
+PNG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "PNG image"}
+}
 
 
 @passes.get("/spacecraft/{spacecraft_id}/images")

@@ -18,7 +18,7 @@ import selectors
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
@@ -446,10 +446,40 @@ def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, r
         "events": [],
         "verifications": [],
     }
+    estimates = _add_packets(message, flown.packets)
+    if flown.exposure is not None:
+        position = world.truth.positions_mcmf(flown.moment.utc_ns)[0]
+        latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
+        message |= {
+            "frame": flown.moment.frame,
+            "reference": {
+                "latitude_deg": np.degrees(latitude),
+                "longitude_deg": np.degrees(longitude) % 360.0,
+                "altitude_m": altitude,
+            },
+            "altitude_km": altitude / 1e3,
+            "terrain": {"name": world.terrain.name, "real": world.terrain.is_real},
+            "catalogue": _catalogue(world, flown),
+            "image_jpeg": _jpeg(flown.exposure.image),
+        }
+        for estimate in estimates.values():
+            if "altitude_m" in estimate:
+                place = mcmf_from_spherical(
+                    np.radians(estimate["latitude_deg"]),
+                    np.radians(estimate["longitude_deg"]),
+                    estimate["altitude_m"],
+                )
+                estimate["error_m"] = float(np.linalg.norm(place - position))
+        message["estimates"] = estimates
+    return message
+
+
+def _add_packets(message: dict[str, Any], packets: Sequence[bytes]) -> dict[str, dict[str, Any]]:
+    """Add the contents of packets to a message; return the outcome and estimate of each estimator."""
     estimates: dict[str, dict[str, Any]] = {}
     identified: dict[int, int] = {}
     labels = DICTIONARY.labels
-    for packet in flown.packets:
+    for packet in packets:
         try:
             name, values = DICTIONARY.unpack(packet)
         except TmtcError:
@@ -487,31 +517,7 @@ def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, r
     for number, detection in enumerate(message.get("detections", [])):
         if number in identified:
             detection["crater_id"] = identified[number]
-    if flown.exposure is not None:
-        position = world.truth.positions_mcmf(flown.moment.utc_ns)[0]
-        latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-        message |= {
-            "frame": flown.moment.frame,
-            "reference": {
-                "latitude_deg": np.degrees(latitude),
-                "longitude_deg": np.degrees(longitude) % 360.0,
-                "altitude_m": altitude,
-            },
-            "altitude_km": altitude / 1e3,
-            "terrain": {"name": world.terrain.name, "real": world.terrain.is_real},
-            "catalogue": _catalogue(world, flown),
-            "image_jpeg": _jpeg(flown.exposure.image),
-        }
-        for estimate in estimates.values():
-            if "altitude_m" in estimate:
-                place = mcmf_from_spherical(
-                    np.radians(estimate["latitude_deg"]),
-                    np.radians(estimate["longitude_deg"]),
-                    estimate["altitude_m"],
-                )
-                estimate["error_m"] = float(np.linalg.norm(place - position))
-        message["estimates"] = estimates
-    return message
+    return estimates
 
 
 def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
