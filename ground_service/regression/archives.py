@@ -33,11 +33,20 @@ from ground_service.regression.model import (
     KeptArchive,
 )
 from ground_service.store.counters import hold
-from ground_service.store.files import FileArchive, StoredFile, replace_durably
+from ground_service.store.files import (
+    FileArchive,
+    StoredFile,
+    remove_leftovers,
+    replace_durably,
+    unfinished_prefix,
+)
 
 MANIFEST = "manifest.json"
 _FILES_LOCK = "files of regression archives"
 """Lock held while files of archives are in use, so that no file is removed that another process has just stored."""
+
+_WORKING = ".working-"
+"""Prefix of folders with temporary copies; host and process follow, to identify leftovers."""
 
 INPUTS = "payload/inputs.jsonl"
 DETECTIONS = "payload/detections.jsonl"
@@ -354,11 +363,22 @@ def _remove_files(
         files.path(sha256).unlink(missing_ok=True)
 
 
-def scratch_of(ground: Ground) -> Path:
-    """Return the folder for temporary copies of archives, which only the service can read."""
-    folder = ground.home / "regression" / "scratch"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+@contextmanager
+def working_folder(ground: Ground) -> Iterator[Path]:
+    """Yield a folder for temporary copies of archives, which only the service can read."""
+    scratch = _scratch_of(ground)
+    scratch.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=unfinished_prefix(_WORKING), dir=scratch) as name:
+        yield Path(name)
+
+
+def remove_unfinished(ground: Ground) -> int:
+    """Remove the temporary copies and unfinished files of ended processes; return their number."""
+    return remove_leftovers(_scratch_of(ground), _WORKING) + store_of(ground).remove_leftovers()
+
+
+def _scratch_of(ground: Ground) -> Path:
+    return ground.home / "regression" / "scratch"
 
 
 def store_of(ground: Ground) -> FileArchive:

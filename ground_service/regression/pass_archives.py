@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,8 @@ from ground_service.regression.archives import (
     PassArchive,
     check_archive,
     kept_archive,
-    scratch_of,
     store_archive,
+    working_folder,
 )
 from ground_service.regression.model import TELEMETRY_ONLY, KeptArchive
 from ground_service.store.vehicles import get_vehicle
@@ -57,8 +56,8 @@ def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArch
     """
     with ground.database.reading() as connection:
         record = passes.get_pass(connection, pass_id)
-    with tempfile.TemporaryDirectory(prefix="pass-", dir=scratch_of(ground)) as name:
-        folder = Path(name) / "archive"
+    with working_folder(ground) as work:
+        folder = work / "archive"
         folder.mkdir()
         if record.archive_digest is not None:
             archive = _imported(ground, record, folder)

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import os
 import platform
-import tempfile
 import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import GroundError, InvalidInput
+from ground_service.errors import GroundError, InvalidInput, Stopping
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -30,8 +29,8 @@ from ground_service.regression.archives import (
     archive_of,
     check_out,
     keep_archive,
-    scratch_of,
     store_of,
+    working_folder,
 )
 from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build
@@ -138,8 +137,8 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
     if known is not None and is_done(known):
         return known
     settle_archive(ground, digest)
-    with tempfile.TemporaryDirectory(prefix="replay-", dir=scratch_of(ground)) as folder:
-        archive = check_out(ground, digest, Path(folder) / "archive")
+    with working_folder(ground) as folder:
+        archive = check_out(ground, digest, folder / "archive")
         refusal = _other_camera(build, archive) or _unreplayable(archive, (build,))
         if refusal:
             refused = KeptReplay(
@@ -154,9 +153,7 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
                 machine=_machine(),
             )
             return _keep(ground, digest, build, refused)
-        run = run_build(
-            build, archive.folder, Path(folder) / "out", runner=ground.runner, private=(ground.home,)
-        )
+        run = run_build(build, archive.folder, folder / "out", runner=ground.runner, private=(ground.home,))
         outcome, detail = run.outcome, run.detail
         stored: dict[str, str | None] = {"downlink": None, "performance": None}
         if run.downlink is not None:
@@ -172,7 +169,7 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
                     outcome, detail = "garbage", str(error)
             stored["downlink"] = store_of(ground).put_octets(octets).sha256
         if run.performance is not None:
-            stored["performance"] = store_of(ground).put_file(Path(folder) / "out" / PERFORMANCE).sha256
+            stored["performance"] = store_of(ground).put_file(folder / "out" / PERFORMANCE).sha256
         return _keep(
             ground,
             digest,
@@ -320,6 +317,8 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
                 str(given), "", "a pass archive, or the identity or the pass of one that is kept", "neither"
             )
         return _settled(ground, record.digest, path)
+    except Stopping:
+        raise
     except (GroundError, LunarError) as error:
         return PassVerdict(path.name, "", "unusable", str(error))
 
@@ -388,8 +387,8 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
             )
             return PassVerdict(archive.name, archive.digest, state, told, old, new)
     try:
-        with tempfile.TemporaryDirectory(prefix="judge-", dir=scratch_of(ground)) as folder:
-            context = pass_context(check_out(ground, archive.digest, Path(folder) / "a"), ground.data)
+        with working_folder(ground) as folder:
+            context = pass_context(check_out(ground, archive.digest, folder / "a"), ground.data)
         read = [_read(ground, context, replay) for replay in (old, new)]
     except (GroundError, LunarError) as error:
         return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)

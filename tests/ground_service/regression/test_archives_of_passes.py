@@ -214,12 +214,95 @@ def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
     assert judged == [gate.name for gate in alone.gates]
 
 
-def test_a_rendering_that_takes_too_long_is_stopped(
+def changed(folder: Path, **values: Any) -> None:
+    """Change keys of the manifest of an archive, and enter the files of its folder."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]
+    write_manifest(folder, {**manifest, **values})
+
+
+@pytest.mark.parametrize("status", [-1.0, 1e3])
+def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
+    ground: Ground,
+    unrendered: Path,
+    make_build: Callable,
+    monkeypatch: pytest.MonkeyPatch,
+    status: float,
+) -> None:
+    """The renderer exceeds its time, or ends as on a full disk; the pass is unusable in this verdict only."""
+    monkeypatch.setattr(rendering, "RENDER_LIMIT_S", status)
+    if status > 0.0:
+        failure = "import sys; sys.exit('linna: error: No space left on device (/x)') "
+        monkeypatch.setattr(rendering, "_LAUNCH", failure)
+    digest = keep_archive(ground, unrendered).digest
+    with pytest.raises(rendering.RenderingFailed, match=r"found (no end within -1 s|exit status 1)"):
+        rendering.settle_archive(ground, digest)
+    build = build_of(ground, str(make_build("good", {})))
+    outcome = run_regression(ground, [digest], build, build, load_policy())
+    assert [one.state for one in outcome.passes] == ["unusable"]
+    assert outcome.verdict == "inconclusive"
+    [kept] = kept_archives(ground)
+    assert (kept.state, kept.reason) == ("to render", "")
+
+
+def test_only_a_message_of_the_renderer_itself_is_a_refusal() -> None:
+    told = "archive: expected pixels with SHA-256 0, found 1"
+    assert rendering._refusal(2, f"progress\nlinna: error: {told}\n") == told
+    for status, printed in (
+        (1, f"linna: error: {told}"),
+        (-9, f"linna: error: {told}"),
+        (2, "Traceback\nMemoryError"),
+        (2, ""),
+        (2, "linna: error: No space left on device (/x)"),
+        (2, "linna: error: [('a', 'b', '[Errno 28] No space left on device')]"),
+    ):
+        assert rendering._refusal(status, printed) == "", printed
+
+
+@pytest.mark.parametrize(
+    ("scenario", "reason"),
+    [
+        ('[orbit]\noem = "{secret}"', "orbit.oem: expected none, found a file"),
+        ('[orbit]\noem = "../secret"', "orbit.oem: expected none, found a file"),
+        ('[dynamics]\ngravity = "{secret}"', "dynamics.gravity: expected auto or builtin, found a file"),
+        ("[camera]\nwidth_px = 4097", "camera.width_px: expected at most 4096, found 4097"),
+        ("[camera]\nheight_px = 8192", "camera.height_px: expected at most 4096, found 8192"),
+    ],
+)
+def test_the_scenario_of_an_archive_opens_no_file_and_renders_no_large_images(
+    ground: Ground, unrendered: Path, tmp_path: Path, scenario: str, reason: str
+) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("secret words")
+    changed(unrendered, scenario_toml=f'name = "x"\n{scenario.format(secret=secret)}\n')
+    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
+    assert kept.state == "telemetry only"
+    assert kept.reason == f"the scenario of the archive is not rendered: {reason}"
+
+
+def test_the_renderer_imports_nothing_from_the_archive(
+    ground: Ground, unrendered: Path, tmp_path: Path
+) -> None:
+    taken = tmp_path / "taken"
+    for name in ("linna/__init__.py", "linna/__main__.py", "ctypes.py", "numpy.py"):
+        (unrendered / name).parent.mkdir(exist_ok=True)
+        (unrendered / name).write_text(f"open({str(taken)!r}, 'w')\n")
+    changed(unrendered)
+    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
+    assert kept.reason.startswith("the frames cannot be rendered: archive/payload/inputs.jsonl, line 1: ")
+    assert not taken.exists()
+
+
+def test_an_archive_that_cannot_be_rendered_is_settled_once(
     ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rendering, "RENDER_LIMIT_S", -1.0)
-    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
-    assert (kept.state, kept.reason) == ("telemetry only", "the frames were not rendered within -1 s")
+    (unrendered / "downlink.cadu").unlink()
+    changed(unrendered)
+    first = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
+    assert first.reason.count("no received detections") == 1
+    assert rendering.settle_archive(ground, first.digest, again=True) == first
+    monkeypatch.setattr(rendering, "check_out", None)
+    assert rendering.settle_archive(ground, first.digest) == first
 
 
 def test_an_archive_is_rendered_again_on_request(
