@@ -1,4 +1,8 @@
-"""Print the licence of every pinned package that is installed; exit status 1 if one is GPL or AGPL."""
+"""Print the licence of every pinned package.
+
+Exit status 1 if one is GPL or AGPL, states no licence or is not installed. A package whose marker excludes this Python
+is named as not needed.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,8 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-PIN = re.compile(r"^([A-Za-z0-9._-]+)==", re.MULTILINE)
+from packaging.requirements import Requirement
+
 COPYLEFT = re.compile(r"\b(A?GPL|GNU (Affero )?General Public)", re.IGNORECASE)
 WEAK = re.compile(r"LGPL|Lesser|Library General", re.IGNORECASE)
 
@@ -29,24 +34,37 @@ def is_copyleft(stated: list[str]) -> bool:
     return any(COPYLEFT.search(text) and not WEAK.search(text) for text in stated)
 
 
+def pinned(files: list[Path]) -> list[Requirement]:
+    """Return the packages of requirement files, by name."""
+    lines = [
+        line.partition("#")[0].strip() for file in files for line in file.read_text("utf-8").splitlines()
+    ]
+    pins = {pin.name.lower(): pin for pin in (Requirement(line) for line in lines if line)}
+    return [pins[name] for name in sorted(pins)]
+
+
 def main(words: list[str]) -> int:
     """Print the packages of requirement files with their licences."""
-    status = 0
-    names = sorted(
-        {name for word in words for name in PIN.findall(Path(word).read_text(encoding="utf-8"))},
-        key=str.lower,
-    )
-    for name in names:
-        try:
-            stated = licences_of(name)
-        except metadata.PackageNotFoundError:
-            print(f"{name}\tnot installed")
+    faults = []
+    for pin in pinned([Path(word) for word in words]):
+        if pin.marker is not None and not pin.marker.evaluate():
+            print(f"{pin.name}\tnot needed by this Python")
             continue
-        print(f"{name}\t{metadata.version(name)}\t{'; '.join(text[:60] for text in stated) or 'not stated'}")
-        if is_copyleft(stated):
-            print(f"licences: {name}: expected no GPL or AGPL, found {'; '.join(stated)}", file=sys.stderr)
-            status = 1
-    return status
+        try:
+            stated = licences_of(pin.name)
+        except metadata.PackageNotFoundError:
+            faults.append(f"{pin.name}: expected the package, found it not installed")
+            continue
+        print(
+            f"{pin.name}\t{metadata.version(pin.name)}\t{'; '.join(text[:60] for text in stated) or 'not stated'}"
+        )
+        if not stated:
+            faults.append(f"{pin.name}: expected a licence, found none stated")
+        elif is_copyleft(stated):
+            faults.append(f"{pin.name}: expected no GPL or AGPL, found {'; '.join(stated)}")
+    for fault in faults:
+        print(f"licences: {fault}", file=sys.stderr)
+    return 1 if faults else 0
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from packaging.markers import default_environment
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -33,10 +35,25 @@ def name_of(text: str) -> str:
     return NORMAL.sub("-", re.split(r"[\[<>=!~ ;]", text, maxsplit=1)[0]).lower()
 
 
-def pins(name: str) -> dict[str, str]:
+def pins(name: str) -> dict[str, Requirement]:
     lines = (ROOT / "requirements" / f"{name}.txt").read_text().splitlines()
     entries = [line.split("#")[0].strip() for line in lines]
-    return {name_of(entry): entry for entry in entries if entry}
+    return {name_of(entry): Requirement(entry) for entry in entries if entry}
+
+
+def version_of(pin: Requirement) -> str:
+    return str(pin.specifier).removeprefix("==")
+
+
+def applies(
+    requirement: Requirement, python: str | None = None, extras: frozenset[str] = frozenset()
+) -> bool:
+    """Return whether a requirement holds for a version of Python (without one: for this)."""
+    here = dict(default_environment())
+    if python is not None:
+        here |= {"python_version": python.rpartition(".")[0], "python_full_version": python}
+    marker = requirement.marker
+    return marker is None or any(marker.evaluate({**here, "extra": extra}) for extra in ("", *extras))
 
 
 RUNTIME = {
@@ -48,7 +65,52 @@ EVERYTHING = {**RUNTIME, **pins("train"), **pins("dev")}
 
 
 def test_every_requirement_is_pinned_to_one_version() -> None:
-    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[^=<>~* ]+", entry) for entry in EVERYTHING.values())
+    for pin in EVERYTHING.values():
+        assert re.fullmatch(r"==[^=<>~*, ]+", str(pin.specifier)) and not pin.url and not pin.extras, pin
+
+
+def needed(python: str, files: tuple[str, ...]) -> dict[str, list[Requirement]]:
+    """Return what the pinned packages of files require of each package, for a version of Python."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    texts = [*project["dependencies"]]
+    texts += [text for file in files for text in project["optional-dependencies"].get(file, [])]
+    waiting, seen = [Requirement(text) for text in texts], set()
+    found: dict[str, list[Requirement]] = {}
+    while waiting:
+        one = waiting.pop()
+        name = name_of(one.name)
+        found.setdefault(name, []).append(one)
+        if (name, frozenset(one.extras)) in seen:
+            continue
+        seen.add((name, frozenset(one.extras)))
+        try:
+            listed = metadata.requires(name) or []
+        except metadata.PackageNotFoundError:
+            assert name in RUNTIME and not applies(RUNTIME[name]), f"{name} is not installed"
+            continue
+        inner = [Requirement(text) for text in listed]
+        waiting += [it for it in inner if applies(it, python, frozenset(one.extras))]
+    return found
+
+
+@pytest.mark.parametrize("python", ["3.11.0", "3.11.2", "3.11.3", "3.12.0"])
+@pytest.mark.parametrize(
+    "files", [("runtime",), ("runtime", "terrain"), ("runtime", "postgres", "parquet", "traces")]
+)
+def test_what_packages_require_is_pinned_for_every_python(files: tuple[str, ...], python: str) -> None:
+    """An installation with hashes fails for a package without a pin, also one that only some versions need."""
+    known = {name: pin for file in files for name, pin in pins(file).items() if applies(pin, python)}
+    requirements = needed(python, files)
+    assert len(requirements) > 40
+    assert set(requirements) <= set(known)
+    for name, asked in requirements.items():
+        for one in asked:
+            assert one.specifier.contains(version_of(known[name]), prereleases=True), one
+
+
+def test_a_package_that_only_older_pythons_need_is_looked_for() -> None:
+    assert "async-timeout" in needed("3.11.2", ("runtime",))
+    assert "async-timeout" not in needed("3.11.3", ("runtime",))
 
 
 def test_every_declared_dependency_has_its_pin() -> None:
@@ -66,10 +128,10 @@ def test_every_declared_dependency_has_its_pin() -> None:
         assert {name_of(text) for text in extras[extra]} <= set(known)
 
 
-@pytest.mark.parametrize("name", sorted(RUNTIME))
+@pytest.mark.parametrize("name", sorted(name for name, pin in RUNTIME.items() if applies(pin)))
 def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
     found = metadata.distribution(name)
-    assert RUNTIME[name].endswith(f"=={found.version}")
+    assert version_of(RUNTIME[name]) == found.version
     stated = licences.licences_of(name)
     assert stated and not licences.is_copyleft(stated), f"{name}: {stated}"
 
@@ -77,12 +139,12 @@ def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
 @pytest.mark.parametrize("name", ["runtime", "postgres", "parquet", "traces", "terrain"])
 def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
     text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
-    entries = {name_of(line): line.split() for line in text.splitlines() if line and not line.startswith("#")}
-    assert {key: words[0].partition("==")[2] for key, words in entries.items()} == {
-        key: pin.partition("==")[2] for key, pin in pins(name).items()
-    }
-    for words in entries.values():
-        assert len(words) > 1 and all(re.fullmatch("--hash=sha256:[0-9a-f]{64}", word) for word in words[1:])
+    entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}
+    assert {key: Requirement(line.partition("--hash")[0].strip()) for key, line in entries.items()} == pins(
+        name
+    )
+    for line in entries.values():
+        assert re.fullmatch("(--hash=sha256:[0-9a-f]{64} *)+", line[line.index("--hash") :])
 
 
 def test_what_is_installed_for_users_is_installed_with_hashes() -> None:
@@ -106,6 +168,22 @@ def test_the_gpl_is_found_and_the_lgpl_permitted() -> None:
         assert licences.is_copyleft(["MIT", text]), text
     for text in ("LGPL-3.0", "GNU Lesser General Public License v3", "MIT", "BSD-3-Clause", "MPL-2.0"):
         assert not licences.is_copyleft([text]), text
+
+
+def test_a_package_without_licence_or_not_installed_is_a_fault(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "a.txt"
+    file.write_text("# packages\nnumpy==1.0\nabsent==1.0 ; python_version < '3'\n")
+    assert licences.main([str(file)]) == 0
+    assert "absent\tnot needed" in capsys.readouterr().out
+    file.write_text("numpy==1.0\nabsent==1.0\n")
+    assert licences.main([str(file)]) == 1
+    assert "absent: expected the package, found it not installed" in capsys.readouterr().err
+    file.write_text("numpy==1.0\n")
+    monkeypatch.setattr(licences, "licences_of", lambda _name: [])
+    assert licences.main([str(file)]) == 1
+    assert "numpy: expected a licence" in capsys.readouterr().err
 
 
 class Osv(BaseHTTPRequestHandler):
