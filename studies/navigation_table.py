@@ -165,7 +165,9 @@ def cells(row: NavigationRow) -> list[str]:
         _number(row.nis_per_degree, 2),
         _number(row.radial_bias_m),
         _number(row.propagate_only_m),
-        "" if row.recovery_frames is None else f"{row.recovery_frames} frames",
+        ""
+        if row.recovery_frames is None
+        else f"{row.recovery_frames} frame{'s' * (row.recovery_frames != 1)}",
         str(row.truth_reads_after_start),
     ]
 

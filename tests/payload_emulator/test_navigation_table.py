@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ def test_a_row_has_the_altitude_the_level_and_the_figures_of_its_summary(tmp_pat
         "| kidnapped-silently | 2034 | 2 | 31 (19 to 43) | 165 | 41 | 83 | 1,204 |  | 0.25 | 98.2 % | 0 | 5.4 | 0.98 "
         "| -8 | 14,834 | 5 frames | 0 |"
     )
+    assert "| 1 frame |" in format_markdown([replace(row, recovery_frames=1)])
 
 
 @pytest.mark.parametrize(
