@@ -203,10 +203,15 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Replace the file by one with this state; after a loss of power either the old or the new one is whole."""
     document = checkpoint.model_dump_json().encode()
     header = f"LINNA session state, version {VERSION}, SHA-256 {hashlib.sha256(document).hexdigest()}\n"
+    replace_file(path, header.encode() + document)
+
+
+def replace_file(path: Path, octets: bytes) -> None:
+    """Replace the content of a file; after a loss of power either the old or the new one is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     new_file = path.with_name(path.name + ".new")
     with new_file.open("wb") as stream:
-        stream.write(header.encode() + document)
+        stream.write(octets)
         stream.flush()
         os.fsync(stream.fileno())
     new_file.replace(path)

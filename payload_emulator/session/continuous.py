@@ -51,7 +51,7 @@ from payload_emulator.session.live import TelecommandBuffer
 from payload_emulator.session.live_ports import Server
 from payload_emulator.session.loading import LoadedPayload, launch_payload
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.snapshot import pack_snapshot, unpack_snapshot
+from payload_emulator.session.snapshot import load_snapshot, save_snapshot
 from payload_emulator.session.spacecraft import Spacecraft, new_board
 from payload_emulator.session.station_ports import KEPT_LIMIT_OCTETS, StationPorts
 from payload_emulator.session.world import (
@@ -189,8 +189,8 @@ class ContinuousSession:
         )
         if checkpoint is not None:
             self._restore(checkpoint)
-        if self.snapshot_file is not None and self.snapshot_file.exists():
-            self._continue_exactly(self.snapshot_file.read_bytes())
+        if self.snapshot_file is not None:
+            self._continue_exactly(self.snapshot_file)
         self._bench = InstrumentBench(self.world)
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
         self._write_clock()
@@ -588,15 +588,14 @@ class ContinuousSession:
         if self.snapshot_file is not None and idle:
             values = {name: getattr(self, name) for name in _EXACT}
             values |= {"truth": self.world.truth, "burns": self.world.burns}
-            octets = pack_snapshot(self.scenario.name, values, self._known_objects())
-            beside = self.snapshot_file.with_name(self.snapshot_file.name + ".new")
-            beside.write_bytes(octets)
-            beside.replace(self.snapshot_file)
+            save_snapshot(self.snapshot_file, self.scenario.name, values, self._known_objects())
         self._send_message({"kind": "saved", "saved": self.snapshot_file is not None and idle})
 
-    def _continue_exactly(self, octets: bytes) -> None:
-        """Continue from an exact state as if the process had not ended."""
-        values = unpack_snapshot(octets, self.scenario.name, self._known_objects())
+    def _continue_exactly(self, path: Path) -> None:
+        """Continue from an exact state, if the file is there, as if the process had not ended."""
+        values = load_snapshot(path, self.scenario.name, self._known_objects())
+        if values is None:
+            return
         self.world = replace(self.world, truth=values.pop("truth"), burns=values.pop("burns"))
         for name, value in values.items():
             setattr(self, name, value)

@@ -2,13 +2,22 @@
 
 Flight software holds views of the memory of its board. A plain pickle would copy each view, and a later fault of the
 memory would no longer reach the software.
+
+The file has a line `LINNA exact state, version N, SHA-256 HEX` and a pickle whose checksum this is. The checksum finds
+damage; it does not say who wrote the file. The pickle can name only classes that modules of this program define, and
+the functions and classes listed here. What remains trusted: it can call the constructors and set the attributes of
+these classes with any values, and have modules of this program imported. Keep the file where only the user of the
+session can write, and read none that somebody else made.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
+import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType, MethodType
 from typing import Any
 
@@ -18,8 +27,11 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray
 from lunar.propagation import Trajectory
 from payload_emulator.errors import RecordError
+from payload_emulator.session.checkpoint import replace_file
 
-_VERSION = 1
+VERSION = 2
+_HEADER = re.compile(rb"LINNA exact state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
+_EXPECTED = "the exact state of a session (linna emulate --continuous --snapshot)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")
 _NAMED = frozenset(
     {
@@ -56,12 +68,14 @@ def pack_snapshot(scenario: str, values: Mapping[str, Any], known: Mapping[str, 
     """
     octets = io.BytesIO()
     try:
-        _Pickler(octets, known).dump((_VERSION, scenario, dict(values)))
+        _Pickler(octets, known).dump((scenario, dict(values)))
     except (pickle.PicklingError, TypeError, AttributeError) as error:
         raise RecordError(
             f"state of scenario {scenario}: expected values that can be kept, found {error}"
         ) from None
-    return octets.getvalue()
+    document = octets.getvalue()
+    header = f"LINNA exact state, version {VERSION}, SHA-256 {hashlib.sha256(document).hexdigest()}\n"
+    return header.encode() + document
 
 
 def unpack_snapshot(octets: bytes, scenario: str, known: Mapping[str, object]) -> dict[str, Any]:
@@ -72,13 +86,48 @@ def unpack_snapshot(octets: bytes, scenario: str, known: Mapping[str, object]) -
     RecordError
         It is damaged, or belongs to another scenario or version.
     """
+    header = _HEADER.match(octets)
+    if header is None:
+        raise RecordError(f"expected {_EXPECTED}, found octets that begin with {octets[:24]!r}")
+    if int(header[1]) != VERSION:
+        raise RecordError(f"expected version {VERSION} of the exact state, found {int(header[1])}")
+    document = octets[header.end() :]
+    if hashlib.sha256(document).hexdigest().encode() != header[2]:
+        raise RecordError(f"expected {_EXPECTED} with the checksum of line 1, found damage")
     try:
-        version, name, values = _Unpickler(io.BytesIO(octets), known).load()
-    except (ValueError, EOFError, TypeError, AttributeError, ImportError, pickle.UnpicklingError) as error:
-        raise RecordError(f"exact state: expected that of a session, found damage ({error})") from None
-    if version != _VERSION or name != scenario:
-        raise RecordError(f"exact state: expected that of scenario {scenario}, found that of {name}")
-    return dict(values)
+        name, values = _Unpickler(io.BytesIO(document), known).load()
+        found = dict(values)
+    except Exception as error:  # classes raise whatever they meet in values that are not theirs
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise RecordError(f"expected {_EXPECTED}, found damage ({reason})") from None
+    if name != scenario:
+        raise RecordError(f"expected the exact state of scenario {scenario}, found that of {name}")
+    return found
+
+
+def save_snapshot(path: Path, scenario: str, values: Mapping[str, Any], known: Mapping[str, object]) -> None:
+    """Replace the file by one with these values, see `pack_snapshot`."""
+    replace_file(path, pack_snapshot(scenario, values, known))
+
+
+def load_snapshot(path: Path, scenario: str, known: Mapping[str, object]) -> dict[str, Any] | None:
+    """Return the values of a file; None without a file.
+
+    Raises
+    ------
+    RecordError
+        The file cannot be read or is damaged, or belongs to another scenario or version.
+    """
+    try:
+        octets = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RecordError(f"{path}: expected {_EXPECTED}, found {error.strerror}") from None
+    try:
+        return unpack_snapshot(octets, scenario, known)
+    except RecordError as error:
+        raise RecordError(f"{path}: {error}") from None
 
 
 class _Pickler(pickle.Pickler):
@@ -111,11 +160,15 @@ class _Unpickler(pickle.Unpickler):
         self._known = known
 
     def find_class(self, module_name: str, name: str) -> Any:
-        if (module_name, name) not in _NAMED and module_name.partition(".")[0] not in _PACKAGES:
+        if (module_name, name) in _NAMED:
+            return super().find_class(module_name, name)
+        if module_name.partition(".")[0] not in _PACKAGES:
             raise pickle.UnpicklingError(f"expected a class of this program, found {module_name}.{name}")
         found = super().find_class(module_name, name)
-        if (module_name, name) not in _NAMED and not isinstance(found, type):
-            raise pickle.UnpicklingError(f"expected a class, found {module_name}.{name}")
+        # A name with dots reaches what a module imports: the class itself has to be of this module.
+        is_class = isinstance(found, type)
+        if not is_class or (found.__module__, found.__qualname__) != (module_name, name):
+            raise pickle.UnpicklingError(f"expected a class of {module_name}, found {name}")
         return found
 
     def persistent_load(self, pid: str) -> object:
@@ -136,4 +189,6 @@ def _view(
     owner: NDArray[Any], offset: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: np.dtype[Any]
 ) -> NDArray[Any]:
     """Return a view of an array that owns its memory."""
+    if dtype.hasobject or owner.dtype.hasobject:
+        raise pickle.UnpicklingError("expected a view of numbers, found one of objects")
     return np.ndarray(shape, dtype, buffer=owner.data, offset=offset, strides=strides)
