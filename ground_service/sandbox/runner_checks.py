@@ -11,7 +11,10 @@ from ground_service.sandbox import launcher
 _PERMITTED = {5: "CAP_KILL", 6: "CAP_SETGID", 7: "CAP_SETUID", 8: "CAP_SETPCAP"}
 _NEEDED = (5, 6, 7)
 _SECRET_WORDS = ("PASSWORD", "SECRET", "TOKEN", "URL", "CREDENTIAL")
-_MEMORY_KINDS = ("tmpfs", "proc", "sysfs", "devpts", "mqueue", "cgroup", "cgroup2", "devtmpfs", "ramfs")
+_MEMORY_KINDS = (
+    *("tmpfs", "ramfs", "devtmpfs", "hugetlbfs"),
+    *("proc", "sysfs", "devpts", "mqueue", "cgroup", "cgroup2"),
+)
 # Files of the container engine, owned by root, which a build cannot change.
 _ENGINE_FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf", "/sbin/docker-init")
 _LISTENING = "0A"

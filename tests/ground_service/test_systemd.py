@@ -14,14 +14,21 @@ SERVICES = sorted(path.name for path in UNITS.glob("*.service"))
 EXPOSURE = 2.5
 """Highest exposure of a service by `systemd-analyze security`: 0 none, 10 that of a service without restrictions."""
 
+PRIVATE_PIDS_SINCE = 257
+"""First version of systemd that knows PrivatePIDs."""
+
 
 @pytest.fixture
 def units(tmp_path: Path) -> Path:
     """Copies of the units whose program exists."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("systemd-analyze is not installed")
+    told = subprocess.run(["systemd-analyze", "--version"], capture_output=True, text=True, check=True).stdout
+    version = int(told.split()[1])
     for path in UNITS.glob("linna*.*"):
         text = path.read_text().replace("/opt/linna/bin/linna", "/bin/true")
+        if version < PRIVATE_PIDS_SINCE:
+            text = text.replace("PrivatePIDs=yes\n", "")
         (tmp_path / path.name).write_text(text)
     return tmp_path
 
@@ -68,3 +75,29 @@ def test_secrets_are_credentials_of_the_units_that_need_them(name: str) -> None:
         }[name]
     )
     assert not re.search(r"(PASSWORD|TOKEN)=", text)
+
+
+def settings(name: str) -> dict[str, str]:
+    """Settings of a unit; of a repeated one, the last."""
+    lines = (UNITS / name).read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
+
+
+def test_the_runner_gets_what_it_requires() -> None:
+    """Requirements of `runner_faults`, as far as a unit states them."""
+    runner = settings("linna-runner.service")
+    assert runner["PrivateTmp"] == "no"
+    places = dict(place.split(":", 1) for place in runner["TemporaryFileSystem"].split())
+    assert places == {"/tmp": "size=2G,mode=1777", "/var/tmp": "size=1M,mode=1777"}
+    assert (runner["ProtectProc"], runner["ProcSubset"], runner["PrivatePIDs"]) == ("default", "all", "yes")
+    assert set(runner["CapabilityBoundingSet"].split()) == {"CAP_KILL", "CAP_SETGID", "CAP_SETUID"}
+    assert runner["NoNewPrivileges"] == runner["PrivateNetwork"] == runner["RestrictNamespaces"] == "yes"
+    assert runner["ProtectSystem"] == "strict" and "ReadWritePaths" not in runner
+    assert runner["StateDirectoryMode"] == "2770"
+    assert not {"EnvironmentFile", "LoadCredential"} & set(runner)
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_only_users_of_the_exchange_may_set_the_group_bit(name: str) -> None:
+    expected = "no" if name in ("linna-runner.service", "linna-worker@.service") else "yes"
+    assert settings(name)["RestrictSUIDSGID"] == expected
