@@ -7,19 +7,20 @@ unpacked, and no file is used whose hash is not the one in the manifest.
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import struct
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput, NotFound, storage_error
+from ground_service.errors import InvalidInput, NotFound, StoreError, storage_error
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.passes.archive_import import checked_files, read_manifest
@@ -40,6 +41,8 @@ from ground_service.store.files import (
     replace_durably,
     unfinished_prefix,
 )
+
+_log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
 _FILES_LOCK = "files of regression archives"
@@ -120,7 +123,7 @@ def check_archive(folder: Path) -> PassArchive:
     Raises
     ------
     InvalidInput
-        The archive is damaged or lacks an input of the payload.
+        The archive is damaged, lacks an input of the payload, or has detections besides all its frames.
     """
     manifest, digest = read_manifest(folder)
     names = set(checked_files(folder, manifest))
@@ -136,7 +139,11 @@ def check_archive(folder: Path) -> PassArchive:
                 str(folder), name, "a file of an archive that can be flown again", "nothing there"
             )
     rows = frame_inputs(folder)
-    lacking = [row["frame"] for row in rows if row["image"] and row["image"] not in names]
+    lacking = _lacking(rows, names)
+    if DETECTIONS in names and not lacking:
+        raise InvalidInput(
+            str(folder), DETECTIONS, "received detections only where frames are missing", "all frames"
+        )
     _check_images(folder, manifest, [row for row in rows if row["image"] in names])
     state, reason = COMPLETE, ""
     if lacking:
@@ -148,6 +155,11 @@ def check_archive(folder: Path) -> PassArchive:
                 "declares no scenario to render them from"
             )
     return PassArchive(folder, digest, manifest, len(rows), len(rows) - len(lacking), state, reason)
+
+
+def _lacking(rows: Sequence[Mapping[str, Any]], names: Collection[str]) -> list[int]:
+    """Return the frames that had an image which is not among the files of the archive."""
+    return [row["frame"] for row in rows if row["image"] and row["image"] not in names]
 
 
 def _check_images(folder: Path, manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
@@ -186,13 +198,15 @@ def pack_archive(folder: Path, target: Path) -> None:
 def write_flight_view(archive: Path, folder: Path) -> None:
     """Copy what the payload was given into a folder: manifest without truth, inputs, tables, parameters, images.
 
-    An archive with recorded detections is replayed without images.
+    An archive without all its frames is replayed from its received detections, without images.
     """
     manifest, _ = read_manifest(archive)
     folder.mkdir(parents=True)
-    folders = ("payload/",) if DETECTIONS in manifest["files"] else _FLIGHT_FOLDERS
-    for name in manifest["files"]:
-        if name.startswith(folders):
+    names = manifest["files"]
+    partial = DETECTIONS in names and bool(_lacking(frame_inputs(archive), names))
+    folders = ("payload/",) if partial else _FLIGHT_FOLDERS
+    for name in names:
+        if name.startswith(folders) and (partial or name != DETECTIONS):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(archive / name, folder / name)
     seen = {key: manifest[key] for key in _FLIGHT_KEYS if key in manifest}
@@ -241,15 +255,17 @@ def store_archive(
             pass_id=pass_id,
         )
         store.keep_archive(connection, record)
-        if pass_id is not None:
-            replaced = store.remove_replaced(connection, pass_id, archive.digest)
-            _remove_files(files, replaced, store.list_archives(connection))
+        replaced = [] if pass_id is None else store.remove_replaced(connection, pass_id, archive.digest)
+    _remove_files(ground, replaced)
 
 
 def restock_archive(ground: Ground, record: ArchiveRecord, archive: PassArchive) -> None:
-    """Replace the files and the state of a kept archive, unless another process has done so."""
+    """Replace the files and the state of a kept archive, unless nothing or another process has changed it."""
     files = store_of(ground)
     stored = _stored(files, archive)
+    found = (stored[MANIFEST].sha256, archive.state, archive.reason)
+    if found == (record.manifest_sha256, record.state, record.reason):
+        return
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
         _restore(files, archive.folder, stored)
@@ -347,20 +363,37 @@ def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
 
     Files that another archive holds too stay.
     """
-    files = store_of(ground)
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
         old = store.remove_unused(connection, utc_now_ns() - unused_for_ns)
-        _remove_files(files, old, store.list_archives(connection))
+    _remove_files(ground, old)
     return sorted(record.digest for record in old)
 
 
-def _remove_files(
-    files: FileArchive, removed: Sequence[ArchiveRecord], kept: Sequence[ArchiveRecord]
-) -> None:
-    """Remove the files of removed archives that no kept archive has."""
-    for sha256 in _held(files, removed) - _held(files, kept):
-        files.path(sha256).unlink(missing_ok=True)
+def _remove_files(ground: Ground, removed: Sequence[ArchiveRecord]) -> None:
+    """Remove the files of archives that were removed, after the commit, unless a kept archive has them.
+
+    Nothing is removed while the manifest of a kept archive cannot be read, because its files are not known.
+    """
+    if not removed:
+        return
+    files = store_of(ground)
+    unused: set[str] = set()
+    for record in removed:
+        try:
+            unused |= _held(files, record)
+        except (NotFound, StoreError) as error:
+            _log.warning("files of removed archive %s are not removed: %s", record.digest, error)
+    with ground.database.writing() as connection:
+        hold(connection, _FILES_LOCK)
+        try:
+            for record in store.list_archives(connection):
+                unused -= _held(files, record)
+        except (NotFound, StoreError) as error:
+            _log.warning("no files of archives are removed: kept archive %s: %s", record.digest, error)
+            return
+        for sha256 in unused:
+            files.path(sha256).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -386,13 +419,10 @@ def store_of(ground: Ground) -> FileArchive:
     return FileArchive(ground.home / "regression" / "files")
 
 
-def _held(files: FileArchive, records: Sequence[ArchiveRecord]) -> set[str]:
-    """Return the hashes of the files of archives, their manifests included."""
-    held = {record.manifest_sha256 for record in records}
-    for record in records:
-        manifest = json.loads(files.get(record.manifest_sha256))
-        held |= {entry["sha256"] for entry in manifest["files"].values()}
-    return held
+def _held(files: FileArchive, record: ArchiveRecord) -> set[str]:
+    """Return the hashes of the files of an archive, its manifest included."""
+    manifest = json.loads(files.get(record.manifest_sha256))
+    return {record.manifest_sha256, *(entry["sha256"] for entry in manifest["files"].values())}
 
 
 def _shown(record: ArchiveRecord) -> KeptArchive:

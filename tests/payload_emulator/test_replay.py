@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_service.regression.archives import check_archive
-from ground_service.regression.rendering import with_detections
+from ground_service.ground import open_ground
+from ground_service.regression.archives import check_archive, keep_archive
+from ground_service.regression.rendering import settle_archive, with_detections
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ParameterError, RecordError
 from payload_emulator.flight.payload import FlightParameters
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.emulator import emulate, file_entries
 from payload_emulator.session.parameter_file import (
     BuildParameters,
     flat_parameters,
@@ -33,7 +34,7 @@ from payload_emulator.session.replay import (
     replay_archive,
     stored_images,
 )
-from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.suite import SUITE, suite_scenarios
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
@@ -98,6 +99,29 @@ def test_the_flown_build_says_of_every_frame_what_it_said_in_flight(archive: Pat
     flown, again = ((folder / "downlink.cadu").read_bytes() for folder in (archive, tmp_path / "out"))
     for name in ("detections", "navigation_state", "frame_outcome"):
         assert packets_of(name, again) == packets_of(name, flown), name
+
+
+def test_the_service_renders_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:
+    """Of the files that a scenario can name, the renderer opens only those that the service refuses."""
+    shutil.rmtree(copy / "frames")
+    manifest = json.loads((copy / "manifest.json").read_text())
+    scenario = parse_scenario(manifest["scenario_toml"])
+    named = replace(
+        scenario,
+        detector=replace(scenario.detector, network="/nowhere/network.onnx"),
+        navigation=replace(
+            scenario.navigation, filter_gravity="/nowhere/field", anchoring_catalogue="/nowhere/table"
+        ),
+    )
+    manifest["scenario_toml"] = format_scenario(named)
+    manifest["files"] = file_entries(copy)
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with open_ground(tmp_path / "home") as ground:
+        kept = keep_archive(ground, copy)
+        assert kept.state == "to render" and kept.frames_stored < kept.frames
+        settled = settle_archive(ground, kept.digest)
+        assert (settled.state, settled.reason, settled.frames_stored) == ("complete", "", kept.frames)
+        assert list((tmp_path / "home/regression/scratch").iterdir()) == []
 
 
 def test_received_detections_replace_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -21,14 +22,21 @@ from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, store
-from ground_service.regression.archives import check_out, keep_archive, kept_archives
+from ground_service.regression.archives import (
+    check_out,
+    keep_archive,
+    kept_archives,
+    let_go,
+    store_of,
+    write_flight_view,
+)
 from ground_service.regression.builds import build_of
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
-from ground_service.regression.model import ArchiveRecord, Comparison
+from ground_service.regression.model import ArchiveRecord, Comparison, KeptReplay
 from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_pass, keep_pass
-from ground_service.regression.service import run_regression
+from ground_service.regression.service import find_replay, run_regression
 from linna.commands import regress
 from tests.ground_service.conftest import (
     SPACECRAFT,
@@ -39,6 +47,17 @@ from tests.ground_service.conftest import (
     write_manifest,
 )
 
+REPLAY = KeptReplay(
+    outcome="ok",
+    detail="",
+    downlink_sha256=None,
+    performance_sha256=None,
+    wall_s=1.0,
+    cpu_s=1.0,
+    peak_rss_mib=1.0,
+    isolation="",
+    machine="",
+)
 STOP = START + 600_000_000_000
 
 
@@ -303,6 +322,70 @@ def test_an_archive_that_cannot_be_rendered_is_settled_once(
     assert rendering.settle_archive(ground, first.digest, again=True) == first
     monkeypatch.setattr(rendering, "check_out", None)
     assert rendering.settle_archive(ground, first.digest) == first
+
+
+def test_an_unchanged_archive_keeps_its_replays(
+    ground: Ground, unrendered: Path, make_build: Callable
+) -> None:
+    digest = keep_archive(ground, unrendered).digest
+    rendering.settle_archive(ground, digest)
+    build = build_of(ground, str(make_build("good", {})))
+    with ground.database.writing() as connection:
+        store.keep_replay(connection, digest, build.digest, REPLAY, 0)
+    assert rendering.settle_archive(ground, digest, again=True).state == "telemetry only"
+    assert find_replay(ground, digest, build) == REPLAY
+
+
+def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
+    ground: Ground, flown: FlyablePass, tmp_path: Path
+) -> None:
+    folder = tmp_path / "pass"
+    shutil.copytree(flown.folder, folder)
+    (folder / "payload/detections.jsonl").write_text("")
+    changed(folder)
+    with pytest.raises(InvalidInput, match="received detections only where frames are missing"):
+        keep_archive(ground, folder)
+    write_flight_view(folder, tmp_path / "view")
+    assert (tmp_path / "view/frames/000000.png").is_file()
+    assert not (tmp_path / "view/payload/detections.jsonl").exists()
+    (folder / "frames/000001.png").unlink()
+    changed(folder)
+    write_flight_view(folder, tmp_path / "partial")
+    assert (tmp_path / "partial/payload/detections.jsonl").is_file()
+    assert not (tmp_path / "partial/frames").exists()
+
+
+def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_known(
+    either: Ground,
+    flown: FlyablePass,
+    unrendered: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    first, second = keep_archive(either, flown.folder), keep_archive(either, unrendered, pinned=True)
+    files = store_of(either)
+    own = flown.folder / "manifest.json"
+    manifest = files.path(hashlib.sha256(own.read_bytes()).hexdigest())
+    with monkeypatch.context() as failing, pytest.raises(OSError, match="commit"):
+
+        def fail(*_: Any) -> None:
+            raise OSError("commit")
+
+        failing.setattr("ground_service.store.audit.append_pending", fail)
+        let_go(either, unused_for_ns=0)
+    assert manifest.is_file() and len(kept_archives(either)) == 2
+    other = files.path(hashlib.sha256((unrendered / "manifest.json").read_bytes()).hexdigest())
+    other.rename(other.with_suffix(".lost"))
+    # An archive with an unreadable manifest hinders neither the keeping of others nor their removal.
+    assert keep_archive(either, flown.folder).digest == first.digest
+    assert let_go(either, unused_for_ns=0) == [first.digest]
+    assert manifest.is_file()
+    assert f"no files of archives are removed: kept archive {second.digest}" in caplog.text
+    other.with_suffix(".lost").rename(other)
+    keep_archive(either, flown.folder)
+    assert let_go(either, unused_for_ns=0) == [first.digest]
+    assert not manifest.is_file()
+    assert keep_archive(either, unrendered).digest == second.digest
 
 
 def test_an_archive_is_rendered_again_on_request(
