@@ -287,9 +287,12 @@ class Client(Connection):
             window_days=window_days,
         )
 
-    def add_monthly_report(self, spacecraft_id: int, month: str) -> MonthlyReport:
-        """Add the report of a month (YYYY-MM) of a spacecraft."""
-        return self._post(MonthlyReport, f"/spacecraft/{spacecraft_id}/monthly-reports/{_part(month)}")
+    def add_monthly_report(
+        self, spacecraft_id: int, month: str, *, instance: str = "flight"
+    ) -> MonthlyReport:
+        """Add the report of a month (YYYY-MM) of a spacecraft in one instance."""
+        path = f"/spacecraft/{spacecraft_id}/monthly-reports/{_part(month)}"
+        return self._post(MonthlyReport, path, instance=instance)
 
     def list_monthly_reports(self, *, spacecraft_id: int | None = None) -> Listing[MonthlyReport]:
         """List monthly reports, newest month first."""

@@ -20,6 +20,7 @@ E. B. Wilson, "Probable inference, the law of succession, and statistical infere
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -32,6 +33,8 @@ FALSE_ALARM_RATE = 0.01
 LEAST_PASSES = 5
 PERMUTATIONS = 1999
 _SEED = 20
+_BLOCK_VALUES = 500_000
+"""Values that are permuted at a time, which limits the memory."""
 
 METRICS = ("recall", "drift_percent", "median_error_m")
 ALTITUDE_EDGES_KM = (20.0, 30.0, 40.0)
@@ -141,9 +144,14 @@ def _splits(
         return []
     ranks = _ranks(values)
     statistic, split = _largest_cusum(ranks[None, :])
-    shuffled, _ = _largest_cusum(rng.permuted(np.tile(ranks, (permutations, 1)), axis=1))
-    # The margin makes equal statistics equal that differ by rounding.
-    p_value = (1 + int(np.count_nonzero(shuffled >= statistic[0] - 1e-9))) / (permutations + 1)
+    block = max(_BLOCK_VALUES // len(ranks), 1)
+    reached = 0
+    for first_row in range(0, permutations, block):
+        rows = min(block, permutations - first_row)
+        shuffled, _ = _largest_cusum(rng.permuted(np.tile(ranks, (rows, 1)), axis=1))
+        # The margin makes equal statistics equal that differ by rounding.
+        reached += int(np.count_nonzero(shuffled >= statistic[0] - 1e-9))
+    p_value = (1 + reached) / (permutations + 1)
     if p_value > alpha:
         return []
     at = int(split[0])
@@ -198,9 +206,11 @@ def rolling_counts(
     """
     counts: list[Mapping[str, int]] = []
     first = 0
-    for last, time_ns in enumerate(times_ns):
+    inside: Counter[str] = Counter()
+    for time_ns, status in zip(times_ns, statuses, strict=True):
+        inside[status] += 1
         while times_ns[first] <= time_ns - window_ns:
+            inside[statuses[first]] -= 1
             first += 1
-        inside = statuses[first : last + 1]
-        counts.append({name: inside.count(name) for name in sorted(set(inside))})
+        counts.append({name: count for name, count in sorted(inside.items()) if count})
     return counts

@@ -17,24 +17,13 @@ from reports.values import (
 
 def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
     """Return the report of a month as a value; it follows from the performance alone."""
-    bad = sum(one.not_met > 0 for one in found.requirements)
-    open_ = sum(one.met + one.not_met == 0 and one.limit is not None for one in found.requirements)
-    judged = [one for one in found.requirements if one.met + one.not_met]
-    if bad:
-        verdict, level = f"requirements not met in every pass: {bad} of {len(judged)} judged", "bad"
-    elif judged and not open_:
-        verdict, level = f"requirements met in every pass: {len(judged)} of {len(judged)} judged", "good"
-    else:
-        verdict, level = (
-            f"requirements judged: {len(judged)} of {len(found.requirements)}, none missed",
-            "caution",
-        )
+    verdict, level = _verdict(found)
     if found.changes:
         count = len(found.changes)
         verdict += f"; {count} {'change' if count == 1 else 'changes'} of level"
     levels = sorted({one.terrain for one in found.passes})
     return MonthlyReportValue(
-        title=f"Spacecraft {found.spacecraft_id}, {month}",
+        title=f"Spacecraft {found.spacecraft_id} ({found.instance or 'all instances'}), {month}",
         month=month,
         verdict=verdict,
         verdict_level=level,
@@ -84,11 +73,40 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
         window_days=found.window_days,
         false_alarm_rate=found.false_alarm_rate,
         provenance={
-            "reports": f"the newest report of each of {len(found.passes)} passes",
+            "reports": f"{_coverage(found)}; the newest report of each",
             "evidence levels": "; ".join(one or "not stated" for one in levels),
         },
         not_available={"data_sources": "stated in the reports of the passes"},
     )
+
+
+def _verdict(found: Performance) -> tuple[str, str]:
+    """Return verdict and level; it is good only if every pass is judged on every requirement with a limit."""
+    bad = sum(one.not_met > 0 for one in found.requirements)
+    judged = [one for one in found.requirements if one.met + one.not_met]
+    unknown = [one for one in found.requirements if one.limit is not None and one.unknown]
+    missing = found.passes_in_span - len(found.passes)
+    if bad:
+        verdict, level = f"requirements not met in every pass: {bad} of {len(judged)} judged", "bad"
+    elif judged and not unknown and not missing:
+        verdict, level = f"requirements met in every pass: {len(judged)} of {len(judged)} judged", "good"
+    else:
+        verdict, level = (
+            f"requirements judged: {len(judged)} of {len(found.requirements)}, none missed",
+            "caution",
+        )
+    if unknown:
+        worst = max(unknown, key=lambda one: one.unknown)
+        verdict += f"; {worst.name} not judged on {worst.unknown} of {worst.passes} passes"
+    if len(unknown) > 1:
+        verdict += f", {len(unknown) - 1} more not judged on every pass"
+    if missing:
+        verdict += f"; {_coverage(found)}"
+    return verdict, level
+
+
+def _coverage(found: Performance) -> str:
+    return f"{len(found.passes)} of {found.passes_in_span} passes have a report"
 
 
 def _headline(found: Performance) -> tuple[HeadlineFigure, ...]:

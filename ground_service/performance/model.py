@@ -80,6 +80,7 @@ class Performance(Entity):
     false_alarm_rate: float = Field(
         description="Probability that a constant level gives any change point", examples=[0.01]
     )
+    passes_in_span: int = Field(description="Number of passes in the span, with or without a report")
     passes: list[PassPerformance] = Field(description="Passes with a report, in order of time")
     groups: list[GroupFigures]
     changes: list[ChangePoint]
@@ -91,6 +92,7 @@ class MonthlyReport(Entity):
 
     id: str
     spacecraft_id: int
+    instance: str = Field(examples=["flight"])
     month: str = Field(examples=["2029-08"])
     passes: int
     verdict: str

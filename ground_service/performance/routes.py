@@ -13,6 +13,7 @@ from ground_service.http.requests import operations
 from ground_service.http.times import GivenTime
 from ground_service.performance import service
 from ground_service.performance.model import MonthlyReport, Performance
+from ground_service.store.vehicles import FLOWN
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
 
@@ -49,10 +50,10 @@ def get_performance(
 
 @reports.post("/spacecraft/{spacecraft_id}/monthly-reports/{month}", status_code=201)
 def add_monthly_report(
-    ground: GroundOf, _: Operator, spacecraft_id: Spacecraft, month: Month
+    ground: GroundOf, _: Operator, spacecraft_id: Spacecraft, month: Month, instance: InstanceName = FLOWN
 ) -> MonthlyReport:
-    """Add the report of a month; the same content gives the same report."""
-    return service.make_monthly_report(ground, spacecraft_id, month)
+    """Add the report of a month of one instance; the same content gives the same report."""
+    return service.make_monthly_report(ground, spacecraft_id, month, instance=instance)
 
 
 @reports.get("/monthly-reports")

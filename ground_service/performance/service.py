@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import calendar
 import hashlib
+import logging
 import math
 import re
 from collections.abc import Sequence
 from typing import Any
 
-from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput, NotFound
+from ground_service.clock import mission_now_ns, utc_now_ns
+from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping
 from ground_service.evaluation.model import PassFigures, StoredReport
 from ground_service.evaluation.report_overview import PREFERRED_ESTIMATORS
 from ground_service.ground import Ground
@@ -40,6 +41,7 @@ from ground_service.performance.model import (
     StoredMonthlyReport,
 )
 from ground_service.store.stored_files import register_file
+from ground_service.store.vehicles import FLOWN, get_vehicle
 from lunar.timescales import format_utc, parse_utc
 
 WINDOW_DAYS = 7.0
@@ -47,7 +49,9 @@ DAY_NS = 86_400_000_000_000
 NOT_STATED = "not stated"
 _MONTH = re.compile(r"^(2[0-9]{3})-(0[1-9]|1[0-2])$")
 
-Reported = tuple[PassRecord, StoredReport]
+Reported = tuple[PassRecord, StoredReport, PassFigures]
+
+log = logging.getLogger(__name__)
 
 
 def performance(
@@ -67,15 +71,22 @@ def performance(
         Instance of the spacecraft; None: all, imported passes included.
     window_days
         Length of the rolling window of the requirements.
+
+    Raises
+    ------
+    InvalidInput
+        There are too many passes in the span.
     """
     with ground.database.reading() as connection:
-        found = store.reported_passes(connection, spacecraft_id, instance, start_utc_ns, stop_utc_ns)
-    passes = [_pass_performance(record, report) for record, report in found]
+        stored, total = store.reported_passes(connection, spacecraft_id, instance, start_utc_ns, stop_utc_ns)
+    found = [(record, report, PassFigures.model_validate(report.summary)) for record, report in stored]
+    passes = [_pass_performance(*one) for one in found]
     return Performance(
         spacecraft_id=spacecraft_id,
         instance=instance,
         window_days=window_days,
         false_alarm_rate=FALSE_ALARM_RATE,
+        passes_in_span=total,
         passes=passes,
         groups=group_figures(passes),
         changes=_changes(passes),
@@ -83,8 +94,7 @@ def performance(
     )
 
 
-def _pass_performance(record: PassRecord, report: StoredReport) -> PassPerformance:
-    figures = PassFigures.model_validate(report.summary)
+def _pass_performance(record: PassRecord, report: StoredReport, figures: PassFigures) -> PassPerformance:
     conditions = figures.conditions
     names = [name for name in PREFERRED_ESTIMATORS if name in figures.navigation]
     judged = None if conditions is None else conditions.estimator
@@ -163,16 +173,19 @@ def _changes(passes: Sequence[PassPerformance]) -> list[ChangePoint]:
 
 
 def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequirement]:
-    """Return the requirements of the newest report over the window that ends at the newest pass."""
+    """Return the requirements of all reports over the window that ends at the newest pass.
+
+    Name, unit and limit are those of the newest report that has the requirement.
+    """
     if not found:
         return []
-    rows = [
-        {one.key: one for one in PassFigures.model_validate(report.summary).requirements}
-        for _, report in found
-    ]
-    times = [record.start_utc_ns for record, _ in found]
+    rows = [{one.key: one for one in figures.requirements} for _, _, figures in found]
+    times = [record.start_utc_ns for record, _, _ in found]
+    newest_of = {key: one for row in rows for key, one in row.items()}
+    order = dict.fromkeys(key for row in reversed(rows) for key in row)
     requirements = []
-    for key, newest in rows[-1].items():
+    for key in order:
+        newest = newest_of[key]
         statuses = [row[key].status if key in row else "unknown" for row in rows]
         counts = rolling_counts(times, statuses, window_ns)
         shares = [
@@ -202,31 +215,48 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequ
     return requirements
 
 
-def make_monthly_report(ground: Ground, spacecraft_id: int, month: str) -> MonthlyReport:
-    """Make the report of a month (YYYY-MM, UTC) of a spacecraft, and return it; the same content is stored once.
+def make_monthly_report(
+    ground: Ground, spacecraft_id: int, month: str, *, instance: str = FLOWN
+) -> MonthlyReport:
+    """Make the report of a month (YYYY-MM, UTC) of a spacecraft in one instance, and return it.
+
+    The same content is stored once.
 
     Raises
     ------
     InvalidInput
         This is not a month, or it has no pass with a report.
     """
+    found = _month(ground, spacecraft_id, instance, month)
+    if not found.passes:
+        raise InvalidInput(
+            f"monthly report of spacecraft {spacecraft_id} ({instance})",
+            month,
+            "passes with a report",
+            "none",
+        )
+    return _keep_monthly_report(ground, found, instance, month)
+
+
+def _month(ground: Ground, spacecraft_id: int, instance: str, month: str) -> Performance:
     start_utc_ns, stop_utc_ns = month_span(month)
-    found = performance(
+    return performance(
         ground,
         spacecraft_id,
+        instance=instance,
         start_utc_ns=start_utc_ns,
         stop_utc_ns=stop_utc_ns,
         window_days=(stop_utc_ns - start_utc_ns) / DAY_NS,
     )
-    if not found.passes:
-        raise InvalidInput(
-            f"monthly report of spacecraft {spacecraft_id}", month, "passes with a report", "none"
-        )
+
+
+def _keep_monthly_report(ground: Ground, found: Performance, instance: str, month: str) -> MonthlyReport:
     from reports.render import render_pages, to_json
 
     value = monthly_value(found, month)
     data = to_json(value).encode()
-    identity = hashlib.blake2b(f"{spacecraft_id} {month} ".encode() + data, digest_size=16).hexdigest()
+    said = f"{found.spacecraft_id} {instance} {month} ".encode()
+    identity = hashlib.blake2b(said + data, digest_size=16).hexdigest()
     with ground.database.reading() as connection:
         try:
             return _entity(store.get_monthly_report(connection, identity))
@@ -243,7 +273,8 @@ def make_monthly_report(ground: Ground, spacecraft_id: int, month: str) -> Month
             register_file(connection, file, "report", f"report of {month} ({kind})", now)
         report = StoredMonthlyReport(
             id=identity,
-            spacecraft_id=spacecraft_id,
+            spacecraft_id=found.spacecraft_id,
+            instance=instance,
             month=month,
             passes=len(found.passes),
             verdict=value.verdict,
@@ -256,34 +287,44 @@ def make_monthly_report(ground: Ground, spacecraft_id: int, month: str) -> Month
         return _entity(store.get_monthly_report(connection, identity))
 
 
-def make_due_report(ground: Ground, spacecraft_id: int) -> MonthlyReport | None:
+def make_due_report(ground: Ground, spacecraft_id: int, instance: str = FLOWN) -> MonthlyReport | None:
     """Make the report of the last complete month (mission time); None if this month has no pass with a report.
 
     Late data give a new report of this month.
     """
-    try:
-        return make_monthly_report(ground, spacecraft_id, last_month(utc_now_ns()))
-    except InvalidInput:
-        return None
+    month = last_month(mission_now_ns())
+    found = _month(ground, spacecraft_id, instance, month)
+    return _keep_monthly_report(ground, found, instance, month) if found.passes else None
 
 
-def make_due_reports(ground: Ground) -> list[dict[str, Any]]:
-    """Make the reports of the last complete month of all spacecraft; return their ids."""
+def make_due_reports(ground: Ground) -> tuple[list[dict[str, Any]], list[int]]:
+    """Make the reports of the last complete month of all flown spacecraft.
+
+    The first value has the reports. The second has the spacecraft whose report failed; the log states why.
+    """
     with ground.database.reading() as connection:
-        spacecraft = store.spacecraft_with_passes(connection)
-    made = [make_due_report(ground, one) for one in spacecraft]
-    return [
-        {"spacecraft_id": one.spacecraft_id, "month": one.month, "report": one.id}
-        for one in made
-        if one is not None
-    ]
+        spacecraft = store.spacecraft_with_passes(connection, FLOWN)
+    made: list[dict[str, Any]] = []
+    failed = []
+    for one in spacecraft:
+        try:
+            report = make_due_report(ground, one)
+        except (Stopping, DatabaseBusy):
+            raise
+        except Exception:  # one spacecraft does not keep the others from their reports
+            log.exception("monthly report of spacecraft %d: failed", one)
+            failed.append(one)
+        else:
+            if report is not None:
+                made.append({"spacecraft_id": one, "month": report.month, "report": report.id})
+    return made, failed
 
 
 def due_report_of_vehicle(ground: Ground, vehicle: int) -> MonthlyReport | None:
-    """Make the report of the last complete month of the spacecraft of a vehicle; see `make_due_report`."""
+    """Make the report of the last complete month of a vehicle; see `make_due_report`."""
     with ground.database.reading() as connection:
-        spacecraft = store.spacecraft_of_vehicle(connection, vehicle)
-    return make_due_report(ground, spacecraft)
+        found = get_vehicle(connection, vehicle)
+    return make_due_report(ground, found.ccsds_id, found.instance)
 
 
 def month_span(month: str) -> tuple[int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import Connection, func, select
 
+from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.store import newest_reports
 from ground_service.passes.model import PassRecord
@@ -13,6 +14,8 @@ from ground_service.store import repository
 _PASSES, _VEHICLES = repository.PASSES, repository.VEHICLES
 _MONTHLY = repository.MONTHLY_REPORTS
 _BLOCK = 500
+PASSES_LIMIT = 5000
+"""Largest number of passes in a span."""
 
 
 def reported_passes(
@@ -21,8 +24,16 @@ def reported_passes(
     instance: str | None,
     start_utc_ns: int | None,
     stop_utc_ns: int | None,
-) -> list[tuple[PassRecord, StoredReport]]:
-    """Return the passes of a spacecraft that begin in a span and have a report, with the newest one, by time."""
+) -> tuple[list[tuple[PassRecord, StoredReport]], int]:
+    """Return the passes of a spacecraft that begin in a span and have a report, with the newest one, by time.
+
+    The second value is the number of all passes in the span.
+
+    Raises
+    ------
+    InvalidInput
+        There are too many passes in the span.
+    """
     query = (
         select(_PASSES)
         .join(_VEHICLES, _VEHICLES.c.id == _PASSES.c.vehicle_id)
@@ -35,23 +46,23 @@ def reported_passes(
         query = query.where(_PASSES.c.start_utc_ns >= start_utc_ns)
     if stop_utc_ns is not None:
         query = query.where(_PASSES.c.start_utc_ns < stop_utc_ns)
+    total = int(connection.execute(select(func.count()).select_from(query.subquery())).scalar_one())
+    if total > PASSES_LIMIT:
+        expected = f"at most {PASSES_LIMIT} passes in the span from start to stop"
+        raise InvalidInput(f"performance of spacecraft {spacecraft_id}", "", expected, f"{total} passes")
     records = [PassRecord.of(row) for row in connection.execute(query).mappings()]
     reports: dict[int, StoredReport] = {}
     for first in range(0, len(records), _BLOCK):
         ids = [one.id for one in records[first : first + _BLOCK]]
         reports |= {one.pass_id: one for one in newest_reports(connection, ids)}
-    return [(one, reports[one.id]) for one in records if one.id in reports]
+    return [(one, reports[one.id]) for one in records if one.id in reports], total
 
 
-def spacecraft_with_passes(connection: Connection) -> list[int]:
-    """Return the spacecraft that have passes."""
+def spacecraft_with_passes(connection: Connection, instance: str) -> list[int]:
+    """Return the spacecraft that have passes in an instance."""
     query = select(_VEHICLES.c.ccsds_id).join(_PASSES, _PASSES.c.vehicle_id == _VEHICLES.c.id).distinct()
+    query = query.where(_VEHICLES.c.instance == instance)
     return [int(one) for one in connection.execute(query.order_by(_VEHICLES.c.ccsds_id)).scalars()]
-
-
-def spacecraft_of_vehicle(connection: Connection, vehicle: int) -> int:
-    """Return the spacecraft of a vehicle."""
-    return int(repository.get(connection, _VEHICLES, vehicle, "vehicle")["ccsds_id"])
 
 
 def add_monthly_report(connection: Connection, report: StoredMonthlyReport) -> bool:

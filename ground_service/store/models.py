@@ -553,6 +553,7 @@ MONTHLY_REPORTS = Table(
     METADATA,
     key("id", String(32)),
     column("spacecraft_id", Integer, index=True),
+    column("instance", String(96)),
     column("month", String(7)),
     column("passes", Integer),
     column("verdict", Text),
@@ -561,7 +562,7 @@ MONTHLY_REPORTS = Table(
     column("json_sha256", ForeignKey("files.sha256")),
     column("created_utc_ns", BigInteger),
 )
-"""A report of a month of a spacecraft; the id is the hash of its content."""
+"""A report of a month of a spacecraft in one instance; the id is the hash of its content."""
 
 
 PASS_FRAMES = Table(

@@ -1,4 +1,4 @@
-"""Nightly job: trends with limit checks, reports of the last complete month, and removal of what is no longer needed.
+"""Nightly job: removal of what is no longer needed, trends with limit checks, reports of the last complete month.
 
 The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
 (the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`, tokens of
@@ -40,7 +40,11 @@ def plan_job_id(utc_ns: int) -> str:
 
 
 def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
-    """Trends of every spacecraft, and what was taken away."""
+    """What was taken away, and trends and due reports of every spacecraft.
+
+    The removal is first, so that a failure of the rest does not make the archive grow.
+    """
+    removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
     with ground.database.reading() as connection:
         vehicles = all_vehicles(connection)
     found: list[dict[str, Any]] = []
@@ -58,9 +62,14 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     if broken:
         with ground.database.writing() as connection:
             publish(connection, LimitsBroken(broken=broken))
-    monthly = make_due_reports(ground)
-    removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
-    return {"spacecraft": found, "limits_broken": broken, "monthly_reports": monthly, "removed": removed}
+    monthly, failed = make_due_reports(ground)
+    return {
+        "spacecraft": found,
+        "limits_broken": broken,
+        "monthly_reports": monthly,
+        "monthly_reports_failed": failed,
+        "removed": removed,
+    }
 
 
 def broken_limits(ground: Ground, vehicle: int) -> list[dict[str, Any]]:

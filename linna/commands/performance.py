@@ -35,6 +35,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _finish(show, _show)
     report = commands.add_parser("report", help="write the report of a month as HTML, PDF and JSON")
     _spacecraft(report)
+    report.add_argument(
+        "--instance", default="flight", metavar="NAME", help="instance of the spacecraft (default: flight)"
+    )
     report.add_argument("--month", required=True, metavar="YYYY-MM", help="month (UTC)")
     report.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the documents of the report"
@@ -72,7 +75,8 @@ def _show(arguments: argparse.Namespace) -> int:
 
 def performance_lines(found: Performance) -> list[str]:
     """Return the performance as lines of text."""
-    lines = [f"{len(found.passes)} passes with a report"]
+    missing = found.passes_in_span - len(found.passes)
+    lines = [f"{len(found.passes)} passes with a report" + (f", {missing} without" if missing else "")]
     for one in found.groups:
         unit, scale, decimals = METRICS[one.metric]
         if one.mean is None:
@@ -100,7 +104,9 @@ def performance_lines(found: Performance) -> list[str]:
 
 def _report(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
-        made = service.add_monthly_report(arguments.spacecraft_id, arguments.month)
+        made = service.add_monthly_report(
+            arguments.spacecraft_id, arguments.month, instance=arguments.instance
+        )
         for kind in ("html", "pdf", "json"):
             service.get_monthly_report(made.id, arguments.out / f"report.{kind}", kind=kind)
     page = str(arguments.out / "report.html")
@@ -112,7 +118,7 @@ def _list(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         found = list(service.list_monthly_reports(spacecraft_id=arguments.spacecraft_id))
     lines = [
-        f"{one.month}  spacecraft {one.spacecraft_id}  {one.passes:4} passes  {one.verdict}  {one.id}"
+        f"{one.month}  spacecraft {one.spacecraft_id} ({one.instance})  {one.passes:4} passes  {one.verdict}  {one.id}"
         for one in found
     ]
     rows = [one.model_dump(mode="json") for one in found]

@@ -826,6 +826,7 @@ def upgrade() -> None:
         "monthly_reports",
         sa.Column("id", sa.String(length=32), nullable=False),
         sa.Column("spacecraft_id", sa.Integer(), nullable=False),
+        sa.Column("instance", sa.String(length=96), nullable=False),
         sa.Column("month", sa.String(length=7), nullable=False),
         sa.Column("passes", sa.Integer(), nullable=False),
         sa.Column("verdict", sa.Text(), nullable=False),

@@ -119,6 +119,7 @@ async function showPerformance() {
       "Monthly reports",
       [
         ["Month", (row) => row.month],
+        ["Instance", (row) => row.instance],
         ["Passes", (row) => figure(row.passes), "num"],
         ["Verdict", (row) => row.verdict],
         ["Report", (row) => element("a", { href: `/monthly-reports/${row.id}`, target: "_blank" }, "open")],

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from ground_service.performance import core
 from ground_service.performance.core import (
     ALTITUDE_EDGES_KM,
     FALSE_ALARM_RATE,
@@ -18,6 +19,7 @@ from ground_service.performance.core import (
     rolling_counts,
     wilson,
 )
+from lunar.arrays import FloatArray, IntArray
 
 NAN = math.nan
 
@@ -117,3 +119,19 @@ def test_a_rolling_window_excludes_passes_of_its_length_ago() -> None:
         {"met": 1, "not met": 1},
         {"met": 1, "not met": 1, "unknown": 1},
     ]
+
+
+def test_permutations_in_blocks_give_the_same_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(3).normal(size=60) + np.repeat([0.0, 3.0], 30)
+    whole = core.change_points(values.tolist(), permutations=301)
+    largest: list[int] = []
+    permuted = core._largest_cusum
+
+    def seen(ranks: FloatArray) -> tuple[FloatArray, IntArray]:
+        largest.append(ranks.size)
+        return permuted(ranks)
+
+    monkeypatch.setattr(core, "_largest_cusum", seen)
+    monkeypatch.setattr(core, "_BLOCK_VALUES", 700)
+    assert core.change_points(values.tolist(), permutations=301) == whole != []
+    assert max(largest) <= 700

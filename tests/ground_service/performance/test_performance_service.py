@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,18 @@ import pytest
 
 from ground_service.automation.service import list_actions
 from ground_service.client.local import local_client
+from ground_service.clock import set_mission_clock
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import add_report
-from ground_service.events import WindowChanged, publish
+from ground_service.events import WindowChanged, publish, read_events
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
+from ground_service.performance import service
+from ground_service.performance.documents import monthly_value
 from ground_service.performance.service import (
     last_month,
     list_monthly_reports,
@@ -30,8 +33,11 @@ from ground_service.performance.service import (
 )
 from ground_service.store import repository
 from ground_service.store.stored_files import register_file
+from ground_service.store.vehicles import FLOWN, vehicle_id
+from ground_service.worker import upkeep
 from ground_service.worker.upkeep import nightly
 from linna.cli import run
+from linna.commands.performance import performance_lines
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import ALTITUDE_M, SPACECRAFT, SyntheticPass
 
@@ -44,7 +50,7 @@ def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
     return make_pass(frames=30, seed=9)
 
 
-def add_pass(ground: Ground, number: int, **changes: Any) -> int:
+def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: Any) -> int:
     """Add a pass with a report, one a day."""
     start = FIRST + number * DAY_NS
     pass_id = define_pass(
@@ -53,6 +59,7 @@ def add_pass(ground: Ground, number: int, **changes: Any) -> int:
         start_utc_ns=start,
         stop_utc_ns=start + 10**12,
         spacecraft_id=SPACECRAFT,
+        instance=instance,
     )
     blob = ground.files.put_octets(b"x")
     values: dict[str, Any] = {
@@ -62,6 +69,8 @@ def add_pass(ground: Ground, number: int, **changes: Any) -> int:
         "altitude": 25.0,
         "status": "met",
         "build": "a",
+        "key": "accuracy.median",
+        "limit": 100.0,
         **changes,
     }
     errors = dict.fromkeys(("p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "end_of_pass_m"))
@@ -82,7 +91,7 @@ def add_pass(ground: Ground, number: int, **changes: Any) -> int:
         "verdict_level": "good",
         "requirements": [
             {
-                "key": "accuracy.median", "name": "median 3-D error", "value": values["error"], "limit": 100.0,
+                "key": values["key"], "name": "median 3-D error", "value": values["error"], "limit": values["limit"],
                 "relation": "<=", "unit": "m", "margin": 1.0, "status": values["status"], "note": "",
             }
         ],
@@ -97,7 +106,7 @@ def add_pass(ground: Ground, number: int, **changes: Any) -> int:
     with ground.database.writing() as connection:
         register_file(connection, blob, "report", "x", 1)
         report = StoredReport(
-            id=f"{number:032x}",
+            id=f"{pass_id:032x}",
             pass_id=pass_id,
             html_sha256=blob.sha256,
             json_sha256=blob.sha256,
@@ -187,10 +196,119 @@ def test_months() -> None:
 
 
 @pytest.fixture
-def september(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "ground_service.performance.service.utc_now_ns", lambda: parse_utc("2029-09-01T00:00:05Z")
+def september() -> Iterator[None]:
+    set_mission_clock(lambda: parse_utc("2029-09-01T00:00:05Z"))
+    yield
+    set_mission_clock(None)
+
+
+def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground) -> None:
+    for number in range(4):
+        add_pass(ground, number, status="met" if number == 3 else "unknown")
+    value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
+    assert value.verdict_level == "caution"
+    assert (
+        value.verdict
+        == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
     )
+
+
+def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
+    add_pass(ground, 0)
+    add_pass(ground, 1, key="other", limit=None, status="unknown")
+    add_pass(ground, 2)
+    found = performance(ground, SPACECRAFT, window_days=31.0)
+    value = monthly_value(found, "2029-08")
+    assert {one.key: (one.limit, one.unknown) for one in found.requirements} == {
+        "accuracy.median": (100.0, 1),
+        "other": (None, 3),
+    }
+    assert value.verdict.endswith("median 3-D error not judged on 1 of 3 passes")
+
+
+def test_requirements_that_the_newest_report_lacks_are_judged(ground: Ground) -> None:
+    add_pass(ground, 0, key="old", limit=50.0, status="not met")
+    add_pass(ground, 1, key="old", limit=60.0, status="not met")
+    add_pass(ground, 2)
+    found = performance(ground, SPACECRAFT)
+    rules = {one.key: (one.limit, one.met, one.not_met, one.unknown) for one in found.requirements}
+    assert rules == {"accuracy.median": (100.0, 1, 0, 2), "old": (60.0, 0, 2, 1)}
+    assert monthly_value(found, "2029-08").verdict_level == "bad"
+
+
+def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None:
+    add_pass(either, 0)
+    add_pass(either, 0, instance="replay", status="not met")
+    add_pass(either, 1, instance="replay", status="not met")
+    flown = make_monthly_report(either, SPACECRAFT, "2029-08")
+    replayed = make_monthly_report(either, SPACECRAFT, "2029-08", instance="replay")
+    assert (flown.instance, flown.passes, flown.verdict) == (
+        "flight", 1, "requirements met in every pass: 1 of 1 judged"
+    )  # fmt: skip
+    assert (replayed.instance, replayed.passes) == ("replay", 2)
+    assert len(performance(either, SPACECRAFT).passes) == 3
+
+
+def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: Ground) -> None:
+    add_pass(ground, 0)
+    assert monthly_value(performance(ground, SPACECRAFT), "2029-08").verdict_level == "good"
+    start = FIRST + DAY_NS
+    define_pass(ground, name="no", start_utc_ns=start, stop_utc_ns=start + 10**12, spacecraft_id=SPACECRAFT)
+    found = performance(ground, SPACECRAFT)
+    assert (found.passes_in_span, len(found.passes)) == (2, 1)
+    assert performance_lines(found)[0] == "1 passes with a report, 1 without"
+    value = monthly_value(found, "2029-08")
+    assert value.verdict_level == "caution"
+    assert value.verdict.endswith("; 1 of 2 passes have a report")
+
+
+def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ground_service.performance.store.PASSES_LIMIT", 2)
+    for number in range(3):
+        add_pass(ground, number)
+    with pytest.raises(InvalidInput, match=r"expected at most 2 passes .* found 3 passes"):
+        performance(ground, SPACECRAFT)
+    assert len(performance(ground, SPACECRAFT, start_utc_ns=FIRST + DAY_NS).passes) == 2
+
+
+def test_the_failed_report_of_a_spacecraft_leaves_the_others(
+    ground: Ground, september: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    add_pass(ground, 0)
+    with ground.database.writing() as connection:
+        other = vehicle_id(connection, 5, FLOWN)
+        row = dict(connection.execute(repository.PASSES.select()).mappings().one())
+        del row["id"]
+        repository.add(connection, repository.PASSES, **{**row, "vehicle_id": other, "name": "other"})
+    made = service.make_due_report
+
+    def broken(ground: Ground, spacecraft_id: int, instance: str = FLOWN) -> Any:
+        if spacecraft_id == 5:
+            raise InvalidInput("report", "", "a value", "none")
+        return made(ground, spacecraft_id, instance)
+
+    monkeypatch.setattr(service, "make_due_report", broken)
+    done = nightly(ground, {})
+    assert [one["spacecraft_id"] for one in done["monthly_reports"]] == [SPACECRAFT]
+    assert done["monthly_reports_failed"] == [5]
+    assert "monthly report of spacecraft 5: failed" in caplog.text
+
+
+def test_what_is_old_goes_before_anything_of_the_night_can_fail(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: Ground) -> None:
+        raise InvalidInput("report", "", "a value", "none")
+
+    monkeypatch.setattr(upkeep, "make_due_reports", fail)
+    with ground.database.writing() as connection:
+        for number in (1, 2):
+            publish(connection, WindowChanged(id=number, state="processed"))
+    with ground.database.writing() as connection:
+        connection.execute(repository.EVENT_LOG.update().values(utc_ns=0))
+    with pytest.raises(InvalidInput):
+        nightly(ground, {})
+    assert [one.number for one in read_events(ground.database, 0)] == [2]
 
 
 def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Ground, september: None) -> None:
@@ -233,13 +351,13 @@ def test_operations_and_commands_give_the_same_report(
 ) -> None:
     for number in range(14):
         add_pass(ground, number, **({"recall": 0.3} if number >= 7 else {}))
-    with local_client(ground, "ann") as service:
-        made = service.add_monthly_report(SPACECRAFT, "2029-08")
-        assert [one.id for one in service.list_monthly_reports(spacecraft_id=SPACECRAFT)] == [made.id]
-        assert list(service.list_monthly_reports(spacecraft_id=1)) == []
+    with local_client(ground, "ann") as client:
+        made = client.add_monthly_report(SPACECRAFT, "2029-08")
+        assert [one.id for one in client.list_monthly_reports(spacecraft_id=SPACECRAFT)] == [made.id]
+        assert list(client.list_monthly_reports(spacecraft_id=1)) == []
         for kind in ("html", "pdf", "json"):
-            service.get_monthly_report(made.id, tmp_path / f"api.{kind}", kind=kind)
-        found = service.get_performance(SPACECRAFT, start=str(UtcTime(FIRST)), window_days=3.0)
+            client.get_monthly_report(made.id, tmp_path / f"api.{kind}", kind=kind)
+        found = client.get_performance(SPACECRAFT, start=str(UtcTime(FIRST)), window_days=3.0)
         assert (len(found.passes), found.window_days) == (14, 3.0)
     page = (tmp_path / "api.html").read_text()
     assert "Changes of level" in page and "Monthly report" in page and "20 to 30 km" in page
