@@ -88,11 +88,25 @@ def queued_jobs(settings: Settings) -> list[str]:
     kombu.exceptions.OperationalError
         If the broker cannot be reached.
     """
+    from redis import RedisError
+
     app = _app_of(settings)
-    with app.connection_for_read() as connection:
-        connection.ensure_connection(max_retries=1, timeout=5)
-        messages = connection.default_channel.client.lrange(QUEUE, 0, -1)
-    return [str(json.loads(message)["headers"].get(JOB_HEADER)) for message in messages]
+    try:
+        with app.connection_for_read() as connection:
+            connection.ensure_connection(max_retries=1, timeout=5)
+            messages = connection.default_channel.client.lrange(QUEUE, 0, -1)
+    except RedisError as error:
+        raise OperationalError(str(error)) from error
+    return [job for job in map(_job_of, messages) if job is not None]
+
+
+def _job_of(message: bytes) -> str | None:
+    """Return the id of the job of a message in the queue; None for a message of another program."""
+    try:
+        job = json.loads(message).get("headers", {}).get(JOB_HEADER)
+    except (ValueError, AttributeError):
+        return None
+    return None if job is None else str(job)
 
 
 def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:

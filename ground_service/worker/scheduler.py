@@ -52,6 +52,7 @@ class Scheduler:
         self._ground, self._dispatcher, self._drain = ground, dispatcher, drain
         self._retention_days = retention_days
         self._catch_up_s = time.monotonic() + CATCH_UP_S
+        self._plan: str | None = None
         self._night: str | None = None
         self._since_utc_ns: int | None = None
         self._stopping = threading.Event()
@@ -90,12 +91,20 @@ class Scheduler:
             return False
         if self._since_utc_ns is None:
             log.info("this process does the recurring work", extra={"owner": self.owner})
-        self._dispatcher.resume()
-        self._drain()
-        self._note_timeouts()
-        self._enter_plan()
-        self._enter_night()
+        self._do("unfinished jobs", self._dispatcher.resume)
+        self._do("events of other processes", self._drain)
+        self._do("overdue telecommands", self._note_timeouts)
+        self._do("plan", self._enter_plan)
+        self._do("nightly job", self._enter_night)
         return True
+
+    def _do(self, name: str, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except GroundError as error:
+            log.warning("recurring work (%s) could not be done: %s", name, error)
+        except Exception as error:  # one faulty part must not stop the others
+            log.warning("recurring work (%s) could not be done: %s", name, error, exc_info=True)
 
     def _note_timeouts(self) -> None:
         until = utc_now_ns()
@@ -106,8 +115,10 @@ class Scheduler:
 
     def _enter_plan(self) -> None:
         """Enter the job of the plan once an hour of mission time."""
-        if needs_plan(self._ground):
-            self._dispatcher.submit("plan", {}, job_id=plan_job_id(mission_now_ns()))
+        identity = plan_job_id(mission_now_ns())
+        if identity != self._plan and needs_plan(self._ground):
+            self._dispatcher.submit("plan", {}, job_id=identity)
+            self._plan = identity
 
     def _enter_night(self) -> None:
         """Enter the nightly job once a day; it is one job however many processes enter it."""

@@ -103,5 +103,9 @@ def test_jobs_survive_a_broker_that_is_killed(
                 wait_for(lambda: not unfinished_jobs(ground), "every job", 180.0)
             finally:
                 worker.terminate()
-                worker.wait(60)
+                try:
+                    worker.wait(60)
+                except subprocess.TimeoutExpired:
+                    worker.kill()
+                    worker.wait()
         assert {(get_job(ground, job).state, get_job(ground, job).attempts) for job in jobs} == {("done", 1)}

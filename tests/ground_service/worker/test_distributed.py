@@ -7,7 +7,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -28,7 +30,8 @@ from ground_service.store.database import (
 )
 from ground_service.store.models import METADATA
 from ground_service.store.vehicles import vehicle_id
-from ground_service.worker.app import run_worker, worker_answers
+from ground_service.worker import app as app_module
+from ground_service.worker.app import queued_jobs, run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import _lock_key, run_job
 from tests.ground_service.archive_hash import archive_hash
@@ -173,8 +176,6 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     """The queue is emptied as if the broker had been killed; a job that somebody is doing is left to him."""
     import redis
 
-    from ground_service.worker.app import queued_jobs
-
     ground = ground_on_postgres
     settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
     dispatcher = dispatcher_for(ground, settings)
@@ -193,6 +194,37 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     dispatcher.resume()  # it waits already: nothing is added
     assert queued_jobs(settings) == waiting
     assert run_job(ground, lost).error == "pass 4712: not found"
+
+
+def test_messages_of_other_programs_in_the_queue_are_no_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = [b'{"headers": {"linna-job": "a1"}}', b"{}", b'{"headers": {}}', b"[1]", b"nothing"]
+    answered = SimpleNamespace(lrange=lambda *_: messages)
+    connection = MagicMock()
+    connection.__enter__.return_value.default_channel.client = answered
+    monkeypatch.setattr(
+        app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection)
+    )
+    assert queued_jobs(Settings(home=tmp_path)) == ["a1"]
+
+
+def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
+    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    import redis
+
+    client = MagicMock()
+    client.lrange.side_effect = redis.ConnectionError("reset by peer")
+    connection = MagicMock()
+    connection.__enter__.return_value.default_channel.client = client
+    connection.__exit__.return_value = False
+    monkeypatch.setattr(
+        app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection)
+    )
+    enter_job(ground, "report", {"pass_id": 1})
+    dispatcher_for(ground, Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")).resume()
+    assert "the broker is away: reset by peer" in caplog.text
 
 
 def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -> None:

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
 from ground_service.store import leases
 from ground_service.store.database import prepare_database
 from ground_service.worker import scheduler as scheduling
 from ground_service.worker.scheduler import LEASE, LEASE_NS, Scheduler, has_scheduler
-from ground_service.worker.upkeep import DAY_NS, nightly_job_id
+from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
 from linna import cli
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import wait_for
@@ -33,7 +34,7 @@ class Recorder:
         self.resumed += 1
 
     def submit(self, kind: str, arguments: object, *, job_id: str | None = None) -> str:
-        assert kind == "nightly"
+        assert kind in ("nightly", "plan")
         self.submitted.append(job_id)
         return str(job_id)
 
@@ -55,13 +56,14 @@ def by_day(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     (first, work_1), (second, work_2) = make(either), make(either)
+    now = [parse_utc("2029-08-07T00:00:00Z")]
+    monkeypatch.setattr(leases, "database_now_ns", lambda connection: now[0])
     assert not has_scheduler(either)
     assert first.tick() and not second.tick() and first.tick() and has_scheduler(either)
     assert (work_1.resumed, work_2.resumed) == (2, 0)
-    now = leases.database_now_ns
-    monkeypatch.setattr(leases, "database_now_ns", lambda connection: now(connection) + LEASE_NS // 2)
+    now[0] += LEASE_NS
     assert not second.tick()
-    monkeypatch.setattr(leases, "database_now_ns", lambda connection: now(connection) + 2 * LEASE_NS)
+    now[0] += 1
     assert not has_scheduler(either)
     assert second.tick() and not first.tick()
     assert (work_1.resumed, work_2.resumed) == (2, 1)
@@ -98,6 +100,37 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(
         one.tick()
         assert len(work.submitted) == entered, minute
     assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
+
+
+def test_the_plan_is_entered_once_an_hour_of_mission_time(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, work = make(ground)
+    monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
+    begin = parse_utc("2029-08-07T05:00:00Z")
+    for second, entered in ((0, 1), (10, 1), (3599, 1), (3600, 2), (3610, 2)):
+        now = begin + second * 1_000_000_000
+        monkeypatch.setattr(scheduling, "mission_now_ns", lambda now=now: now)
+        one.tick()
+        assert len(work.submitted) == entered, second
+    assert work.submitted == [plan_job_id(begin), plan_job_id(begin + 3_600_000_000_000)]
+
+
+@pytest.mark.parametrize("error", [StorageFull("database"), ConnectionError("refused")])
+def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
+    ground: Ground, error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, work = make(ground)
+    monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
+
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(work, "resume", fail)
+    assert one.tick() and len(work.submitted) == 1
+    assert [line.getMessage() for line in caplog.records if line.levelname == "WARNING"] == [
+        f"recurring work (unfinished jobs) could not be done: {error}"
+    ]
 
 
 def test_a_night_that_was_missed_is_made_up_for_after_a_while(
