@@ -76,6 +76,8 @@ class PassArchive:
         Frames that the payload was given, and those with a stored image.
     state, reason
         See `KeptArchive`.
+    manifest_sha256
+        SHA-256 of the manifest of a kept archive, which changes with its files; empty if the archive is not kept.
     """
 
     folder: Path
@@ -85,6 +87,7 @@ class PassArchive:
     frames_stored: int
     state: str = COMPLETE
     reason: str = ""
+    manifest_sha256: str = ""
 
     @property
     def name(self) -> str:
@@ -349,6 +352,7 @@ def archive_of(ground: Ground, record: ArchiveRecord, folder: Path) -> PassArchi
         record.frames_stored,
         record.state,
         record.reason,
+        record.manifest_sha256,
     )
 
 

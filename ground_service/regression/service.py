@@ -132,11 +132,26 @@ def fly_shards(
 
 
 def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
-    """One build over one kept archive: done now, or what was kept of an earlier time."""
-    known = find_replay(ground, digest, build)
-    if known is not None and is_done(known):
-        return known
-    settle_archive(ground, digest)
+    """One build over one kept archive: done now, or what was kept of an earlier time.
+
+    A replay of an archive that was completed meanwhile is done again.
+    """
+    while True:
+        known = find_replay(ground, digest, build)
+        if known is not None and is_done(known):
+            return known
+        settle_archive(ground, digest)
+        replay, manifest_sha256 = _replayed(ground, digest, build)
+        if _keep(ground, digest, build, replay, manifest_sha256):
+            return replay
+        with ground.database.reading() as connection:
+            if store.find_archive(connection, digest) is None:
+                return replay  # removed meanwhile, which the verdict reports
+        ground.check_stopping()
+
+
+def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, str]:
+    """Replay a kept archive; return the result, and the hash of the manifest that the archive had."""
     with working_folder(ground) as folder:
         archive = check_out(ground, digest, folder / "archive")
         refusal = _other_camera(build, archive) or _unreplayable(archive, (build,))
@@ -152,7 +167,7 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
                 isolation="",
                 machine=_machine(),
             )
-            return _keep(ground, digest, build, refused)
+            return refused, archive.manifest_sha256
         run = run_build(build, archive.folder, folder / "out", runner=ground.runner, private=(ground.home,))
         outcome, detail = run.outcome, run.detail
         stored: dict[str, str | None] = {"downlink": None, "performance": None}
@@ -170,22 +185,18 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
             stored["downlink"] = store_of(ground).put_octets(octets).sha256
         if run.performance is not None:
             stored["performance"] = store_of(ground).put_file(folder / "out" / PERFORMANCE).sha256
-        return _keep(
-            ground,
-            digest,
-            build,
-            KeptReplay(
-                outcome=outcome,
-                detail=detail,
-                downlink_sha256=stored["downlink"],
-                performance_sha256=stored["performance"],
-                wall_s=run.wall_s,
-                cpu_s=run.cpu_s,
-                peak_rss_mib=run.peak_rss_mib,
-                isolation=run.isolation,
-                machine=_machine(),
-            ),
+        replay = KeptReplay(
+            outcome=outcome,
+            detail=detail,
+            downlink_sha256=stored["downlink"],
+            performance_sha256=stored["performance"],
+            wall_s=run.wall_s,
+            cpu_s=run.cpu_s,
+            peak_rss_mib=run.peak_rss_mib,
+            isolation=run.isolation,
+            machine=_machine(),
         )
+        return replay, archive.manifest_sha256
 
 
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
@@ -373,6 +384,12 @@ def _gates(
 
 
 def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseline: Build) -> PassVerdict:
+    try:
+        # The state that the replays belong to: the archive may have been completed since it was kept.
+        with ground.database.reading() as connection:
+            archive = archive_of(ground, store.get_archive(connection, archive.digest), archive.folder)
+    except GroundError as error:
+        return PassVerdict(archive.name, archive.digest, "unusable", str(error))
     reason = _unreplayable(archive, (baseline, candidate))
     if reason:
         return PassVerdict(archive.name, archive.digest, NOT_JUDGED, reason)
@@ -407,11 +424,16 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
     return read_downlink(context, files.get(replay.downlink_sha256), performance, replay.peak_rss_mib)
 
 
-def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay) -> KeptReplay:
-    """Store a replay; a successful replay is never replaced by a concurrent one of another worker."""
+def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay, manifest_sha256: str) -> bool:
+    """Store a replay; return whether the archive still has this manifest.
+
+    A successful replay is never replaced by a concurrent one of another worker.
+    """
     with ground.database.writing() as connection:
-        store.keep_replay(connection, digest, build.digest, replay, utc_now_ns())
-    return replay
+        now = utc_now_ns()
+        return store.keep_replay(
+            connection, digest, build.digest, replay, now, manifest_sha256=manifest_sha256
+        )
 
 
 def _other_camera(build: Build, archive: PassArchive) -> str:

@@ -161,9 +161,25 @@ def remove_unused(connection: Connection, used_before_utc_ns: int) -> list[Archi
 
 
 def keep_replay(
-    connection: Connection, archive: str, build: str, replay: KeptReplay, now_utc_ns: int
-) -> None:
-    """Store a replay of a build over an archive; an unsuccessful one does not replace a successful one."""
+    connection: Connection,
+    archive: str,
+    build: str,
+    replay: KeptReplay,
+    now_utc_ns: int,
+    *,
+    manifest_sha256: str,
+) -> bool:
+    """Store a replay of a build over an archive; an unsuccessful one does not replace a successful one.
+
+    Returns
+    -------
+    bool
+        Whether the kept archive still has this manifest; nothing is stored otherwise. The row is locked until the
+        transaction ends, so that `restock_archive` either precedes the replay or removes it.
+    """
+    found = {"manifest_sha256": manifest_sha256}
+    if not change_if(connection, ARCHIVES, archive, found, used_utc_ns=now_utc_ns):
+        return False
     identity, values = replay_id(archive, build), replay.model_dump()
     added = repository.add_new(
         connection,
@@ -178,6 +194,7 @@ def keep_replay(
         replaceable = [] if replay.outcome == OK else [REPLAYS.c.outcome != OK]
         query = update(REPLAYS).where(REPLAYS.c.id == identity, *replaceable)
         connection.execute(query.values(**values))
+    return True
 
 
 def find_replay(connection: Connection, archive: str, build: str) -> KeptReplay | None:

@@ -18,6 +18,7 @@ from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
 from ground_service.performance.service import make_due_reports
+from ground_service.regression.archives import remove_unfinished
 from ground_service.store import events
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
@@ -99,5 +100,7 @@ def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
             "answers": delete_answers(connection, before),
             "sessions": delete_ended_sessions(connection, now),
         }
-    removed["files"] = ground.files.remove_leftovers() + remove_leftovers(ground.home, UNPACKING)
+    removed["files"] = (
+        ground.files.remove_leftovers() + remove_leftovers(ground.home, UNPACKING) + remove_unfinished(ground)
+    )
     return removed

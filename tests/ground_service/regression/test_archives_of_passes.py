@@ -21,8 +21,9 @@ from ground_service.http.times import UtcTime
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
-from ground_service.regression import rendering, store
+from ground_service.regression import rendering, service, store
 from ground_service.regression.archives import (
+    PassArchive,
     check_out,
     keep_archive,
     kept_archives,
@@ -331,9 +332,41 @@ def test_an_unchanged_archive_keeps_its_replays(
     rendering.settle_archive(ground, digest)
     build = build_of(ground, str(make_build("good", {})))
     with ground.database.writing() as connection:
-        store.keep_replay(connection, digest, build.digest, REPLAY, 0)
+        manifest = store.get_archive(connection, digest).manifest_sha256
+        assert store.keep_replay(connection, digest, build.digest, REPLAY, 0, manifest_sha256=manifest)
     assert rendering.settle_archive(ground, digest, again=True).state == "telemetry only"
     assert find_replay(ground, digest, build) == REPLAY
+
+
+def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
+    either: Ground,
+    unrendered: Path,
+    flown: FlyablePass,
+    make_build: Callable,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    digest = keep_archive(either, unrendered).digest
+    assert rendering.settle_archive(either, digest).state == "telemetry only"
+    build = build_of(either, str(make_build("good", {"synthetic pass 5": flown.packets})))
+    replayed, seen = service._replayed, []
+
+    def render(_ground: Ground, _archive: PassArchive, out: Path) -> str:
+        shutil.copytree(flown.folder, out)
+        return ""
+
+    def completed_meanwhile(ground: Ground, digest: str, build: Any) -> Any:
+        result = replayed(ground, digest, build)
+        seen.append(result[0].outcome)
+        if len(seen) == 1:
+            rendering.settle_archive(ground, digest, again=True)
+        return result
+
+    monkeypatch.setattr(rendering, "_render", render)
+    monkeypatch.setattr(service, "_replayed", completed_meanwhile)
+    assert service.do_replay(either, digest, build).outcome == "ok"
+    assert seen == ["refused", "ok"]
+    kept = find_replay(either, digest, build)
+    assert kept is not None and kept.outcome == "ok"
 
 
 def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(

@@ -16,6 +16,7 @@ from ground_service.jobs.service import enter_job
 from ground_service.passes.core import downsample
 from ground_service.passes.service import spacecraft_trends
 from ground_service.passes.trends import trend_of
+from ground_service.regression.archives import working_folder
 from ground_service.store import repository
 from ground_service.store.events import publish
 from ground_service.worker.jobs import run_job
@@ -71,7 +72,17 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
         ground.files.root.mkdir(exist_ok=True)
         (ground.files.root / name).write_bytes(b"")
     os.utime(ground.files.root / ".incoming-old", (0, 0))
-    assert tidy(ground, 90) == {"events": 2, "jobs": 0, "answers": 1, "sessions": 0, "files": 1}
+    regression = ground.home / "regression"
+    (regression / "files").mkdir(parents=True)
+    (regression / "files/.incoming-old").write_bytes(b"")
+    (regression / "scratch/.working-old/archive").mkdir(parents=True)
+    for name in ("files/.incoming-old", "scratch/.working-old"):
+        os.utime(regression / name, (0, 0))
+    with working_folder(ground) as in_use:
+        removed = tidy(ground, 90)
+        assert in_use.is_dir()
+    assert removed == {"events": 2, "jobs": 0, "answers": 1, "sessions": 0, "files": 3}
+    assert [path.name for path in (regression / "scratch").iterdir()] == []
     assert [item.number for item in read_events(ground.database, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.page(connection, repository.AUDIT).total == 1
