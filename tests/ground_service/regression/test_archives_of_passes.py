@@ -427,8 +427,8 @@ def test_an_archive_is_rendered_again_on_request(
     digest = keep_archive(ground, unrendered).digest
     assert rendering.settle_archive(ground, digest).state == "telemetry only"
 
-    def render(_ground: Ground, folder: Path, out: Path) -> str:
-        assert not (folder / "payload/detections.jsonl").exists()
+    def render(_ground: Ground, given: PassArchive, out: Path) -> str:
+        assert not (given.folder / "payload/detections.jsonl").exists()
         shutil.copytree(flown.folder, out)
         return ""
 
