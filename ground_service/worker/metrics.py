@@ -21,6 +21,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ground_service.ground import Ground
+from ground_service.jobs.service import KINDS
 from ground_service.tracing import span
 from ground_service.worker.condition import read_condition
 
@@ -59,6 +60,9 @@ class Metrics:
         self._free = self._gauge("linna_disk_free_bytes", "Free space of the archive's file system")
         self._size = self._gauge("linna_disk_size_bytes", "Size of the archive's file system")
         self._scheduler = self._gauge("linna_scheduler", "Processes that do the recurring work: 1 or 0")
+        self._backed_up = self._gauge(
+            "linna_backup_configured", "Whether LINNA_BACKUPS names a folder: 1 or 0"
+        )
         self._backup = self._gauge("linna_backup_age_seconds", "Age of the newest backup", ("folder",))
         self._correlation = self._gauge(
             "linna_time_correlation_age_seconds",
@@ -81,10 +85,14 @@ class Metrics:
         self._free.set(now.disk_free)
         self._size.set(now.disk_size)
         self._scheduler.set(float(now.scheduler is not None))
+        self._backed_up.set(float(self._backups is not None))
         if self._backups is not None and now.backup_age_s is not None:
             self._backup.labels(str(self._backups)).set(now.backup_age_s)
         for (number, instance), age_s in now.correlation_ages_s.items():
             self._correlation.labels(str(number), instance).set(age_s)
+        # The first failure of a kind is an increase only if there was a 0 before.
+        for kind in KINDS:
+            self._jobs.labels(kind, "failed").set(0)
         for (kind, state), count in counts.jobs.items():
             self._jobs.labels(kind, state).set(count)
         for state, count in counts.ingests.items():

@@ -616,7 +616,11 @@ def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
         ground = opened.app.state.ground
         job = enter_job(ground, "report", {"pass_id": 1})
-        assert 'linna_jobs{kind="report",state="queued"} 1.0' in opened.get("/metrics").text
+        figures = opened.get("/metrics").text
+        assert 'linna_jobs{kind="report",state="queued"} 1.0' in figures
+        assert 'linna_jobs{kind="report",state="failed"} 0.0' in figures
+        assert 'linna_jobs{kind="plan",state="failed"} 0.0' in figures
+        assert "linna_backup_configured 0.0" in figures and "linna_backup_age_seconds{" not in figures
         run_job(ground, job)
         figures = opened.get("/metrics").text
     assert 'linna_jobs{kind="report",state="failed"} 1.0' in figures

@@ -118,6 +118,14 @@ def test_the_api_believes_the_proxy_and_nobody_else() -> None:
     assert not default_of(subnet).endswith("/0")
 
 
+def test_prometheus_in_the_inner_network_may_name_the_api() -> None:
+    hosts = SERVICES["api"]["environment"]["LINNA_ALLOWED_HOSTS"]
+    assert default_of(hosts).split(",") == ["localhost", "api"]
+    command = SERVICES["api"]["command"]
+    target = f"api:{command[command.index('--port') + 1]}"
+    assert f"`{target}`" in (ROOT / "docs/deployment.md").read_text()
+
+
 def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None:
     backup = SERVICES["backup"]
     assert backup["profiles"] == ["backup"] and backup["restart"] == "no"

@@ -171,16 +171,58 @@ def test_the_status_names_what_has_to_be_looked_after(change: dict[str, Any], sa
 
 
 FIRING = {
+    "LinnaDown": ('up{job="linna"}', "1x5 0x20", "20m"),
+    "LinnaBackupOld": ("linna_backup_age_seconds", "90000+60x200", "180m"),
     "LinnaNoScheduler": ("linna_scheduler", "1x5 0x20", "20m"),
     "LinnaQueueOld": ("linna_queue_age_seconds", "0+60x40", "40m"),
     "LinnaIngestLag": ("linna_ingest_lag_seconds", "0+60x40", "40m"),
-    "LinnaJobsFailed": ('linna_jobs{state="failed",kind="report"}', "2x20 3x20", "40m"),
+    "LinnaJobsFailed": ('linna_jobs{state="failed",kind="report"}', "0x20 1x20", "40m"),
     "LinnaTimeCorrelationOld": (
         'linna_time_correlation_age_seconds{spacecraft_id="76",instance="flight"}',
         "172000+60x120",
         "120m",
     ),
 }
+
+
+def expectation(expression: str, at: str, labels: str, value: float) -> dict[str, Any]:
+    return {"expr": expression, "eval_time": at, "exp_samples": [{"labels": labels, "value": value}]}
+
+
+def replicas_test(healthy: list[dict[str, str]]) -> dict[str, Any]:
+    """One of two API processes fails, and both count the same failed job: no call, and one failure."""
+    series, up = 'linna_jobs{state="failed",kind="report"', 'up{job="linna"'
+    others = [one for one in healthy if not one["series"].startswith((series, up))]
+    added = [
+        {"series": up + ',instance="a"}', "values": "1x200"},
+        {"series": up + ',instance="b"}', "values": "0x200"},
+        {"series": series + ',instance="a"}', "values": "0x20 1x180"},
+        {"series": series + ',instance="b"}', "values": "0x20 1x180"},
+    ]
+    failed = 'ALERTS{alertstate="firing",alertname="LinnaJobsFailed"}'
+    (rule,) = (one["expr"] for one in alerts() if one["alert"] == "LinnaJobsFailed")
+    return {
+        "interval": "1m",
+        "input_series": [*others, *added],
+        "promql_expr_test": [
+            expectation('count(ALERTS{alertname="LinnaDown"}) or vector(0)', "20m", "{}", 0),
+            expectation(f"count({failed})", "70m", "{}", 1),
+            expectation(f"round({rule})", "70m", '{kind="report", state="failed"}', 1),
+            expectation(f"count({failed}) or vector(0)", "150m", "{}", 0),
+        ],
+    }
+
+
+def backup_tests(healthy: list[dict[str, str]]) -> Iterator[dict[str, Any]]:
+    """Without a backup there is an alert if a folder is configured, otherwise none."""
+    others = [one for one in healthy if not one["series"].startswith("linna_backup")]
+    for configured in (0, 1):
+        firing = 'count(ALERTS{alertstate="firing",alertname="LinnaBackupOld"}) or vector(0)'
+        yield {
+            "interval": "1m",
+            "input_series": [*others, {"series": "linna_backup_configured", "values": f"{configured}x200"}],
+            "promql_expr_test": [expectation(firing, "150m", "{}", configured)],
+        }
 
 
 def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
@@ -195,6 +237,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
         {"series": 'up{job="linna"}', "values": "1x200"},
         {"series": "linna_scheduler", "values": "1x200"},
         {"series": "linna_backup_age_seconds", "values": "3600x200"},
+        {"series": "linna_backup_configured", "values": "1x200"},
         {"series": "linna_queue_age_seconds", "values": "30x200"},
         {"series": "linna_disk_free_bytes", "values": "50x200"},
         {"series": "linna_disk_size_bytes", "values": "100x200"},
@@ -227,6 +270,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
                 ],
             }
         )
+    tests += [replicas_test(healthy), *backup_tests(healthy)]
     document = {"rule_files": [str(RULES)], "evaluation_interval": "1m", "tests": tests}
     (tmp_path / "tests.yml").write_text(yaml.safe_dump(document))
     done = subprocess.run(
