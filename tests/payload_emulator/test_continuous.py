@@ -88,7 +88,8 @@ class Ground:
         self._telemetry = self._connect("telemetry madrid")
         self._telecommand = self._connect("telecommand madrid")
         self._console = self._connect("console")
-        self._threads = [threading.Thread(target=self._receive), threading.Thread(target=self._operate)]
+        works = (self._receive, self._operate)
+        self._threads = [threading.Thread(target=one, daemon=True) for one in works]
         for thread in self._threads:
             thread.start()
 
@@ -144,11 +145,14 @@ def flown(
     """Fly a session for some hours from its epoch, with a client."""
     stop = EPOCH + round(hours * HOUR_NS)
     session = ContinuousSession(scenario, DataFolder(None), holds=True, stop_utc_ns=stop, **options)
-    thread = threading.Thread(target=session.run)
+    thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
-    ground = Ground(session, act)
-    thread.join(120)
-    assert not thread.is_alive()
+    try:
+        ground = Ground(session, act)
+        thread.join(120)
+        assert not thread.is_alive()
+    finally:
+        session.stopping.set()
     ground.close()
     return session, ground
 
@@ -342,14 +346,17 @@ def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path:
 
 def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
     session = ContinuousSession(scenario(), DataFolder(None), paused=True, ends_with_console=True)
-    thread = threading.Thread(target=session.run)
+    thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
-    with socket.create_connection(("127.0.0.1", session.ports["console"])) as console:
-        console.sendall(b"state\n")
-        assert json.loads(console.makefile("r").readline())["kind"] == "state"
-        assert thread.is_alive()
-    thread.join(20)
-    assert not thread.is_alive()
+    try:
+        with socket.create_connection(("127.0.0.1", session.ports["console"])) as console:
+            console.sendall(b"state\n")
+            assert json.loads(console.makefile("r").readline())["kind"] == "state"
+            assert thread.is_alive()
+        thread.join(120)
+        assert not thread.is_alive()
+    finally:
+        session.stopping.set()
 
 
 def test_a_damaged_or_foreign_state_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -103,13 +103,15 @@ class Watcher:
 def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, Watcher]]:
     world, loaded = flown
     live = LivePayload(world, new_spacecraft(world, loaded), rate=0.0, paused=True)
-    thread = threading.Thread(target=live.run)
+    thread = threading.Thread(target=live.run, daemon=True)
     watcher = Watcher(live)
     thread.start()
-    yield live, watcher
-    live.stopping.set()
-    thread.join(20.0)
-    watcher.close()
+    try:
+        yield live, watcher
+    finally:
+        live.stopping.set()
+        thread.join(120.0)
+        watcher.close()
     assert not thread.is_alive()
 
 
