@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from linna import cli
 from lunar.datafolder import DataFolder
-from payload_emulator.errors import ScenarioError
+from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.figures import contacts_until, trend
 from studies.mission_run.ground import EmbeddedGround
-from studies.mission_run.run import RunTerms, run_mission
+from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
 
 SCENARIO = """
 name = "half-a-day"
@@ -42,12 +43,20 @@ estimators = ["spherical"]
 TERMS = RunTerms(days=0.5, windows_per_day=1, window_s=600.0)
 
 
+def of_mission_time(incidents: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [one for one in incidents if one["kind"] != "link"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_path: Path) -> None:
     said: list[str] = []
     figures = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     windows = figures["windows"]
     assert windows["requested"] == windows["flown"] == windows["processed"] == figures["reports"] == 1
-    assert windows["failed"] == 0 and figures["incidents"] == []
+    assert windows["failed"] == 0 and figures["reports_without_frames"] == 0
+    # Losses of links have times of the wall clock: a loaded computer may have some, from which the run recovers.
+    assert of_mission_time(figures["incidents"]) == []
     assert figures["packets_lost"] == 0 and figures["packets_received"] == figures["packets"] > 0
     (flown,) = figures["trend"]
     assert 38 <= flown["frames"] <= 42  # 600 s / 15 s
@@ -71,6 +80,52 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
         run_mission(
             parse_scenario(SCENARIO), DataFolder(None), tmp_path, replace(TERMS, days=0.75), said.append
         )
+
+
+class Uplink:
+    """A spacecraft that keeps orders, and a ground that has sent 40 octets."""
+
+    def __init__(self) -> None:
+        self.orders: list[str] = []
+
+    def order(self, word: str) -> None:
+        self.orders.append(word)
+
+    def octets_sent(self) -> dict[str, int]:
+        return {"madrid": 40}
+
+
+def state(octets: int) -> dict[str, Any]:
+    return {"kind": "state", "uplinked": {"madrid": octets}}
+
+
+@pytest.mark.parametrize(
+    ("said", "error"),
+    [
+        ([{"kind": "error", "text": "out of memory"}, state(40)], "spacecraft: out of memory"),
+        ([state(10)], "expected its state, found its end"),
+        ([state(10)] * 3, r"sent \({'madrid': 40}\) within 0 s, found {'madrid': 10}"),
+        ([{"kind": "paused"}, state(40)], None),
+    ],
+)
+def test_a_wait_for_octets_at_the_spacecraft_ends_with_an_error_or_with_all(
+    said: list[dict[str, Any]], error: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("studies.mission_run.run.SOCKET_S", 0.0 if len(said) == 3 else 60.0)
+    run = MissionRun(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, print)
+    both: Any = Uplink()
+    with nullcontext() if error is None else pytest.raises(LinkError, match=error):
+        run._wait_uplinked(both, both, iter(said))
+    assert set(both.orders) == {"state"}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"posts": [], "unknown": 1}', '{"posts": [1]}', '{"posts": null}']
+)
+def test_the_folder_of_another_version_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "progress.json").write_text(text)
+    with pytest.raises(ScenarioError, match=r"progress.json: expected .* start the run in a new folder$"):
+        _read_progress(tmp_path / "progress.json")
 
 
 def test_a_trend_needs_three_known_values() -> None:
@@ -158,8 +213,9 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     assert any("continues from 2029-08-07T" in line for line in lines)
     assert again["starts"] == 2 and again["interventions"] == 0
     differ = {
-        "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "interventions_list",
+        "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "interventions_list", "incidents",
     }  # fmt: skip
     assert {key: value for key, value in again.items() if key not in differ} == {
         key: value for key, value in whole.items() if key not in differ
     }
+    assert of_mission_time(again["incidents"]) == of_mission_time(whole["incidents"])

@@ -38,8 +38,8 @@ LAST_NS = 4 * 3600 * NS
 CHECKPOINT_S = 60.0
 """Wall time between two checkpoints."""
 
-SOCKET_S = 10.0
-"""Longest wait for octets that were sent to reach the spacecraft; what is lost the ground sends again."""
+SOCKET_S = 60.0
+"""Longest wait for octets that were sent to reach the spacecraft."""
 
 COUNTED = (
     "frames", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
@@ -238,11 +238,17 @@ class MissionRun:
     ) -> None:
         """Wait until the stations of the spacecraft, whose time stands still, have what the links have sent."""
         until = time.monotonic() + SOCKET_S
-        while time.monotonic() < until:
+        while True:
             spacecraft.order("state")
-            found = next(one for one in messages if one["kind"] == "state")["uplinked"]
-            if all(found.get(name, 0) >= count for name, count in ground.octets_sent().items()):
+            found = _next_state(messages)["uplinked"]
+            sent = ground.octets_sent()
+            if all(found.get(name, 0) >= count for name, count in sent.items()):
                 return
+            if time.monotonic() >= until:
+                raise LinkError(
+                    f"spacecraft: expected the octets of telecommands that were sent ({sent}) "
+                    f"within {SOCKET_S:.0f} s, found {found}"
+                )
             time.sleep(POLL_S)
 
     def _post(self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, dynamics: FlightDynamics) -> None:
@@ -361,9 +367,25 @@ class MissionRun:
         new_file.replace(self._progress_file)
 
 
+def _next_state(messages: Iterator[dict[str, Any]]) -> dict[str, Any]:
+    """Return the next message with the state of the spacecraft, whose time stands still."""
+    message = next((one for one in messages if one["kind"] in ("state", "error")), None)
+    if message is None:
+        raise LinkError("spacecraft: expected its state, found its end")
+    if message["kind"] == "error":
+        raise LinkError(f"spacecraft: {message['text']}")
+    return message
+
+
 def _read_progress(path: Path) -> Progress:
-    stated = json.loads(path.read_text())
-    return Progress(**{**stated, "posts": [(first, last) for first, last in stated["posts"]]})
+    try:
+        stated = json.loads(path.read_text())
+        return Progress(**{**stated, "posts": [(first, last) for first, last in stated["posts"]]})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ScenarioError(
+            f"{path}: expected the progress of a run of this version of the program, found another file "
+            f"({type(error).__name__}: {error}); start the run in a new folder"
+        ) from None
 
 
 __all__ = ["GroundError", "RunTerms", "run_mission"]
