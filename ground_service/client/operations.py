@@ -15,6 +15,7 @@ from ground_service.automation.model import AutomationAction, RuleInForce
 from ground_service.client.connection import Body, Connection, Listing, new_key
 from ground_service.client.problems import JobFailed
 from ground_service.commanding.model import Telecommand, UplinkState
+from ground_service.displays.model import Display, DisplaySummary
 from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
@@ -29,7 +30,9 @@ from ground_service.passes.model import (
     Detection,
     Event,
     ExportFormat,
+    Image,
     LiveParameter,
+    ParameterInfo,
     ParameterSeries,
     PassDetail,
     PassParameters,
@@ -253,6 +256,46 @@ class Client(Connection):
     def list_spacecraft(self) -> list[SpacecraftInstance]:
         """List the spacecraft in all instances, flown ones first."""
         return self._all(SpacecraftInstance, "/spacecraft")
+
+    def list_spacecraft_parameters(
+        self, spacecraft_id: int, *, instance: str = "flight"
+    ) -> Listing[ParameterInfo]:
+        """List the parameters of a spacecraft with series."""
+        path = f"/spacecraft/{spacecraft_id}/parameters"
+        return self._list(ParameterInfo, path, paged=False, instance=instance)
+
+    def list_images(
+        self, spacecraft_id: int, start: str, stop: str, *, instance: str = "flight"
+    ) -> Listing[Image]:
+        """List the images of an interval: downlinked thumbnails, and frames of pass archives."""
+        path = f"/spacecraft/{spacecraft_id}/images"
+        return self._list(Image, path, paged=False, start=start, stop=stop, instance=instance)
+
+    def get_thumbnail(
+        self, spacecraft_id: int, ticks: int, target: Path, *, instance: str = "flight"
+    ) -> None:
+        """Download a downlinked thumbnail as PNG into a file."""
+        self._download(f"/spacecraft/{spacecraft_id}/thumbnails/{ticks}", target, instance=instance)
+
+    def get_image(self, pass_id: int, frame_number: int, target: Path, *, detections: bool = False) -> None:
+        """Download a frame of a pass archive as PNG into a file."""
+        self._download(f"/passes/{pass_id}/images/{frame_number}", target, detections=detections)
+
+    def list_displays(self) -> Listing[DisplaySummary]:
+        """List the stored objects of the telemetry displays."""
+        return self._list(DisplaySummary, "/displays")
+
+    def get_display(self, key: str) -> Display:
+        """Return a stored object of the telemetry displays."""
+        return self._get(Display, f"/displays/{_part(key)}")
+
+    def keep_display(self, key: str, display: Body) -> Display:
+        """Store an object of the telemetry displays; `version` is the one that it replaces."""
+        return self._call(Display, "PUT", f"/displays/{_part(key)}", body=display)
+
+    def delete_display(self, key: str) -> None:
+        """Delete a stored object of the telemetry displays."""
+        self._octets("DELETE", f"/displays/{_part(key)}")
 
     def list_live_parameters(self, spacecraft_id: int, *, instance: str = "flight") -> list[LiveParameter]:
         """List the newest value of every parameter, with its age and limit state."""

@@ -244,6 +244,7 @@ def test_a_failed_job_is_an_exception_with_its_error() -> None:
     job = {
         "id": "0" * 32, "kind": "ingest", "state": "failed", "progress": 0.0, "attempts": 1, "arguments": {},
         "result": None, "error": "no downlink", "created": "2029-08-07T00:00:00Z", "started": None, "finished": None,
+        "traceparent": None,
     }  # fmt: skip
     with pytest.raises(JobFailed, match="no downlink"):
         client_of(lambda _: httpx.Response(200, json=job)).wait("0" * 32)
@@ -344,7 +345,7 @@ ARGUMENTS: dict[str, Any] = {
     "file": b"octets", "definition": {"a": 1}, "constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
     "plan": {"a": 1}, "request": {"a": 1}, "points": [{"a": 1}], "receptions": [{"a": 1}], "arguments": {"a": 1},
     "parameter": "temperature_c", "report_id": "0" * 32, "regression_id": "0" * 32, "job_id": "0" * 32,
-    "revision": "0" * 64, "role": "viewer", "name": "ann", "reason": "wrong cadence",
+    "revision": "0" * 64, "display": {"a": 1}, "key": "0", "role": "viewer", "name": "ann", "reason": "wrong cadence",
 }  # fmt: skip
 
 

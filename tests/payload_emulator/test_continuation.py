@@ -72,12 +72,12 @@ def test_a_live_session_takes_images_after_the_scenario() -> None:
     told: list[int] = []
 
     class Watched(LivePayload):
-        def _tell(self, flown) -> None:
+        def _send_frame(self, flown) -> None:
             if flown.moment.frame >= 0:
                 told.append(flown.moment.frame)
             if flown.moment.utc_ns > int(world.frame_utc_ns[-1]) + 900 * NS:
                 self.stopping.set()
-            LivePayload._tell(self, flown)
+            LivePayload._send_frame(self, flown)
 
     live = Watched(world, new_spacecraft(world, loaded), rate=0.0)
     thread = threading.Thread(target=live.run)

@@ -248,7 +248,7 @@ def test_telecommands_and_telemetry_of_the_live_payload_take_the_light_time(
     monkeypatch.setattr(Server, "send", lambda server, octets: sent.append(octets) or None)
     with selectors.DefaultSelector() as selector:
         live._take_telecommands(UplinkEncoder(0x4C).encode([ping(3)]))
-        live._tell(Flown(Moment(EPOCH, -1, 1.0, True, 1 << 20), None, b"", [ping(1)], bytes(4)))
+        live._send_frame(Flown(Moment(EPOCH, -1, 1.0, True, 1 << 20), None, b"", [ping(1)], bytes(4)))
         live._serve(selector, 0.0)
         assert not sent and not live._orders
         clock[0] += 1.27
