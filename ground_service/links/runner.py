@@ -47,12 +47,17 @@ INCOMING = "incoming"
 
 @dataclass(slots=True)
 class _Progress:
-    """Octets of the link in this process: received, and of these ingested; sent."""
+    """Octets of the link in this process: received, and of these ingested; sent.
+
+    `heard_utc_ns` is the mission time of the newest reception, `empty_utc_ns` the one before the newest look at the
+    connection that found nothing. Octets that wait unread are no silence, however late they are read.
+    """
 
     received: int = 0
     ingested: int = 0
     sent: int = 0
     heard_utc_ns: int | None = None
+    empty_utc_ns: int | None = None
     cut_utc_ns: dict[str, int] = field(default_factory=dict)
 
 
@@ -102,7 +107,11 @@ class LinkRunner:
     def is_settled(self) -> bool:
         """Whether no contact is open that was silent for so long that it has to end."""
         heard = self._progress.heard_utc_ns
-        return self._contact is None or heard is None or not self._silent(heard, mission_now_ns())
+        return (
+            self._contact is None
+            or heard is None
+            or not core.is_silent(heard, mission_now_ns(), self._silence_s)
+        )
 
     @property
     def alive(self) -> bool:
@@ -194,13 +203,17 @@ class LinkRunner:
         if self._block is None:
             if not self._down.connected:
                 self._acknowledged = 0
+            before = mission_now_ns()
             if not self._down.connect():
+                self._progress.empty_utc_ns = before
                 self._stopping.wait(TICK_S)
                 return
             if self._progress.received - self._progress.ingested >= SPOOL_LIMIT_OCTETS:
                 self._stopping.wait(TICK_S)  # the flow control of TCP holds the station back
                 return
             self._block = self._down.receive(POLL_S)
+            if self._block is None:
+                self._progress.empty_utc_ns = before
         octets = self._block
         if octets is None:
             idle = self._progress.received - self._spool.size <= self._progress.ingested
@@ -228,7 +241,7 @@ class LinkRunner:
         """Note a reception now; after a silence it starts a new contact."""
         now = mission_now_ns()
         heard = self._progress.heard_utc_ns
-        if self._contact is not None and heard is not None and self._silent(heard, now):
+        if self._contact is not None and heard is not None and self._was_silent_since(heard):
             self._cut()
             self._finish_contact(heard, wait=True)
         if self._contact is None:
@@ -237,7 +250,7 @@ class LinkRunner:
 
     def _follow_contact(self) -> None:
         now, heard = mission_now_ns(), self._progress.heard_utc_ns
-        if self._contact is not None and heard is not None and self._silent(heard, now):
+        if self._contact is not None and heard is not None and self._was_silent_since(heard):
             self._cut()
             self._finish_contact(heard, wait=False)
         if time.monotonic() - self._missed_s >= MISSED_S and self._contact is None:
@@ -256,8 +269,13 @@ class LinkRunner:
         service.end_contact(self._ground, self._contact.id, self._name, stop_utc_ns)
         self._contact = None
 
-    def _silent(self, heard: int, now: int) -> bool:
-        return core.is_silent(heard, now, self.declared.link.silence_s)
+    @property
+    def _silence_s(self) -> float:
+        return self.declared.link.silence_s
+
+    def _was_silent_since(self, heard: int) -> bool:
+        empty = self._progress.empty_utc_ns
+        return empty is not None and core.is_silent(heard, empty, self._silence_s)
 
     def _send(self) -> None:
         if self._up is None:

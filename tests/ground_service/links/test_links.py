@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.links import service, store
+from ground_service.links.runner import LinkRunner
 from ground_service.links.stream import ACKNOWLEDGEMENT
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
@@ -214,6 +216,63 @@ def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_conta
             )
         sent = packets_of(bytes(station.telecommands))
     assert sent == octets_of(ground, keys) * service.REPEAT_ATTEMPTS
+
+
+class Socket:
+    """A connection that returns what the test has put in, or nothing."""
+
+    connected = True
+    fault = None
+
+    def __init__(self) -> None:
+        self.blocks: list[bytes] = []
+
+    def connect(self) -> bool:
+        return True
+
+    def receive(self, _seconds: float) -> bytes | None:
+        return self.blocks.pop(0) if self.blocks else None
+
+    def close(self) -> None:
+        pass
+
+
+def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Station, stream: bytes) -> None:
+    """A process that was held up finds octets of the whole time: their contact goes on, and no frame is cut."""
+    declare(ground, station.link())
+    declared = service.declared_links(ground)["lab"]
+    assert service.acquire(ground, declared, "me", 3_600_000_000_000)
+    runner, line, now = LinkRunner(ground, declared, "me"), Socket(), [utc_now_ns()]
+    set_mission_clock(lambda: now[0])
+    ingesting = threading.Thread(target=runner._ingest_all, daemon=True)
+    try:
+        runner._open()
+        ingesting.start()
+        runner._down = line  # type: ignore[assignment]
+        line.blocks = [stream[: 2 * CADU + 100]]
+        runner._receive()
+        now[0] += 3600 * 10**9
+        line.blocks = [stream[2 * CADU + 100 : 4 * CADU]]
+        runner._receive()
+        runner._follow_contact()
+        assert contact_events(ground) == ["contact started"]
+        now[0] += 3600 * 10**9
+        runner._receive()  # finds nothing
+
+        def ended() -> bool:
+            runner._follow_contact()
+            return contact_events(ground) == ["contact started", "contact ended"]
+
+        until(ended, "the end of the contact")
+    finally:
+        set_mission_clock(None)
+        runner._stopping.set()
+        runner._cut_all.set()
+        runner._work.set()
+        ingesting.join(60.0)
+        runner._spool.seal()
+        if runner._lock is not None:
+            runner._lock.close()
 
 
 def test_expired_telecommands_are_not_sent(ground: Ground, station: Station, stream: bytes) -> None:
