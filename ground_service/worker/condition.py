@@ -15,7 +15,7 @@ from ground_service.store import leases
 from ground_service.worker.backup import MANIFEST
 from ground_service.worker.model import CorrelationAge, ServiceStatus
 from ground_service.worker.scheduler import LEASE
-from ground_service.worker.store import WorkCounts, count_work, newest_correlations
+from ground_service.worker.store import WorkCounts, count_work, newest_correlations, vehicles_received
 from lunar.timescales import parse_utc
 
 QUEUE_AGE_LIMIT_S = 900.0
@@ -41,6 +41,10 @@ class Condition:
     backup_age_s: float | None
     correlation_ages_s: dict[tuple[int, str], float]
     scheduler: str | None
+    backup_missing: bool = False
+    """A folder of backups is set, and no complete backup is in it."""
+    uncorrelated: tuple[int, ...] = ()
+    """Flown spacecraft with received telemetry and without any time correlation."""
 
 
 def read_condition(ground: Ground, backups: Path | None) -> Condition:
@@ -48,6 +52,7 @@ def read_condition(ground: Ground, backups: Path | None) -> Condition:
     with ground.database.reading() as connection:
         counts = count_work(connection)
         correlations = newest_correlations(connection)
+        received = vehicles_received(connection, FLIGHT)
         scheduler = leases.owner_of(connection, LEASE)
     now = utc_now_ns()
     disk = shutil.disk_usage(ground.home)
@@ -65,6 +70,8 @@ def read_condition(ground: Ground, backups: Path | None) -> Condition:
         None if newest is None else age_s(newest),
         {vehicle: age_s(utc_ns) for vehicle, utc_ns in correlations.items()},
         scheduler,
+        backup_missing=backups is not None and newest is None,
+        uncorrelated=tuple(one for one in received if (one, FLIGHT) not in correlations),
     )
 
 
@@ -79,8 +86,11 @@ def complaints(found: Condition) -> list[str]:
         said.append(f"An ingest has been unfinished for {found.ingest_lag_s:.0f} s.")
     if found.disk_free < DISK_FREE_LIMIT * found.disk_size:
         said.append(f"{found.disk_free / found.disk_size:.0%} of the disk of the archive are free.")
+    if found.backup_missing:
+        said.append("No backup was found.")
     if found.backup_age_s is not None and found.backup_age_s > BACKUP_AGE_LIMIT_S:
         said.append(f"The newest backup is {found.backup_age_s / 3600.0:.0f} h old.")
+    said += [f"Spacecraft {number} has no time correlation." for number in found.uncorrelated]
     for (number, instance), age_s in sorted(found.correlation_ages_s.items()):
         if instance == FLIGHT and age_s > CORRELATION_AGE_LIMIT_S:
             said.append(f"The time correlation of spacecraft {number} is {age_s / 3600.0:.0f} h old.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, Connection, func, select
+from sqlalchemy import ColumnElement, Connection, exists, func, select
 
 from ground_service.store import repository
 
@@ -37,6 +37,14 @@ def count_work(connection: Connection) -> WorkCounts:
         oldest(jobs.created_utc_ns, jobs.state == "queued"),
         oldest(ingests.received_utc_ns, ingests.state.not_in(("done", "failed"))),
     )
+
+
+def vehicles_received(connection: Connection, instance: str) -> list[int]:
+    """Return the numbers of the spacecraft from which telemetry was received in an instance."""
+    vehicles, packets = repository.VEHICLES.c, repository.PACKETS.c
+    received = exists().where(packets.vehicle_id == vehicles.id)
+    query = select(vehicles.ccsds_id).where(vehicles.instance == instance, received)
+    return [int(one) for one in connection.execute(query.order_by(vehicles.ccsds_id)).scalars()]
 
 
 def newest_correlations(connection: Connection) -> dict[tuple[int, str], int]:

@@ -156,6 +156,8 @@ GOOD = condition.Condition(WorkCounts({}, {}, 0, None, None), 0.0, 0.0, 50, 100,
         ({"queue_age_s": 901.0}, "A job has waited for 901 s."),
         ({"ingest_lag_s": 601.0}, "An ingest has been unfinished for 601 s."),
         ({"disk_free": 9}, "9% of the disk of the archive are free."),
+        ({"backup_missing": True}, "No backup was found."),
+        ({"uncorrelated": (76,)}, "Spacecraft 76 has no time correlation."),
         ({"backup_age_s": 97_200.0}, "The newest backup is 27 h old."),
         (
             {"correlation_ages_s": {(76, "flight"): 180_000.0, (76, "replay"): 1e9}},
@@ -295,10 +297,12 @@ def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass
         connection.execute(jobs.update().where(jobs.c.id == done).values(created_utc_ns=now - 9000 * S))
         connection.execute(ingests.update().values(state="running", received_utc_ns=now - 2000 * S))
         connection.execute(repository.CORRELATIONS.delete())
+    assert read_condition(either, None).uncorrelated == (76,)
     add_correlation(either, vehicle, now - 5000 * S)
     add_correlation(either, vehicle, now - 4000 * S)
     seen = read_condition(either, None)
     assert 1000.0 <= seen.queue_age_s < 2000.0 <= seen.ingest_lag_s < 3000.0
+    assert idle.uncorrelated == seen.uncorrelated == ()
     ((key, age_s),) = seen.correlation_ages_s.items()
     assert key == (76, "flight") and 4000.0 <= age_s < 5000.0
 
@@ -315,6 +319,8 @@ def test_the_status_counts_jobs_of_all_kinds_by_state(either: Ground) -> None:
 
 def test_the_newest_complete_backup_counts(ground: Ground, tmp_path: Path) -> None:
     assert newest_backup_utc_ns(tmp_path / "none") is None
+    assert read_condition(ground, tmp_path / "none").backup_missing
+    assert not read_condition(ground, None).backup_missing
     for name, made in (("a", 3000 * S), ("b", 2000 * S)):
         backup(ground, tmp_path / "backups" / name, now_utc_ns=made)
     (tmp_path / "backups" / "c").mkdir()
