@@ -6,6 +6,9 @@ folder="${LINNA_WAL:-/wal}"
 keep=2
 name="$(date -u +%Y%m%dT%H%M%SZ)"
 mkdir -p "$folder/base"
+# Nothing stays of a backup that fails or is stopped.
+trap 'rm -rf "${folder:?}/base/.$name.partial"' EXIT
+trap 'exit 1' HUP INT TERM
 pg_basebackup --pgdata "$folder/base/.$name.partial" --checkpoint fast "$@"
 pg_verifybackup --quiet "$folder/base/.$name.partial"
 date -u +%Y%m%dT%H%M%SZ > "$folder/base/.$name.partial/.ended"

@@ -24,8 +24,12 @@ secret admin_token "${LINNA_ADMIN_TOKEN:-}"
 if [ ! -s "$folder/tls_certificate" ] || [ ! -s "$folder/tls_key" ]; then
   name="${LINNA_HOST_NAME:-localhost}"
   rm -f "$folder/tls_certificate" "$folder/tls_key"
-  openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=$name" \
-    -addext "subjectAltName=DNS:$name,IP:127.0.0.1" -keyout "$folder/tls_key" -out "$folder/tls_certificate" 2>/dev/null
+  said="$(openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=$name" \
+    -addext "subjectAltName=DNS:$name,IP:127.0.0.1" -keyout "$folder/tls_key" -out "$folder/tls_certificate" 2>&1)" || {
+    rm -f "$folder/tls_certificate" "$folder/tls_key"
+    printf 'secrets: no certificate was made for %s:\n%s\n' "$name" "$said" >&2
+    exit 1
+  }
   chmod 444 "$folder/tls_certificate" "$folder/tls_key"
 fi
 echo "secrets are in $folder; the token of the user admin is in $folder/admin_token"

@@ -212,6 +212,36 @@ def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept
     assert {path.name: path.read_text() for path in folder.iterdir()} == made
 
 
+def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    (programs / "openssl").write_text("#!/bin/sh\necho 'a reason' >&2\nexit 1\n")
+    (programs / "openssl").chmod(0o755)
+    done = subprocess.run(
+        ["sh", str(ROOT / "deploy/secrets.sh")],
+        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS_DIR": str(tmp_path / "secrets")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1 and "secrets are in" not in done.stdout
+    assert "no certificate was made for localhost:\na reason" in done.stderr
+
+
+def test_nothing_stays_of_a_base_backup_that_fails(tmp_path: Path) -> None:
+    programs, wal = tmp_path / "programs", tmp_path / "wal"
+    programs.mkdir()
+    (programs / "pg_basebackup").write_text('#!/bin/sh\nmkdir -p "$2" && echo part > "$2/file"\nexit 1\n')
+    (programs / "pg_basebackup").chmod(0o755)
+    done = subprocess.run(
+        ["sh", str(ROOT / "deploy/base-backup.sh")],
+        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_WAL": str(wal)},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 1 and list((wal / "base").iterdir()) == []
+
+
 def test_there_is_a_second_worker_and_a_second_scheduler() -> None:
     assert SERVICES["scheduler"]["scale"] == 2 and default_of(SERVICES["worker"]["scale"]) == "2"
     assert SERVICES["scheduler"]["command"] == ["scheduler"]

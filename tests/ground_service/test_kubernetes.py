@@ -148,3 +148,16 @@ def test_the_backup_cannot_change_the_archive() -> None:
     assert mount["readOnly"] is True
     (url,) = (one["value"] for one in container["env"] if one["name"] == "LINNA_DATABASE_URL")
     assert url.startswith("postgresql+psycopg://linna_backup@")
+
+
+def test_the_ingress_refuses_metrics_and_health() -> None:
+    (ingress,) = (one for one in RESOURCES if one["kind"] == "Ingress")
+    (rule,) = ingress["spec"]["rules"]
+    backends = {
+        (path["path"], path["pathType"]): path["backend"]["service"]["name"] for path in rule["http"]["paths"]
+    }
+    assert backends.pop(("/", "Prefix")) == "linna-api"
+    assert backends == {(f"/{name}", "Exact"): "linna-refused" for name in ("metrics", "healthz", "readyz")}
+    services = {one["metadata"]["name"]: one["spec"] for one in RESOURCES if one["kind"] == "Service"}
+    assert "selector" not in services["linna-refused"] and services["linna-api"]["selector"]
+    assert not any(one["kind"] in ("Endpoints", "EndpointSlice") for one in RESOURCES)
