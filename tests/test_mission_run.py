@@ -202,7 +202,7 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
 
     def stop(line: str) -> None:
         lines.append(line)
-        if len(lines) == 4:
+        if len(lines) == 3:
             raise KeyboardInterrupt
 
     folder = tmp_path / "stopped"
