@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import sqlite3
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -19,6 +20,7 @@ from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.figures import contacts_until, trend
 from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
+from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
 
 SCENARIO = """
 name = "half-a-day"
@@ -178,6 +180,27 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
         assert connection.execute("select number from one").fetchall() == [(1,), (2,)]
     assert not (home / "incoming").exists()
     assert Checkpoints(tmp_path / "other", home, snapshot).restore() is None and not home.exists()
+
+
+@pytest.mark.parametrize(("faults", "starts"), [(0, 1), (2, 3), (3, None)])
+def test_a_spacecraft_whose_port_was_taken_starts_with_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faults: int, starts: int | None
+) -> None:
+    """Between the choice of a port and its use another process can take it."""
+    files = SpacecraftFiles(*(tmp_path / name for name in "scdol"), tmp_path / "exact")
+    ours, theirs = socket.socketpair()
+    started = []
+
+    def start(self: SpacecraftProcess, *_: Any) -> None:
+        started.append(self)
+        if len(started) <= faults:
+            raise LinkError("spacecraft: expected it to start, found: Address already in use")
+        self._console = ours
+
+    monkeypatch.setattr(SpacecraftProcess, "_start", start)
+    with ours, theirs, pytest.raises(LinkError) if starts is None else nullcontext():
+        SpacecraftProcess(files, ("madrid",), 0.1, 0.0)._lines.close()
+    assert len(started) == (starts or 3)
 
 
 @pytest.mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"]])

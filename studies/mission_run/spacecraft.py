@@ -21,6 +21,9 @@ ANSWER_S = 600.0
 """Longest wait for the spacecraft: the time to the next contact with windows in between, at maximum speed."""
 
 
+START_ATTEMPTS = 3
+
+
 def free_ports(count: int) -> list[int]:
     """Return ports that are free now."""
     with contextlib.ExitStack() as stack:
@@ -44,6 +47,18 @@ class SpacecraftProcess:
     """The emulated spacecraft and its stations in a process; `messages` of its console in order."""
 
     def __init__(self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float) -> None:
+        self._log = files.log
+        for attempts_left in reversed(range(START_ATTEMPTS)):
+            try:
+                self._start(files, stations, days, rate)
+                break
+            except LinkError as error:
+                # Another process can take a port between its choice and its use.
+                if attempts_left == 0 or "Address already in use" not in str(error):
+                    raise
+        self._lines = self._console.makefile("r")
+
+    def _start(self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float) -> None:
         console, mission, *station_ports = free_ports(2 + 2 * len(stations))
         self.mission_port = mission
         words = ["emulate", files.scenario, "--continuous", "--days", days, "--rate", rate, "--hold-contacts"]
@@ -57,9 +72,7 @@ class SpacecraftProcess:
         with files.log.open("ab") as log:
             # A group of its own: Ctrl-C reaches the runner, which stops the spacecraft in order.
             self.process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-        self._log = files.log
         self._console = self._connected(console)
-        self._lines = self._console.makefile("r")
 
     def messages(self) -> Iterator[dict[str, Any]]:
         """Return what the console says, until the spacecraft ends."""
