@@ -274,6 +274,7 @@ def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest
 def test_the_failed_report_of_a_spacecraft_leaves_the_others(
     ground: Ground, september: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("WARNING", "ground_service")
     add_pass(ground, 0)
     with ground.database.writing() as connection:
         other = vehicle_id(connection, 5, FLOWN)

@@ -395,6 +395,7 @@ def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_kn
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level("WARNING", "ground_service")
     first, second = keep_archive(either, flown.folder), keep_archive(either, unrendered, pinned=True)
     files = store_of(either)
     own = flown.folder / "manifest.json"

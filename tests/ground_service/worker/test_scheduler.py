@@ -120,6 +120,7 @@ def test_the_plan_is_entered_once_an_hour_of_mission_time(
 def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
     ground: Ground, error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("WARNING", "ground_service")
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
 
