@@ -152,6 +152,7 @@ dialog.addEventListener("close", async () => {
     const next = new URLSearchParams(location.search).get("next") ?? "";
     // Only pages of this service. The browser's own parser decides, which skips control characters in addresses.
     const wanted = new URL(next || "/", location.origin);
+    if (!wanted.hash) wanted.hash = location.hash; // browsers keep it when they are sent to the sign-in
     if (next.startsWith("/") && wanted.origin === location.origin) location.assign(wanted.href);
     else location.reload();
   } catch (error) {

@@ -73,6 +73,14 @@ def test_a_page_that_needs_a_sign_in_opens_after_it(stranger, guarded):
     expect(stranger.locator("body")).to_contain_text("not found")
 
 
+@pytest.mark.parametrize("address", ["/reports/{key}#part", "/?next=/reports/{key}%23part"])
+def test_the_part_of_a_page_in_the_address_is_kept_over_the_sign_in(stranger, guarded, address):
+    stranger.goto(address.format(key="0" * 32))
+    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    sign_in(stranger, guarded[1])
+    expect(stranger).to_have_url(f"{guarded[0]}/reports/{'0' * 32}#part")
+
+
 @pytest.mark.parametrize("next_page", ["//example.org/", "/%5Cexample.org/", "https://example.org/"])
 def test_after_sign_in_no_other_host_is_opened(stranger, guarded, next_page):
     stranger.goto(f"/?next={next_page}")

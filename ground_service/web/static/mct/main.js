@@ -15,7 +15,7 @@ const MINUTE_MS = 60_000;
 const HOUR_MS = 60 * MINUTE_MS;
 const openmct = window.openmct;
 
-window.addEventListener("linna-sign-in", () => location.assign("/?next=/mct"));
+window.addEventListener("linna-sign-in", () => location.assign(`/?next=${encodeURIComponent(`/mct${location.hash}`)}`));
 
 function installConductor(last) {
   const recent = (clock) => ({ name: clock, timeSystem: "utc", clock, clockOffsets: { start: -30 * MINUTE_MS, end: MINUTE_MS } });
