@@ -10,13 +10,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -26,7 +27,27 @@ from lunar.timescales import parse_utc
 
 CHROMIUM = "/usr/bin/chromium"
 START_S = 180.0
+PATIENCE_S = 60.0
 NS = 1_000_000_000
+# Counts the requests of a page's scripts until their answers are read, and notes what was refused.
+COUNT_REQUESTS = """
+window.underWay = 0;
+window.refused = [];
+const plainFetch = window.fetch;
+window.fetch = async (...given) => {
+  const ended = () => setTimeout(() => { window.underWay -= 1; }, 50);
+  window.underWay += 1;
+  try {
+    const answer = await plainFetch(...given);
+    if (answer.status === 403) window.refused.push(answer.url);
+    answer.clone().arrayBuffer().then(ended, ended);
+    return answer;
+  } catch (error) {
+    ended();
+    throw error;
+  }
+};
+"""
 FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -36,6 +57,21 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+
+
+def wait_until(reached: Callable[[], bool], otherwise: str) -> None:
+    """Wait for a state, with patience."""
+    until = time.monotonic() + PATIENCE_S
+    while not reached():
+        assert time.monotonic() < until, otherwise
+        time.sleep(0.02)
+
+
+def end_socket(one: socket.socket) -> None:
+    """Close a socket, and wake a thread that waits on it."""
+    with suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)
+    one.close()
 
 
 class Console:
@@ -59,24 +95,22 @@ class Console:
             threading.Thread(target=self._hear, args=(client,), daemon=True).start()
 
     def _hear(self, client: socket.socket) -> None:
-        with client, client.makefile("r") as lines:
+        with client, suppress(OSError), client.makefile("r") as lines:
             for line in lines:
                 self.heard.append(line.strip())
-            self._clients.remove(client)
+        self._clients.remove(client)
 
     def say(self, message: dict[str, object]) -> None:
         """One message to everyone connected, of whom there is at least one in time."""
-        for _ in range(100):
-            if self._clients:
-                break
-            time.sleep(0.1)
+        wait_until(lambda: bool(self._clients), "nobody has connected to the console")
         for client in list(self._clients):
-            client.sendall(json.dumps(message).encode() + b"\n")
+            with suppress(OSError):  # one that has just hung up
+                client.sendall(json.dumps(message).encode() + b"\n")
 
     def close(self) -> None:
-        self._listener.close()
-        for client in self._clients:
-            client.close()
+        for one in (self._listener, *self._clients):
+            end_socket(one)
+        self._thread.join(PATIENCE_S)
 
 
 def live_frame(number: int) -> dict[str, object]:
@@ -148,7 +182,7 @@ class Service:
 
     def stop(self) -> None:
         self._process.terminate()
-        self._process.wait(30)
+        self._process.wait(PATIENCE_S)
         self._log.close()
 
 
@@ -177,6 +211,12 @@ def serve() -> type[Service]:
     return Service
 
 
+@pytest.fixture(scope="session", autouse=True)
+def patience() -> None:
+    """Wait long for what pages show: a state that is reached ends the wait, and the machine may be busy."""
+    expect.set_options(timeout=PATIENCE_S * 1e3)
+
+
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """The system's Chromium, without a screen."""
@@ -191,7 +231,8 @@ def page(browser: Browser, service: Service) -> Iterator[Page]:
     """A fresh page of the service; the test fails if a script of it did, or if it asked another host."""
     context = browser.new_context(base_url=service.url, viewport={"width": 1280, "height": 900})
     opened = context.new_page()
-    opened.set_default_timeout(20_000)
+    opened.set_default_timeout(PATIENCE_S * 1e3)
+    opened.add_init_script(COUNT_REQUESTS)
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
     opened.on("request", lambda request: _note_foreign(request.url, service.url, errors))

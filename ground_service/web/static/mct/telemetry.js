@@ -72,7 +72,8 @@ async function history(object, options) {
 
 // Parameters whose packet is not among the newest values: what is later than the last value, after each event.
 function followSeries(object, callback, since) {
-  let last = since;
+  let last = since - 1;
+  let points = MOST_POINTS; // at first as the history, whose samples the views recognise
   let busy = false;
   let again = false;
   async function refresh() {
@@ -82,7 +83,8 @@ function followSeries(object, callback, since) {
     }
     busy = true;
     try {
-      const { buckets } = await series(object, last + 1, Date.UTC(2129, 0), POINTS);
+      const { buckets } = await series(object, last + 1, Date.UTC(2129, 0), points);
+      points = POINTS;
       const found = samplesOf(buckets, false).filter((one) => one.utc > last);
       if (found.length) {
         last = found.at(-1).utc;
@@ -102,7 +104,7 @@ function followSeries(object, callback, since) {
 }
 
 function subscribe(openmct, object, callback) {
-  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().end);
+  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().start);
   let last = -Infinity;
   let stop = null;
   const warn = (error) => console.warn(`${object.name}: ${error.message}`);
