@@ -98,14 +98,17 @@ function toggle(id) {
   loadRegressions().catch(trouble);
 }
 
+// Without frames the detector is not judged: such an archive is chosen only on purpose.
 const archiveChoice = (archive) => {
   const pass = archive.pass_id === null ? null : [", ", element("a", { href: `/passes/${archive.pass_id}` }, `pass ${archive.pass_id}`)];
-  return element("label", {}, element("input", { type: "checkbox", name: "archive", value: archive.digest, checked: true }), element("span", {}, `${archive.name}, ${archive.frames} frames`, pass));
+  const without = archive.state === "telemetry only";
+  const what = `${archive.name}, ${archive.frames} frames`;
+  return element("label", {}, element("input", { type: "checkbox", name: "archive", value: archive.digest, checked: !without }), element("span", {}, what, pass, without ? `: ${archive.state}, ${archive.reason}` : null));
 };
 
 // A pass is replayed from its archive: one without a kept archive is listed with what to do.
 const passWithout = (pass) =>
-  element("label", {}, element("input", { type: "checkbox", disabled: true }), element("span", {}, element("a", { href: `/passes/${pass.id}` }, `pass ${pass.id}, ${pass.name}`), ": no archive with its images is kept; upload it below"));
+  element("label", {}, element("input", { type: "checkbox", disabled: true }), element("span", {}, element("a", { href: `/passes/${pass.id}` }, `pass ${pass.id}, ${pass.name}`), ": no archive is kept; upload it below"));
 
 async function load() {
   const [found, archives, passes] = await Promise.all([get("builds", { limit: 200 }), get("regression-archives"), get("passes", { limit: 200 })]);

@@ -114,7 +114,10 @@ def send_state_and_event(url, time_ms):
     fault = {"event_id": 20, "frame_number": number, "value_1": 0.0, "value_2": 0.0}
     packets = [
         DICTIONARY.pack(
-            "navigation_state", zeros | {"image_ticks": ticks}, ticks=ticks, sequence_count=number
+            "navigation_state",
+            zeros | {"image_ticks": ticks, "estimator": "spherical"},
+            ticks=ticks,
+            sequence_count=number,
         ),
         DICTIONARY.pack("event_high", fault, ticks=ticks, sequence_count=number),
     ]

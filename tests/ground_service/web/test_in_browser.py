@@ -9,6 +9,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
 from ground_service.regression.archives import pack_archive
+from tests.ground_service.web.conftest import wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -58,7 +59,7 @@ def receive(page, packets):
         headers={"Content-Type": "application/octet-stream"},
     )
     job = answer.json()["job_id"]
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while page.request.get(f"/api/v1/jobs/{job}").json()["state"] != "done":
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -84,6 +85,11 @@ def settled(page, path):
         path = path.format(revision=newest_revision(page)[:16])
     page.goto(path)
     expect(page.locator("#feed-light")).to_have_class("light on")
+
+
+def answered(page):
+    """Wait until no script of the page waits for an answer."""
+    wait_until(lambda: page.evaluate("window.underWay === 0"), "requests are not answered")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -148,7 +154,7 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     expect(page.get_by_label("chart: altitude, m")).to_be_visible()
     expect(page.locator("#map-legend")).to_contain_text("spherical")
     page.get_by_role("button", name="Make a report").click()
-    expect(page.locator("#verdict .verdict")).not_to_be_empty(timeout=60_000)
+    expect(page.locator("#verdict .verdict")).not_to_be_empty()
     expect(page.locator("#verdict")).to_contain_text("Median position error")
     with page.expect_popup() as opened:
         page.get_by_role("link", name="Open report").click()
@@ -242,8 +248,8 @@ def test_a_chart_is_zoomed_with_the_keyboard(page):
     before = chart.screenshot()
     chart.focus()
     page.keyboard.press("+")
-    page.wait_for_timeout(200)
-    assert chart.screenshot() != before
+    expect(page).to_have_url(re.compile("zoom="))
+    wait_until(lambda: chart.screenshot() != before, "the chart has not changed")
     page.keyboard.press("0")
 
 
@@ -277,7 +283,7 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     settled(page, "/planner")
     page.locator("#ephemeris").select_option(label="orbits.oem, 2030-01-01 00:00:00")
     page.get_by_role("button", name="Search").click()
-    expect(page.locator("#candidates tbody tr").first).to_be_visible(timeout=30_000)
+    expect(page.locator("#candidates tbody tr").first).to_be_visible()
     page.locator("#candidates").get_by_role("button", name="Plan").nth(1).click()
     bar = page.locator("#timeline .window.draft")
     expect(bar).to_have_count(1)
@@ -331,7 +337,7 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Step").click()
     page.get_by_label("Rate").select_option("60")
-    page.wait_for_timeout(500)
+    wait_until(lambda: len(console.heard) >= 3, f"heard no more than {console.heard}")
     assert console.heard == ["pause", "step", "rate 60"]
 
 
@@ -382,7 +388,7 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
             page.locator(select).select_option(option.get_attribute("value"))
         page.get_by_role("button", name="Run", exact=True).click()
         latest = page.locator("#regressions tbody tr").first
-        expect(latest).to_contain_text(verdict, timeout=60_000)
+        expect(latest).to_contain_text(verdict)
     page.locator("#regressions").get_by_role("button", name="Gates").nth(1).click()
     expect(page.locator("#regressions table").nth(1)).to_contain_text("recall")
     with page.expect_popup() as opened:

@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,13 +33,13 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
+from tests.ground_service.web.conftest import PATIENCE_S, end_socket, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
 
 NS = 1_000_000_000
 SPACECRAFT = 76
-PATIENCE_MS = 60_000
 
 MISSION = """name = "selenita"
 [spacecraft]
@@ -81,32 +82,35 @@ class Spacecraft:
     down: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
     up: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
     _encoder: DownlinkEncoder = field(default_factory=lambda: DownlinkEncoder(SPACECRAFT))
-    _listener: socket.socket | None = None
+    _listeners: list[socket.socket] = field(default_factory=list)
+    _connections: list[socket.socket] = field(default_factory=list)
+    _tasks: list[threading.Thread] = field(default_factory=list)
     _count: int = 0
     _sending: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         for task in (self._accept_listeners, self._take_telecommands):
-            threading.Thread(target=task, daemon=True).start()
+            self._start(task)
+
+    def _start(self, task: Callable[..., None], *arguments: Any) -> None:
+        thread = threading.Thread(target=task, args=arguments, daemon=True)
+        self._tasks.append(thread)
+        thread.start()
 
     def report(self, name: str, **values: Any) -> None:
         """Send a packet to the service, which has connected."""
         zeros = {one.name: 0 for one in DICTIONARY.packet(name).fields if one.size == 1}
+        wait_until(lambda: bool(self._listeners), "the service has not connected")
         with self._sending:
             self._count += 1
             ticks = int(ticks_from_utc_ns(time.time_ns())) + self._count
             packet = DICTIONARY.pack(name, zeros | values, ticks=ticks, sequence_count=self._count)
-            octets = self._encoder.encode([packet])
-        until = time.monotonic() + PATIENCE_MS / 1e3
-        while self._listener is None:
-            assert time.monotonic() < until, "the service has not connected"
-            time.sleep(0.02)
-        self._listener.sendall(octets)
+            self._listeners[-1].sendall(self._encoder.encode([packet]))
 
     def _accept_listeners(self) -> None:
         while True:
             try:
-                self._listener = self.down.accept()[0]
+                self._listeners.append(self.down.accept()[0])
             except OSError:
                 return
 
@@ -116,19 +120,23 @@ class Spacecraft:
                 connection, _ = self.up.accept()
             except OSError:
                 return
-            threading.Thread(target=self._verify, args=(connection,), daemon=True).start()
+            self._connections.append(connection)
+            self._start(self._verify, connection)
 
     def _verify(self, connection: socket.socket) -> None:
         decoder = UplinkDecoder(SPACECRAFT)
-        while octets := connection.recv(1 << 16):
-            for packet in decoder.decode(octets).packets:
-                request = int.from_bytes(packet[:4], "big")
-                for stage in ("accepted", "started", "completed"):
-                    self.report(f"verification_{stage}", request_id=request)
+        with connection, suppress(OSError):  # the service may end first
+            while octets := connection.recv(1 << 16):
+                for packet in decoder.decode(octets).packets:
+                    request = int.from_bytes(packet[:4], "big")
+                    for stage in ("accepted", "started", "completed"):
+                        self.report(f"verification_{stage}", request_id=request)
 
     def close(self) -> None:
-        self.down.close()
-        self.up.close()
+        for one in (self.down, self.up, *self._listeners, *self._connections):
+            end_socket(one)
+        for task in self._tasks:
+            task.join(PATIENCE_S)
 
 
 @dataclass
@@ -170,8 +178,8 @@ def shift(
             register_build(ground, load_build(path.parent), actor="root")
     running = serve(home, home / "serve.log", console.port)
     yield Shift(running.url, token, spacecraft)
-    spacecraft.close()
     running.stop()
+    spacecraft.close()
 
 
 class Pictures:
@@ -193,12 +201,10 @@ def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
     """The operator's browser; the test fails if a script fails or the console shows an error."""
     context = browser.new_context(base_url=shift.url, viewport={"width": 1280, "height": 800})
     page = context.new_page()
-    page.set_default_timeout(PATIENCE_MS)
-    expect.set_options(timeout=PATIENCE_MS)
+    page.set_default_timeout(PATIENCE_S * 1e3)
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     yield page
-    expect.set_options(timeout=5_000)
     context.close()
     assert errors == []
 
