@@ -20,17 +20,17 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.web.conftest import wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
+WAIT_MS = 30_000
 SOURCE = Path(__file__).parents[3] / "deploy" / "openmct"
 
 
 def ask(url, **headers):
     """Status, body and headers of a GET."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=60) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
             return answer.status, answer.read(), answer.headers
     except urllib.error.HTTPError as error:
         with error:
@@ -71,7 +71,7 @@ def mct(browser, shown):
     """A page for the displays; the test fails on an error in the console or a violation of the policy."""
     context = browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900})
     opened = context.new_page()
-    opened.set_default_timeout(60_000)
+    opened.set_default_timeout(30_000)
     opened.add_init_script(
         "document.addEventListener('securitypolicyviolation', (event) =>"
         " console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"
@@ -102,36 +102,12 @@ def receive(url, temperature_c, second):
         DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=900 + second),
         DICTIONARY.pack("event_high", fault, ticks=ticks, sequence_count=900 + second),
     ]
-    upload(url, f"live-{second}", packets)
-
-
-def send_state_and_event(url, time_ms):
-    """Upload a navigation state and an event report of a time."""
-    number = time_ms // 1_000 % 10_000
-    ticks = int(ticks_from_utc_ns(time_ms * 1_000_000))
-    fields = DICTIONARY.packet("navigation_state").fields
-    zeros = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
-    fault = {"event_id": 20, "frame_number": number, "value_1": 0.0, "value_2": 0.0}
-    packets = [
-        DICTIONARY.pack(
-            "navigation_state",
-            zeros | {"image_ticks": ticks, "estimator": "spherical"},
-            ticks=ticks,
-            sequence_count=number,
-        ),
-        DICTIONARY.pack("event_high", fault, ticks=ticks, sequence_count=number),
-    ]
-    upload(url, f"after-{time_ms}", packets)
-
-
-def upload(url, name, packets):
-    """Upload packets as a downlink of the spacecraft of the synthetic pass."""
     request = urllib.request.Request(
-        f"{url}/api/v1/telemetry?name={name}.cadu&instance={spacecraft(url)['instance']}",
+        f"{url}/api/v1/telemetry?name=live-{second}.cadu&instance={spacecraft(url)['instance']}",
         data=encode_cadus(packets, spacecraft_id=76),
         headers={"Content-Type": "application/octet-stream"},
     )
-    with urllib.request.urlopen(request, timeout=60) as answer:
+    with urllib.request.urlopen(request, timeout=20) as answer:
         assert answer.status == 202
 
 
@@ -181,77 +157,33 @@ def test_a_parameter_is_found_in_the_tree_and_its_plot_is_drawn(mct):
     with mct.expect_response(lambda answer: "/telemetry/temperature_c?" in answer.url) as received:
         tree.get_by_label("Navigate to temperature linna.parameter").click()
     assert len(received.value.json()["buckets"]) >= 40  # the whole pass is in the interval
-    expect(mct.locator(".c-plot").get_by_text("temperature °C")).to_be_visible()
-    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible()
+    expect(mct.locator(".c-plot").get_by_text("temperature °C")).to_be_visible(timeout=WAIT_MS)
+    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible(timeout=WAIT_MS)
 
 
 def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     mct.goto("/mct")
     row = mct.get_by_label("lad row").filter(has=mct.get_by_text("temperature", exact=True))
-    expect(row).to_contain_text("23.9")
-    expect(mct.get_by_text("Live feed connected")).to_be_visible()
+    expect(row).to_contain_text("23.9", timeout=WAIT_MS)
+    expect(mct.get_by_text("Live feed connected")).to_be_visible(timeout=WAIT_MS)
     receive(shown.url, 95.25, 1)
-    expect(row).to_contain_text("95.25")
-    expect(row.locator(".is-limit--red")).to_have_count(1)
+    expect(row).to_contain_text("95.25", timeout=WAIT_MS)
+    expect(row.locator(".is-limit--red")).to_have_count(1, timeout=WAIT_MS)
     mode = mct.get_by_label("lad row").filter(has=mct.get_by_text("mode", exact=True))
-    expect(mode).to_contain_text(DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "))
+    expect(mode).to_contain_text(
+        DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "), timeout=WAIT_MS
+    )
     fault = mct.get_by_label("Select fault: temperature")
     fault.check()
     mct.get_by_role("button", name="Acknowledge").click()
     mct.get_by_label("Save", exact=True).click()
-    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible()
+    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible(
+        timeout=WAIT_MS
+    )
     found = {one["name"]: one["state"] for one in json.loads(ask(f"{shown.url}/api/v1/alarms")[1])["items"]}
     assert found == {"temperature_c": "acknowledged", "camera_fault": "raised"}
     event = mct.locator(".c-telemetry-table tr").filter(has_text="camera fault")
-    expect(event).to_contain_text("high")
-
-
-def newest_ms(url):
-    """Time of the newest telemetry, which the clock of the displays shows, in milliseconds."""
-    instance = spacecraft(url)["instance"]
-    times = [
-        one["time"]
-        for one in json.loads(ask(f"{url}/api/v1/parameters?spacecraft_id=76&instance={instance}")[1])[
-            "items"
-        ]
-    ]
-    return max(parse_utc(time) for time in times) // 1_000_000
-
-
-FOLLOW = """async (key) => {
-    const object = await openmct.objects.get({ namespace: "linna", key });
-    window.followed = [];
-    openmct.telemetry.subscribe(object, (given) => followed.push(...[given].flat()), { strategy: "batch" });
-}"""
-
-
-FOLLOWED = "(time) => followed.some((one) => Math.abs(one.utc - time) <= 1)"
-
-
-@pytest.mark.parametrize("kind", ["events", "parameter"])
-def test_what_comes_seconds_after_the_newest_telemetry_is_shown_once(mct, shown, kind):
-    instance = spacecraft(shown.url)["instance"]
-    mct.goto(f"/mct#/browse/linna:spacecraft/linna:vehicle~76~{instance}")
-    expect(mct.get_by_text("Live feed connected")).to_be_visible()
-    names = json.loads(ask(f"{shown.url}/api/v1/spacecraft/76/parameters?instance={instance}")[1])["items"]
-    state = next(one["name"] for one in names if one["packet"] == "navigation_state")
-    mct.evaluate(
-        FOLLOW, {"events": f"events~76~{instance}", "parameter": f"parameter~76~{instance}~{state}"}[kind]
-    )
-    newest = newest_ms(shown.url)
-    send_state_and_event(shown.url, newest + 5_000)
-    wait_until(lambda: mct.evaluate(FOLLOWED, newest + 5_000), "what came is not shown")
-    send_state_and_event(shown.url, newest + 10_000)
-    wait_until(lambda: mct.evaluate(FOLLOWED, newest + 10_000), "what came is not shown")
-    given = mct.evaluate("followed.map((one) => JSON.stringify(one))")
-    assert len(given) == len(set(given))
-
-
-def test_the_sign_in_leads_back_to_the_object_that_was_shown(mct, shown):
-    mct.goto("/mct#/browse/linna:spacecraft")
-    expect(mct.get_by_text("Live feed connected")).to_be_visible()
-    mct.evaluate("window.dispatchEvent(new Event('linna-sign-in'))")
-    expect(mct).to_have_url(re.compile(r"/\?next=%2Fmct%23%2Fbrowse%2Flinna%3Aspacecraft"))
+    expect(event).to_contain_text("high", timeout=WAIT_MS)
 
 
 def test_the_layout_of_a_payload_engineer_shows_states_series_and_images(mct, shown):
@@ -259,10 +191,10 @@ def test_the_layout_of_a_payload_engineer_shows_states_series_and_images(mct, sh
     instance = spacecraft(shown.url)["instance"]
     mct.goto(f"/mct#/browse/linna:spacecraft/linna:vehicle~76~{instance}/linna:{name}~76~{instance}")
     row = mct.get_by_label("lad row").filter(has=mct.get_by_text("frames processed", exact=True))
-    expect(row).to_contain_text("2029-08-07")
+    expect(row).to_contain_text("2029-08-07", timeout=WAIT_MS)
     # The estimator of the newest state, of the series of all estimators.
-    expect(mct.get_by_text("altitude, spherical").first).to_be_visible()
-    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible()
+    expect(mct.get_by_text("altitude, spherical").first).to_be_visible(timeout=WAIT_MS)
+    expect(mct.locator(".gl-plot-display-area canvas").first).to_be_visible(timeout=WAIT_MS)
 
 
 def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
@@ -271,11 +203,11 @@ def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
     mct.get_by_role("menuitem", name="Folder").click()
     mct.get_by_label("Title", exact=True).fill("Shift of Monday")
     mct.get_by_label("Save", exact=True).click()
-    expect(mct.get_by_role("region", name="Shift of Monday Object View")).to_be_visible()
+    expect(mct.get_by_role("region", name="Shift of Monday Object View")).to_be_visible(timeout=WAIT_MS)
     other = browser.new_context(base_url=shown.url).new_page()
     try:
         other.goto("/mct#/browse/linna.stored:layouts")
-        expect(other.get_by_text("Shift of Monday").first).to_be_visible()
+        expect(other.get_by_text("Shift of Monday").first).to_be_visible(timeout=30_000)
     finally:
         other.context.close()
     names = [one["name"] for one in json.loads(ask(f"{shown.url}/api/v1/displays")[1])["items"]]

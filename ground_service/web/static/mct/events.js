@@ -33,17 +33,13 @@ async function request({ spacecraft }, { start, end, size, signal }) {
 }
 
 function subscribe(openmct, object, callback) {
-  // From the start of what is shown: the interval ends after the newest telemetry, so its end would hide what follows.
-  let from = openmct.time.getBounds().start;
-  const known = new Set();
+  let last = openmct.time.getBounds().end;
   return listen("telemetry", async () => {
     try {
-      const found = await request(object, { start: from, end: Date.UTC(2129, 0) });
-      const fresh = found.filter((one) => !known.has(one.id));
-      if (!fresh.length) return;
-      fresh.forEach((one) => known.add(one.id));
-      from = Math.max(from, fresh.at(-1).utc);
-      callback(fresh);
+      const found = await request(object, { start: last + 1, end: Date.UTC(2129, 0) });
+      if (!found.length) return;
+      last = found.at(-1).utc;
+      callback(found);
     } catch (error) {
       console.warn(`${object.name}: ${error.message}`);
     }

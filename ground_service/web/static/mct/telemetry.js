@@ -72,8 +72,7 @@ async function history(object, options) {
 
 // Parameters whose packet is not among the newest values: what is later than the last value, after each event.
 function followSeries(object, callback, since) {
-  let last = since - 1;
-  let points = MOST_POINTS; // at first as the history, whose samples the views recognise
+  let last = since;
   let busy = false;
   let again = false;
   async function refresh() {
@@ -83,8 +82,7 @@ function followSeries(object, callback, since) {
     }
     busy = true;
     try {
-      const { buckets } = await series(object, last + 1, Date.UTC(2129, 0), points);
-      points = POINTS;
+      const { buckets } = await series(object, last + 1, Date.UTC(2129, 0), POINTS);
       const found = samplesOf(buckets, false).filter((one) => one.utc > last);
       if (found.length) {
         last = found.at(-1).utc;
@@ -104,7 +102,7 @@ function followSeries(object, callback, since) {
 }
 
 function subscribe(openmct, object, callback) {
-  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().start);
+  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().end);
   let last = -Infinity;
   let stop = null;
   const warn = (error) => console.warn(`${object.name}: ${error.message}`);
