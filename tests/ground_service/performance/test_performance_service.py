@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -272,9 +273,10 @@ def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest
 
 
 def test_the_failed_report_of_a_spacecraft_leaves_the_others(
-    ground: Ground, september: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ground: Ground, september: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    caplog.set_level("WARNING", "ground_service")
+    log = MagicMock()
+    monkeypatch.setattr("ground_service.performance.service.log", log)
     add_pass(ground, 0)
     with ground.database.writing() as connection:
         other = vehicle_id(connection, 5, FLOWN)
@@ -292,7 +294,7 @@ def test_the_failed_report_of_a_spacecraft_leaves_the_others(
     done = nightly(ground, {})
     assert [one["spacecraft_id"] for one in done["monthly_reports"]] == [SPACECRAFT]
     assert done["monthly_reports_failed"] == [5]
-    assert "monthly report of spacecraft 5: failed" in caplog.text
+    log.exception.assert_called_once_with("monthly report of spacecraft %d: failed", 5)
 
 
 def test_what_is_old_goes_before_anything_of_the_night_can_fail(
