@@ -209,7 +209,7 @@ byId("menu").addEventListener("click", () => {
   byId("menu").setAttribute("aria-expanded", open);
 });
 
-// `again` reads anew what a page shows: what happened before the feed connected came with no message.
+// `again` reads the contents of a page again: no message reports changes from before the feed connected.
 const watchers = [];
 const readers = [];
 export function watch(onMessage, again = null) {

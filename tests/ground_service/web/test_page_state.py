@@ -195,7 +195,7 @@ def signed_in(browser, guarded):
         one.close()
 
 
-# Press the first button on which nothing was pressed yet, in one step: a page that draws anew cannot come between.
+# Press the first button on which nothing was pressed yet, in one step, so that no redraw of the page comes between.
 PRESS = """(pressed) => {
     const named = (one) => one.getAttribute("aria-label") ?? one.textContent.trim();
     const usable = (one) => one.checkVisibility({visibilityProperty: true}) && !one.disabled;
