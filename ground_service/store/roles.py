@@ -42,10 +42,7 @@ def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
         Names of all tables of the schema.
     """
     name = quoted(role)
-    yield "REVOKE ALL ON SCHEMA public FROM PUBLIC"
-    yield f"REVOKE ALL ON SCHEMA public FROM {name}"
-    yield f"GRANT USAGE ON SCHEMA public TO {name}"
-    yield f"REVOKE ALL ON ALL TABLES IN SCHEMA public FROM PUBLIC, {name}"
+    yield from _without_rights(name)
     for table in sorted(tables):
         rights = "SELECT, INSERT, UPDATE, DELETE"
         if table in READ_ONLY:
@@ -67,13 +64,18 @@ def backup_statements(role: str, tables: list[str]) -> Iterator[str]:
         Names of all tables of the schema.
     """
     name = quoted(role)
+    yield from _without_rights(name)
+    yield f"REVOKE ALL ON ALL SEQUENCES IN SCHEMA public FROM {name}"
+    for table in sorted(tables):
+        yield f"GRANT SELECT ON {quoted(table)} TO {name}"
+
+
+def _without_rights(name: str) -> Iterator[str]:
+    """Yield SQL that leaves a role, and everyone, no right but to see the schema; `name` is quoted."""
     yield "REVOKE ALL ON SCHEMA public FROM PUBLIC"
     yield f"REVOKE ALL ON SCHEMA public FROM {name}"
     yield f"GRANT USAGE ON SCHEMA public TO {name}"
     yield f"REVOKE ALL ON ALL TABLES IN SCHEMA public FROM PUBLIC, {name}"
-    yield f"REVOKE ALL ON ALL SEQUENCES IN SCHEMA public FROM {name}"
-    for table in sorted(tables):
-        yield f"GRANT SELECT ON {quoted(table)} TO {name}"
 
 
 def grant_service(database: Database, role: str) -> None:
