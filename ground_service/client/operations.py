@@ -143,11 +143,24 @@ class Client(Connection):
     # Passes
 
     def list_passes(
-        self, *, search: str | None = None, spacecraft_id: int | None = None, instance: str | None = None
+        self,
+        *,
+        search: str | None = None,
+        spacecraft_id: int | None = None,
+        instance: str | None = None,
+        verdict: str | None = None,
     ) -> Listing[PassSummary]:
-        """List the passes that match, newest first; `search` is a part of the name."""
+        """List the passes that match, newest first.
+
+        `search` is a part of the name; `verdict` is good, caution, bad, or "none" for passes without a report.
+        """
         return self._list(
-            PassSummary, "/passes", search=search, spacecraft_id=spacecraft_id, instance=instance
+            PassSummary,
+            "/passes",
+            search=search,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            verdict=verdict,
         )
 
     def define_pass(self, definition: Fields, *, key: str | None = None) -> PassDetail:

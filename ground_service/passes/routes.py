@@ -100,6 +100,10 @@ def list_passes(
     ] = None,
     spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
     instance: Instance | None = None,
+    verdict: Annotated[
+        Literal["good", "caution", "bad", "none"] | None,
+        Query(description="Verdict of the newest report; none: without a report"),
+    ] = None,
 ) -> PageOf[PassSummary]:
     """List the passes, newest first."""
     items, total = service.list_passes(
@@ -107,6 +111,7 @@ def list_passes(
         search=search,
         spacecraft_id=spacecraft_id,
         instance=instance,
+        verdict=verdict,
         limit=paging.limit,
         offset=paging.offset,
     )

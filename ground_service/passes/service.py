@@ -69,16 +69,21 @@ def list_passes(
     search: str | None = None,
     spacecraft_id: int | None = None,
     instance: str | None = None,
+    verdict: str | None = None,
     limit: int = 100,
     offset: int = 0,
 ) -> tuple[list[PassSummary], int]:
-    """Return a page of the passes that match, newest first, and their number; `search` is a part of the name."""
+    """Return a page of the passes that match, newest first, and their number.
+
+    `search` is a part of the name; `verdict` the level of the newest report, "none" for passes without one.
+    """
     with ground.database.reading() as connection:
         return store.list_passes(
             connection,
             search=search,
             spacecraft_id=spacecraft_id,
             instance=instance,
+            verdict=verdict,
             limit=limit,
             offset=offset,
         )

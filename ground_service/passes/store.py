@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, ScalarSelect, func, insert, select
 
 from ground_service.passes.model import PassDetail, PassRecord, PassSummary
 from ground_service.passes.samples import DetectionSamples, no_detections
@@ -73,10 +73,14 @@ def list_passes(
     search: str | None,
     spacecraft_id: int | None,
     instance: str | None,
+    verdict: str | None,
     limit: int,
     offset: int,
 ) -> tuple[list[PassSummary], int]:
-    """Return a page of the passes that match, newest first, and their number; `search` is a part of the name."""
+    """Return a page of the passes that match, newest first, and their number.
+
+    `search` is a part of the name; `verdict` the level of the newest report, "none" for passes without one.
+    """
     vehicles = repository.VEHICLES
     query = select(_PASSES, vehicles.c.ccsds_id.label("spacecraft_id"), vehicles.c.instance).join(
         vehicles, vehicles.c.id == _PASSES.c.vehicle_id
@@ -87,9 +91,26 @@ def list_passes(
         query = query.where(vehicles.c.ccsds_id == spacecraft_id)
     if instance is not None:
         query = query.where(vehicles.c.instance == instance)
+    if verdict == "none":
+        query = query.where(_PASSES.c.id.not_in(select(repository.REPORTS.c.pass_id)))
+    elif verdict is not None:
+        query = query.where(_newest_verdict() == verdict)
     total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
     query = query.order_by(_PASSES.c.created_utc_ns.desc(), _PASSES.c.id.desc()).limit(limit).offset(offset)
     return [PassSummary.of(row) for row in connection.execute(query).mappings()], int(total)
+
+
+def _newest_verdict() -> ScalarSelect[str]:
+    """Return the verdict level of the newest report of a pass, as a subquery of a query of passes."""
+    reports = repository.REPORTS
+    return (
+        select(reports.c.summary["verdict_level"].as_string())
+        .where(reports.c.pass_id == _PASSES.c.id)
+        .order_by(reports.c.created_utc_ns.desc(), reports.c.id)
+        .limit(1)
+        .correlate(_PASSES)
+        .scalar_subquery()
+    )
 
 
 def passes_of_vehicle(connection: Connection, vehicle: int, *, reported: bool) -> list[PassRecord]:

@@ -70,6 +70,7 @@ PAGES = (
     Page("/planner", "planner", "Planner", "Planner"),
     Page("/passes", "passes", "Passes", "Passes"),
     Page("/passes/{pass_id}", "pass", "Pass", "", "passes"),
+    Page("/comparison", "comparison", "Comparison of passes", "", "passes"),
     Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
     DISPLAYS,
     Page("/events", "events", "Events", "Events"),

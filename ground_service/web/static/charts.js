@@ -47,6 +47,10 @@ function clockTexts(plot, times, _, __, step) {
   });
 }
 
+// Time since a start, in minutes.
+const minuteTexts = (_, times) => times.map((time) => String(+(time / 60).toFixed(2)));
+const sinceStart = (_, time) => (time === null ? "–" : `${(time / 60).toFixed(2)} min`);
+
 const faint = (css) => (css.startsWith("#") && css.length === 7 ? `${css}38` : css);
 
 // Zoom: charts of a group show the same time, which is in the address.
@@ -142,8 +146,8 @@ function drawLimits(plot, series, scaleOf) {
 }
 
 // Lines and bands of the series, and their values as uPlot takes them.
-function drawnSeries(series, scaleOf) {
-  const lines = [{ label: "UTC", value: (_, time) => (time === null ? "–" : new Date(1000 * time).toISOString().slice(0, 19).replace("T", " ")) }];
+function drawnSeries(series, scaleOf, elapsed) {
+  const lines = [elapsed ? { label: "since start", value: sinceStart } : { label: "UTC", value: (_, time) => (time === null ? "–" : new Date(1000 * time).toISOString().slice(0, 19).replace("T", " ")) }];
   const bands = [];
   const tables = [];
   series.forEach((one, index) => {
@@ -180,8 +184,12 @@ function zoomByKeys(box, plot) {
   });
 }
 
+// Minutes are ruled at whole numbers of them.
+const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600].map((one) => 60 * one);
+
 // series: [{label, times, mean, low?, high?, unit?, labels?, warning?, alarm?}]; logarithmic axis where asked for.
-export function chart(place, title, unit, series, { logarithmic = false, group = null, height = 220 } = {}) {
+// `elapsed`: times are seconds since a start instead of UTC.
+export function chart(place, title, unit, series, { logarithmic = false, elapsed = false, group = null, height = 220 } = {}) {
   const label = unit ? `${title}, ${unit}` : title;
   const box = element("figure", { class: "chart", tabindex: "0", role: "group", "aria-label": `chart: ${label}` });
   box.append(element("figcaption", {}, label));
@@ -193,9 +201,10 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
   const axes = [...new Map(series.map((one) => [axisOf(one), one]))];
   if (axes.length > 2) throw new Error("A chart has two axes: choose parameters with at most two units.");
   const scaleOf = (one) => (axisOf(one) === axes[0][0] ? "y" : "second");
-  const { lines, bands, data } = drawnSeries(series, scaleOf);
+  const { lines, bands, data } = drawnSeries(series, scaleOf, elapsed);
   const colours = { ink: style("--muted"), grid: { stroke: style("--grid"), width: 1 } };
-  const scales = Object.fromEntries(axes.map(([, one]) => [scaleOf(one), one.labels ? CODES : logarithmic ? LOGARITHMIC : {}]));
+  const ruler = elapsed ? { values: minuteTexts, incrs: MINUTES, label: "minutes since the start", labelSize: 20 } : { values: clockTexts };
+  const scales = { ...(elapsed && { x: { time: false } }), ...Object.fromEntries(axes.map(([, one]) => [scaleOf(one), one.labels ? CODES : logarithmic ? LOGARITHMIC : {}])) };
   const plot = new uPlot(
     {
       width: box.clientWidth,
@@ -204,7 +213,7 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
       tzDate: (time) => uPlot.tzDate(new Date(1000 * time), "Etc/UTC"),
       scales,
       axes: [
-        { stroke: colours.ink, grid: colours.grid, ticks: colours.grid, values: clockTexts, space: 80 },
+        { stroke: colours.ink, grid: colours.grid, ticks: colours.grid, space: 80, ...ruler },
         ...axes.map(([, one], index) => axisFor(one, scaleOf(one), index, colours, logarithmic)),
       ],
       series: lines,

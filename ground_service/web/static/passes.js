@@ -1,11 +1,61 @@
-import { keep, restore } from "./address.js";
+import { keep, restore, state, statedAll } from "./address.js";
 import { get, send } from "./api.js";
 import { acting, byId, element, figure, lengthText, notice, pager, seconds, show, table, timeText, trouble } from "./page.js";
 
-restore("search");
+restore("search", "verdict");
+
+// Passes chosen for the comparison, over all pages of the list.
+const MOST_COMPARED = 7; // colours of a chart
+const compared = new Set(statedAll("compare"));
+
+function showChosen() {
+  state({ compare: [...compared] });
+  byId("compare").disabled = compared.size < 2;
+  byId("chosen").textContent = compared.size ? `${compared.size} chosen` : "Choose two or more passes to compare them.";
+  byId("choose-none").hidden = !compared.size;
+}
+
+function choice(row) {
+  const key = String(row.id);
+  const choose = (event) => {
+    if (event.target.checked && compared.size >= MOST_COMPARED) {
+      event.target.checked = false;
+      notice(`At most ${MOST_COMPARED} passes are compared.`, "bad");
+    } else if (event.target.checked) compared.add(key);
+    else compared.delete(key);
+    showChosen();
+  };
+  return element("input", { type: "checkbox", checked: compared.has(key), "aria-label": `compare ${row.name}`, onchange: choose });
+}
+
+byId("compare").addEventListener("click", () => location.assign(`/comparison?${[...compared].map((key) => `pass=${encodeURIComponent(key)}`).join("&")}`));
+byId("choose-none").addEventListener("click", () => {
+  compared.clear();
+  for (const box of byId("passes").querySelectorAll("input")) box.checked = false;
+  showChosen();
+});
+showChosen();
+
+// Spacecraft of the list: of the address until the list of them has come.
+async function showSpacecraft() {
+  const { items } = await get("spacecraft");
+  const keys = [...new Set(items.map((one) => `${one.spacecraft_id} ${one.instance}`))];
+  show("of-spacecraft", element("option", { value: "" }, "all"), keys.map((key) => element("option", { value: key }, key.replace(" ", ", "))));
+  restore("of-spacecraft");
+}
+
+const filtered = () => ["search", "verdict", "of-spacecraft"].some((id) => byId(id).value);
 
 const load = pager(async (limit, offset) => {
-  const page = await get("passes", { limit, offset, search: byId("search").value || null });
+  const [spacecraft, ...instance] = byId("of-spacecraft").value.split(" ");
+  const page = await get("passes", {
+    limit,
+    offset,
+    search: byId("search").value || null,
+    verdict: byId("verdict").value || null,
+    spacecraft_id: spacecraft || null,
+    instance: instance.join(" ") || null,
+  });
   const ids = page.items.map((one) => one.id);
   const found = ids.length ? (await get("reports", { pass_id: ids })).items : [];
   const report = Object.fromEntries(found.map((one) => [one.pass_id, one]));
@@ -14,6 +64,7 @@ const load = pager(async (limit, offset) => {
     table(
       "Passes",
       [
+        ["Compare", choice],
         ["Pass", (row) => element("a", { href: `/passes/${row.id}` }, row.name)],
         ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
         ["Start", (row) => timeText(row.start)],
@@ -25,7 +76,7 @@ const load = pager(async (limit, offset) => {
         ["Report", (row) => (report[row.id] ? element("a", { href: `/reports/${report[row.id].id}`, target: "_blank" }, "open") : "none")],
       ],
       page.items,
-      byId("search").value ? "No pass matches." : "No pass yet.",
+      filtered() ? "No pass matches." : "No pass yet.",
     ),
   );
   return page;
@@ -37,10 +88,11 @@ const verdict = (report) => (report ? element("span", { class: `state ${report.v
 byId("find").addEventListener(
   "submit",
   acting(async () => {
-    keep("search");
+    keep("search", "verdict", "of-spacecraft");
     await load.first();
   }),
 );
+for (const id of ["verdict", "of-spacecraft"]) byId(id).addEventListener("change", () => byId("find").requestSubmit());
 byId("define").addEventListener(
   "submit",
   acting(async () => {
@@ -133,4 +185,4 @@ async function showPerformance() {
 byId("performance").addEventListener("toggle", () => byId("performance").open && showPerformance().catch(trouble));
 byId("trend").addEventListener("submit", acting(showPerformance));
 
-load().catch((error) => error.status === 401 || trouble(error));
+showSpacecraft().then(load).catch((error) => error.status === 401 || trouble(error));

@@ -18,6 +18,7 @@ PATHS = [
     "/planner",
     "/passes",
     "/passes/1",
+    "/comparison?pass=1",
     "/telemetry",
     "/events",
     "/alarms",

@@ -1,0 +1,132 @@
+"""Passes side by side, in Chromium."""
+
+import re
+
+import pytest
+from playwright.sync_api import expect
+
+from ground_service.evaluation.service import make_report
+from ground_service.ground import open_ground
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.service import define_pass
+from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S
+from tests.ground_service.web.test_in_browser import answered, settled
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory, make_pass, console, serve):
+    """A service with two passes that have reports, and one that has none."""
+    home = tmp_path_factory.mktemp("compared") / "home"
+    with open_ground(home) as ground:
+        for frames, seed in ((40, 1), (30, 2)):
+            key = import_archive(ground, make_pass(frames=frames, seed=seed).folder)
+            make_report(ground, key, pdf=False)
+        start = 1_900_000_000_000_000_000
+        define_pass(
+            ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 60 * 10**9, spacecraft_id=76
+        )
+    running = serve(home, home / "serve.log", console.port)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def view(browser, compared):
+    """A page of the service; the test fails if a script of it fails."""
+    context = browser.new_context(base_url=compared.url, viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_S * 1e3)
+    page.add_init_script(COUNT_REQUESTS)
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    yield page
+    context.close()
+    assert errors == []
+
+
+def row(page, name):
+    """Cells of the row of a figure."""
+    line = page.locator("tbody tr").filter(
+        has=page.locator("td:first-child", has_text=re.compile(f"^{name}$"))
+    )
+    return line.locator("td").all_inner_texts()[1:]
+
+
+def test_passes_chosen_on_the_list_are_compared_side_by_side(view):
+    settled(view, "/passes")
+    button = view.get_by_role("button", name="Compare")
+    expect(button).to_be_disabled()
+    for key in ("1", "2"):
+        line = view.locator("#passes tbody tr").filter(has=view.locator(f'a[href="/passes/{key}"]'))
+        line.get_by_role("checkbox").press("Space")
+    expect(view).to_have_url(re.compile("compare=1&compare=2"))
+    view.reload()
+    expect(view.locator("#passes input:checked")).to_have_count(2)
+    button.press("Enter")
+    expect(view).to_have_url(re.compile(r"/comparison\?pass=1&pass=2"))
+    answered(view)
+    reports = [
+        view.request.get("/api/v1/reports", params={"pass_id": key}).json()["items"][0] for key in (1, 2)
+    ]
+    figures = [view.request.get(f"/api/v1/reports/{one['id']}/summary").json() for one in reports]
+    estimator = reports[0]["estimator"]
+    expect(view.get_by_label("Navigation solution")).to_have_value(estimator)
+    medians = [one["navigation"][estimator]["median_3d_m"] for one in figures]
+    first, second, change = row(view, f"Median error, {estimator}, m")
+    assert [float(first), float(second)] == pytest.approx(medians, rel=6e-3)  # three figures
+    assert change == "±0" and medians[0] == pytest.approx(medians[1], rel=1e-3)  # the same errors were put in
+    sun = [one["conditions"]["sun_elevation_deg"] for one in figures]
+    change = row(view, "Sun elevation, deg")[2]
+    assert float(change.replace("−", "-")) == pytest.approx(sun[1] - sun[0], rel=6e-3)
+    expect(view.locator("#figures thead")).to_contain_text("synthetic pass (2)")
+    assert row(view, "Frames") == ["40", "30", "−10"]
+    verdicts = row(view, "Verdict")
+    for cell, one in zip(verdicts, reports, strict=False):
+        assert one["verdict"] in cell
+    lines = view.evaluate(
+        """() => {
+            const plot = document.querySelector(".chart").plot;
+            const values = (index) => plot.data[index].filter((value) => value != null);
+            const named = plot.series.map((one, index) => [one.label, values(index)]);
+            return named.filter(([label]) => !["min", "max"].includes(label))
+                .map(([label, found]) => [label, found.length, found[0]]);
+        }"""
+    )
+    assert lines[0][0] == "since start" and lines[0][2] == 0.0
+    assert [count for _, count, _ in lines[1:]] == [40, 30]
+
+
+def test_a_comparison_keeps_its_solution_in_the_address(view):
+    settled(view, "/comparison?pass=1&pass=2")
+    answered(view)
+    view.get_by_label("Navigation solution").select_option("spherical")
+    expect(view).to_have_url(re.compile("solution=spherical"))
+    view.reload()
+    expect(view.get_by_label("Navigation solution")).to_have_value("spherical")
+    expect(view.get_by_label("chart: error of spherical, m")).to_be_visible()
+
+
+def test_a_pass_without_a_report_is_compared_by_what_is_known(view):
+    settled(view, "/comparison?pass=1&pass=3")
+    answered(view)
+    assert row(view, "Verdict")[1] == "no report"
+    assert row(view, "Recall")[1:] == ["unknown", ""]
+    settled(view, "/comparison?pass=1")
+    expect(view.locator("#figures")).to_contain_text("Choose two or more passes")
+
+
+def test_passes_are_filtered_by_their_verdict(view):
+    levels = {
+        key: view.request.get("/api/v1/reports", params={"pass_id": key}).json()["items"][0]["verdict_level"]
+        for key in (1, 2)
+    }
+    settled(view, "/passes?verdict=none")
+    expect(view.locator("#passes tbody tr")).to_have_count(1)
+    expect(view.locator("#passes tbody tr")).to_contain_text("empty")
+    view.get_by_label("Verdict").select_option(levels[1])
+    expect(view).to_have_url(re.compile(f"verdict={levels[1]}"))
+    alike = [key for key, level in levels.items() if level == levels[1]]
+    expect(view.locator("#passes tbody tr")).to_have_count(len(alike))
+    other = next(level for level in ("good", "caution", "bad") if level not in levels.values())
+    view.get_by_label("Verdict").select_option(other)
+    expect(view.locator("#passes")).to_contain_text("No pass matches.")
