@@ -15,6 +15,7 @@ secret() {
   chmod 444 "$folder/$1"
 }
 secret database_superuser_password ''
+secret database_replication_password ''
 secret database_owner_password "${LINNA_DB_OWNER_PASSWORD:-}"
 secret database_password "${LINNA_DB_PASSWORD:-}"
 secret database_backup_password "${LINNA_DB_BACKUP_PASSWORD:-}"

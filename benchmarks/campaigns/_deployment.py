@@ -13,12 +13,15 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import text
 
 from ground_service.store.database import prepare_database
 from ground_service.store.roles import grant_service
+
+if TYPE_CHECKING:
+    from benchmarks.campaigns._failover import DatabaseCluster
 
 
 def free_port() -> int:
@@ -233,14 +236,32 @@ SERVICE_ROLE = "service"
 
 
 class Deployment:
-    """Deployment of PostgreSQL, Redis, API processes and two workers, with a database role that owns nothing."""
+    """Deployment of PostgreSQL, Redis, API processes and two workers, with a database role that owns nothing.
 
-    def __init__(self, folder: Path, apis: int = 1, **settings: str) -> None:
+    Parameters
+    ----------
+    cluster
+        Pair of database servers that the caller starts and stops; default: one server of this deployment.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        apis: int = 1,
+        *,
+        cluster: DatabaseCluster | None = None,
+        schedulers: int = 0,
+        **settings: str,
+    ) -> None:
         if shutil.which("redis-server") is None:
             raise SystemExit("expected redis-server on this machine, found none")
-        database = PostgresServer(folder)
-        self.parts = {"database": database.part}
-        self.url = database.url.replace("//linna@", f"//{SERVICE_ROLE}@")
+        self.parts: dict[str, Part] = {}
+        if cluster is None:
+            database = PostgresServer(folder)
+            self.parts["database"] = database.part
+            self.url = database.url.replace("//linna@", f"//{SERVICE_ROLE}@")
+        else:
+            self.url = cluster.url
         self.home = folder / "home"
         broker = free_port()
         environment = bare_environment(
@@ -266,7 +287,10 @@ class Deployment:
         ]
         addresses = []
         try:
-            self._prepare(database.url)
+            if cluster is None:
+                self._prepare(database.url)
+            else:
+                cluster.prepare()
             self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
             for number in range(1, apis + 1):
                 port = free_port()
@@ -277,6 +301,10 @@ class Deployment:
             for number in (1, 2):
                 log = folder / f"worker{number}.log"
                 self._add(f"worker {number}", Part([*linna, "worker"], log, lambda: True, env=environment))
+            for number in range(1, schedulers + 1):
+                log = folder / f"scheduler{number}.log"
+                part = Part([*linna, "scheduler"], log, lambda: True, env=environment)
+                self._add(f"scheduler {number}", part)
         except BaseException:
             self.stop()
             raise

@@ -57,6 +57,19 @@ PAGE_CACHE_KIB = 16_384
 """SQLite's own cache of each connection; what falls out of it is still in the system's, which all of them share."""
 
 
+LOST_HOST = {
+    "connect_timeout": 10,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 20_000,
+}
+"""Options of libpq with which a connection to a host that no longer answers fails within half a minute."""
+
+SAFE_COMMITS = ("on", "remote_apply")
+"""Values of synchronous_commit with which a commit is on the disk of the server, and of a synchronous standby."""
+
+
 @dataclass(frozen=True, slots=True)
 class Database:
     """An engine and its transactions; `listeners` are called after commits with events."""
@@ -169,7 +182,12 @@ def open_database(url: str) -> Database:
         return Database(engine)
     try:
         engine = create_engine(
-            parsed, pool_pre_ping=True, pool_size=10, max_overflow=20, json_serializer=_json_text
+            parsed,
+            connect_args={name: value for name, value in LOST_HOST.items() if name not in parsed.query},
+            pool_pre_ping=True,
+            pool_size=10,
+            max_overflow=20,
+            json_serializer=_json_text,
         )
         event.listen(engine, "handle_error", _refuse_values)
         event.listen(engine, "connect", _prepare_postgresql)
@@ -340,7 +358,7 @@ def _prepare_postgresql(connection: Any, _record: object) -> None:
     with connection.cursor() as cursor:
         cursor.execute(f"SET {row_digests.WRITER_SETTING} = 'on'")
         cursor.execute("SHOW synchronous_commit")
-        if cursor.fetchone()[0] == "off":
+        if cursor.fetchone()[0] not in SAFE_COMMITS:
             cursor.execute("SET synchronous_commit = on")
     connection.commit()
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from sqlalchemy import make_url
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -25,6 +26,8 @@ SECRETS = (
     "broker_password",
     "admin_token",
 )
+FAILOVER: dict[str, Any] = yaml.safe_load((ROOT / "deploy/failover/compose.yml").read_text())
+ADDED = {name: one for name, one in FAILOVER["services"].items() if "image" in one}
 CERTIFICATE = ("tls_certificate", "tls_key")
 EXACT = re.compile(r"[a-z]+:\d+\.\d+(\.\d+)?-[a-z-]+")
 
@@ -34,9 +37,9 @@ def default_of(text: str) -> str:
     return re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text)
 
 
-@pytest.mark.parametrize("name", sorted(SERVICES))
+@pytest.mark.parametrize("name", sorted({*SERVICES, *ADDED}))
 def test_every_service_is_confined(name: str) -> None:
-    service = SERVICES[name]
+    service = ADDED.get(name) or SERVICES[name]
     assert service["read_only"] and service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]
     assert service["pids_limit"] and service["mem_limit"]
@@ -202,12 +205,46 @@ def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept
     }
     subprocess.run(script, check=True, env=environment, capture_output=True)
     made = {path.name: path.read_text() for path in folder.iterdir()}
-    assert set(made) == {*SECRETS, *CERTIFICATE} and made["admin_token"] == "given" * 5
-    drawn = [made[name] for name in SECRETS if name != "admin_token"]
-    assert len(set(drawn)) == 5 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
+    assert set(made) == {*SECRETS, *FAILOVER["secrets"], *CERTIFICATE}
+    assert made["admin_token"] == "given" * 5
+    drawn = [made[name] for name in (*SECRETS, *FAILOVER["secrets"]) if name != "admin_token"]
+    assert len(set(drawn)) == 6 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
     assert folder.stat().st_mode & 0o077 == 0
     subprocess.run(script, check=True, env={**environment, "LINNA_ADMIN_TOKEN": "other"}, capture_output=True)
     assert {path.name: path.read_text() for path in folder.iterdir()} == made
+
+
+def test_with_failover_every_connection_names_both_servers_and_finds_the_primary() -> None:
+    members = {name for name in ADDED if name.startswith("db")}
+    assert members == {"db", "db2"}
+    for name, service in SERVICES.items():
+        for key, value in service.get("environment", {}).items():
+            if not key.endswith("DATABASE_URL"):
+                continue
+            single, pair = make_url(value), make_url(FAILOVER["services"][name]["environment"][key])
+            assert (pair.username, pair.database) == (single.username, single.database)
+            assert set(pair.query["host"]) == {f"{member}:5432" for member in members}
+            # The role of backups can only read, also on the primary.
+            wanted = "primary" if pair.username == "linna_backup" else "read-write"
+            assert pair.query["target_session_attrs"] == wanted
+
+
+def test_failover_needs_a_majority_of_leases_and_a_copy_of_every_commit() -> None:
+    peers = {name: one for name, one in ADDED.items() if name.startswith("etcd")}
+    assert len(peers) == 3
+    for name, one in peers.items():
+        assert one["environment"]["ETCD_NAME"] == name
+        assert f"{name}=http://{name}:2380" in one["environment"]["ETCD_INITIAL_CLUSTER"]
+    cluster = yaml.safe_load((ROOT / "deploy/failover/patroni.yml").read_text())["bootstrap"]["dcs"]
+    assert cluster["synchronous_mode"] is True and cluster["primary_start_timeout"] == 0
+    # A primary gives up before its lease of `ttl` seconds ends.
+    assert cluster["loop_wait"] + 2 * cluster["retry_timeout"] <= cluster["ttl"] <= 30
+    for member in (ADDED["db"], ADDED["db2"]):
+        assert (
+            set(member["networks"]) == {"data", "consensus"}
+            and "database_replication_password" in member["secrets"]
+        )
+    assert FAILOVER["networks"]["consensus"]["internal"]
 
 
 def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
+from sqlalchemy import make_url
 
 from ground_service.settings import Settings
 from linna.cli import GROUPS
@@ -46,6 +47,22 @@ def test_every_file_is_part_of_the_base() -> None:
 @pytest.mark.parametrize("resource", RESOURCES, ids=name_of)
 def test_a_resource_is_valid(resource: dict[str, Any], version: str) -> None:
     kubernetes_validate.validate(resource, version, strict=True)
+
+
+def test_the_failover_overlay_leads_the_base_to_the_primary_and_keeps_a_copy_of_every_commit() -> None:
+    overlay = BASE / "failover"
+    listed = yaml.safe_load((overlay / "kustomization.yaml").read_text())["resources"]
+    assert listed == ["../", *sorted(path.name for path in overlay.glob("[!k]*.yaml"))]
+    cluster, policy = yaml.safe_load_all((overlay / "database.yaml").read_text())
+    kubernetes_validate.validate(policy, VERSIONS[-1], strict=True)
+    spec = cluster["spec"]
+    (service,) = spec["managed"]["services"]["additional"]
+    (configured,) = (one for one in RESOURCES if one["kind"] == "ConfigMap")
+    host = make_url(configured["data"]["LINNA_DATABASE_URL"]).host
+    assert service["selectorType"] == "rw" and service["serviceTemplate"]["metadata"]["name"] == host
+    assert spec["instances"] >= 3 and spec["postgresql"]["synchronous"]["number"] == 1
+    # The base permits its pods to connect to pods with this label.
+    assert spec["inheritedMetadata"]["labels"] == policy["spec"]["podSelector"]["matchLabels"]
 
 
 def test_an_unknown_key_is_noticed() -> None:
