@@ -16,7 +16,7 @@ from linna.commands._detector_common import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from linna.commands import _detector_domain, _detector_make, _detector_studies
+    from linna.commands import _detector_domain, _detector_make, _detector_pictures, _detector_studies
 
     verbs = parser.add_subparsers(title="verbs", required=True)
 
@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _detector_studies.configure(verbs)
     _detector_make.configure(verbs)
     _detector_domain.configure(verbs)
-    _add_detect(verbs)
+    _detector_pictures.configure(verbs)
     _add_bench_and_info(verbs)
 
 
@@ -121,11 +121,14 @@ def _add_export(verbs: Any) -> None:
 
 
 def _add_evaluate(verbs: Any) -> None:
+    from linna.commands import _detector_pictures
     from linna.output import add_json_flag
 
     evaluate = verbs.add_parser("evaluate", help="precision, recall and localisation on a data set")
     add_model(evaluate)
-    evaluate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    tested = evaluate.add_mutually_exclusive_group(required=True)
+    tested.add_argument("--dataset", type=Path, nargs="+", metavar="DIR")
+    _detector_pictures.add_evaluation(evaluate, tested)
     evaluate.add_argument("--split", choices=("train", "val", "test"), default="test")
     evaluate.add_argument("--source", default="", help="only the frames of this source")
     evaluate.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
@@ -153,24 +156,6 @@ def _add_evaluate(verbs: Any) -> None:
     evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")
     add_json_flag(evaluate)
     evaluate.set_defaults(handler=_evaluate)
-
-
-def _add_detect(verbs: Any) -> None:
-    from linna.output import add_json_flag
-
-    detect = verbs.add_parser("detect", help="craters in any PNG, TIFF or JPEG")
-    detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
-    add_model(detect)
-    detect.add_argument(
-        "--altitude-km", type=float, default=None, help="above the ground; gives size classes"
-    )
-    detect.add_argument("--fov-deg", type=float, default=120.0)
-    detect.add_argument(
-        "--sun-azimuth-deg", type=float, default=None, help="of the Sun in the image, clockwise from its top"
-    )
-    detect.add_argument("--threshold", type=float, default=None)
-    add_json_flag(detect)
-    detect.set_defaults(handler=_detect)
 
 
 def _add_bench_and_info(verbs: Any) -> None:
@@ -254,11 +239,15 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
+    from linna.commands._detector_pictures import evaluate_set, refuse_options_of_sets
     from linna.output import emit, progress
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.data.refits import load_refitted
     from payload_emulator.training.evaluate.evaluate import format_figures, open_for_evaluation, run, summary
 
+    if arguments.coco is not None:
+        return evaluate_set(arguments)
+    refuse_options_of_sets(arguments)
     datasets = [Dataset(folder) for folder in arguments.dataset]
     rims = None if arguments.rims is None else load_refitted(arguments.rims, *arguments.rims_shift)
     detector = open_for_evaluation(model_octets(arguments.model))
@@ -280,79 +269,6 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         write_text(arguments.report, render_html(report))
     emit(arguments, figures, format_figures(figures))
     return 0
-
-
-def _detect(arguments: argparse.Namespace) -> int:
-    import math
-
-    import numpy as np
-
-    from linna.errors import UsageError
-    from linna.output import emit
-    from lunar.catalogue import size_class
-    from payload_emulator.flight.vision.detections import states
-    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
-
-    if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
-        raise UsageError(
-            f"--altitude-km: expected a positive number of kilometres, found {arguments.altitude_km:g}"
-        )
-    if not 0.0 < arguments.fov_deg < 180.0:
-        raise UsageError(f"--fov-deg: expected an angle between 0 and 180, found {arguments.fov_deg:g}")
-    detector = OnnxDetector(
-        model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
-    )
-    sun = None
-    if arguments.sun_azimuth_deg is not None:
-        azimuth = math.radians(arguments.sun_azimuth_deg)
-        sun = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
-    images: list[dict[str, Any]] = []
-    for path in arguments.images:
-        image = _read_image(path)
-        quality, found = detector.examine_any_size(image, sun)
-        classes = np.full(len(found), -1)
-        if arguments.altitude_km is not None:
-            focal = 0.5 * image.shape[1] / math.tan(math.radians(arguments.fov_deg) / 2.0)
-            classes = size_class(found.diameter_px * arguments.altitude_km * 1000.0 / focal)
-        ratios, called = found.depth_ratio, states(found)
-        detections = [
-            {
-                "u_px": round(float(found.u_px[k]), 3),
-                "v_px": round(float(found.v_px[k]), 3),
-                "diameter_px": round(float(found.diameter_px[k]), 3),
-                "score": round(float(found.score[k]), 4),
-                "sigma_px": round(float(found.sigma_px[k]), 3),
-                "class": int(classes[k]),
-                **({} if ratios is None else {"depth_ratio": round(float(ratios[k]), 3), "state": called[k]}),
-            }
-            for k in range(len(found))
-        ]
-        images.append({"file": str(path), "quality": quality.name.lower(), "detections": detections})
-    text = "\n".join(
-        f"{item['file']}: {item['quality']}, {len(item['detections'])} craters" for item in images
-    )
-    emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
-    return 0
-
-
-def _read_image(path: Path) -> Any:
-    """Pixels of an image file, 8 or 16 bits or float; colours in RGB order.
-
-    A 16-bit file whose greatest value would fit into 12 or 14 bits is taken for one of so many.
-    """
-    import cv2
-    import numpy as np
-
-    from linna.errors import UsageError
-
-    octets = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(octets, cv2.IMREAD_UNCHANGED) if octets.size else None
-    if image is None:
-        raise UsageError(f"{path}: expected an image (PNG, TIFF, JPEG), found none that can be read")
-    if image.dtype == np.uint16:
-        held = next(bits for bits in (12, 14, 16) if int(image.max()) < 1 << bits)
-        image = image << (16 - held)
-    return image[..., [2, 1, 0]] if image.ndim == 3 and image.shape[2] >= 3 else image
 
 
 def _bench(arguments: argparse.Namespace) -> int:

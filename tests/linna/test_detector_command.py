@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from linna.cli import run
+from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 
 
 def speckled(shape=(512, 512), dtype=np.uint8):
@@ -66,6 +67,75 @@ def test_a_picture_with_values_that_are_no_numbers_is_a_verdict(write_image, cap
     assert run(["detector", "detect", str(write_image("nan.tiff", image)), "--json"]) == 0
     (item,) = json.loads(capsys.readouterr().out)["images"]
     assert item["quality"] == "invalid" and item["detections"] == []
+
+
+def test_detect_finds_the_sun_that_is_not_given_and_says_so_in_one_line(write_image, capsys):
+    path = write_image("a.png", bowl_image(sun_azimuth_deg=180.0))
+    assert run(["detector", "detect", str(path), "--json"]) == 0
+    out, err = capsys.readouterr()
+    (item,) = json.loads(out)["images"]
+    assert item["sun"]["source"] == "found"
+    assert abs(item["sun"]["azimuth_deg"] - 180.0) < 8.0
+    assert len(item["detections"]) >= 4
+    (line,) = err.strip().splitlines()
+    assert line.startswith(f"{path}: Sun azimuth not given; found 1") and "confidence" in line
+    assert run(["detector", "detect", str(path), "--sun-azimuth-deg", "180", "--two-scales", "--json"]) == 0
+    out, err = capsys.readouterr()
+    (item,) = json.loads(out)["images"]
+    assert item["sun"] == {"source": "given", "azimuth_deg": 180.0, "confidence": None}
+    assert err == ""
+
+
+def test_a_picture_without_craters_leaves_the_sun_unknown(write_image, capsys):
+    noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
+    assert run(["detector", "detect", str(write_image("a.png", noise)), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["images"][0]["sun"]["source"] == "unknown"
+    assert "not given and not found" in err
+
+
+def write_labelled(tmp_path, write_image):
+    write_image("a.png", bowl_image())
+    boxes = [
+        {"id": k, "image_id": 1, "bbox": [u - 19.5, v - 19.5, 40, 40]}
+        for k, (u, v) in enumerate(BOWL_CENTRES)
+    ]
+    document = {"images": [{"id": 1, "file_name": "a.png"}], "annotations": boxes, "categories": []}
+    (tmp_path / "labels.json").write_text(json.dumps(document))
+
+
+def test_a_labelled_set_of_anyone_is_evaluated(tmp_path, write_image, capsys):
+    write_labelled(tmp_path, write_image)
+    assert run(["detector", "evaluate", "--coco", str(tmp_path), "--pixel-m", "200", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["rung"] == 5 and figures["images"] == 1 and figures["craters"] == 4
+    assert set(figures["micro"]) >= {"precision", "recall", "f1", "loc_px", "f1_interval_95"}
+    assert figures["per_class"][0]["expected"] == 4
+    assert run(["detector", "evaluate", "--coco", str(tmp_path), "--two-scales"]) == 0
+    text = capsys.readouterr().out
+    assert "evidence level 5" in text and "two scales" in text
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--report", "r.html"], "--report: expected together with --dataset"),
+        (["--paper-classes"], "--paper-classes: expected together with --dataset"),
+        (["--pixel-m", "0"], "--pixel-m: expected a number above zero, found 0"),
+        (["--fov-deg", "0"], "--fov-deg: expected an angle between 0 and 180"),
+        (["--range-px", "9", "8"], "--range-px: expected two diameters in rising order, found 9 8"),
+        ([], "expected a COCO file"),
+    ],
+)
+def test_what_does_not_fit_a_labelled_set_is_refused(tmp_path, capsys, extra, words):
+    assert run(["detector", "evaluate", "--coco", str(tmp_path), *extra]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, capsys):
+    assert run(["detector", "evaluate", "--dataset", str(tmp_path), "--two-scales"]) == 2
+    assert "--two-scales: expected together with --coco" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray
+from lunar.arrays import FloatArray, IntArray
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import (
@@ -152,34 +152,41 @@ class OnnxDetector:
             return prepared.quality, no_detections()
         height_px, width_px = prepared.gray.shape
         turns = sun_up_turns(sun_in_camera)
-        found = self._search(np.rot90(prepared.gray, turns))
+        found = self.search(np.rot90(prepared.gray, turns))
         u_px, v_px = turn_back(found.u_px, found.v_px, turns, height_px, width_px)
-        found = replace(found, u_px=u_px, v_px=v_px)
-        if (height_px, width_px) == (self.parameters.height_px, self.parameters.width_px):
-            found = remove_parallax(found, self.parallax_per_px, height_px, width_px)
-        return ImageQuality.OK, found
+        return ImageQuality.OK, self.to_rim_plane(replace(found, u_px=u_px, v_px=v_px), height_px, width_px)
+
+    def to_rim_plane(self, found: Detections, height_px: int, width_px: int) -> Detections:
+        """Detections of an image (H, W), without parallax if it has the size of the camera's frames."""
+        if (height_px, width_px) != (self.parameters.height_px, self.parameters.width_px):
+            return found
+        return remove_parallax(found, self.parallax_per_px, height_px, width_px)
 
     def run_network(self, tile: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Heatmap and geometry maps of one prepared tile (1, 1, 512, 512)."""
         heatmap, geometry = self._session.run([HEATMAP_NAME, GEOMETRY_NAME], {INPUT_NAME: tile})
         return heatmap, geometry
 
-    def _search(self, gray: NDArray[np.float32]) -> Detections:
+    def search(self, gray: NDArray[np.float32], score_threshold: float | None = None) -> Detections:
+        """Detections of a prepared plane (H, W) of any size with the Sun at its top, best first.
+
+        `score_threshold` None takes that of the detector.
+        """
+        least = self.score_threshold if score_threshold is None else score_threshold
         rows, columns = gray.shape
-        if rows <= INPUT_SIZE_PX and columns <= INPUT_SIZE_PX:
-            found = [self._search_tile(gray, 0, 0)]
-        else:
-            found = [
-                self._search_tile(gray, top, left)
-                for top in _tile_starts(rows)
-                for left in _tile_starts(columns)
-            ]
-        every = found[0] if len(found) == 1 else _joined(found)
+        found = [
+            self._search_tile(gray, top, left, least)
+            for top in _tile_starts(rows)
+            for left in _tile_starts(columns)
+        ]
+        every = found[0] if len(found) == 1 else join(found)
         order = np.argsort(-every.score, kind="stable")
         kept = drop_duplicates(every.select(order), self.parameters)
         return kept.select(np.arange(min(len(kept), self.parameters.max_detections * len(found))))
 
-    def _search_tile(self, gray: NDArray[np.float32], top: int, left: int) -> Detections:
+    def _search_tile(
+        self, gray: NDArray[np.float32], top: int, left: int, score_threshold: float
+    ) -> Detections:
         tile = gray[top : top + INPUT_SIZE_PX, left : left + INPUT_SIZE_PX]
         rows, columns = tile.shape
         if tile.shape != (INPUT_SIZE_PX, INPUT_SIZE_PX):
@@ -188,10 +195,10 @@ class OnnxDetector:
             tile = padded
         heatmap, geometry = self.run_network(np.ascontiguousarray(tile)[None, None])
         if self.class_medians_m is None:
-            found = decode(heatmap[0, 0], geometry[0], self.score_threshold, self.stride_px)
+            found = decode(heatmap[0, 0], geometry[0], score_threshold, self.stride_px)
         else:
             found = decode_classes(
-                heatmap[0], geometry[0], self.class_medians_m, self.score_threshold, self.stride_px
+                heatmap[0], geometry[0], self.class_medians_m, score_threshold, self.stride_px
             )
         inside = (found.u_px < columns) & (found.v_px < rows)
         found = found.select(inside)
@@ -264,7 +271,7 @@ def decode_classes(
     """
     parts = [decode(heatmap, geometry, score_threshold, stride_px) for heatmap in heatmaps]
     classes = np.concatenate([np.full(len(part), k, dtype=np.int64) for k, part in enumerate(parts)])
-    found = replace(_joined(parts), size_class=classes, diameter_m=medians_m[classes])
+    found = replace(join(parts), size_class=classes, diameter_m=medians_m[classes])
     found = found.select(np.argsort(-found.score, kind="stable"))
     distance = np.hypot(found.u_px[:, None] - found.u_px, found.v_px[:, None] - found.v_px)
     repeated = np.triu(distance < SAME_PLACE_CELLS * stride_px, 1)
@@ -296,7 +303,9 @@ def remove_parallax(found: Detections, share_per_px: float, height_px: int, widt
     )
 
 
-def _joined(parts: list[Detections]) -> Detections:
+def join(parts: list[Detections]) -> Detections:
+    """Detections of several searches in one; columns that one of them lacks are left out."""
+
     def column(name: str) -> Any:
         values = [getattr(part, name) for part in parts]
         return None if any(value is None for value in values) else np.concatenate(values)
@@ -312,20 +321,51 @@ def _tile_starts(length: int) -> list[int]:
     return [int(start) for start in np.rint(np.linspace(0, length - INPUT_SIZE_PX, count))]
 
 
+MANY_DETECTIONS = (
+    512  # from here on, comparing each with each other takes longer than a search for neighbours
+)
+
+
 def drop_duplicates(found: Detections, parameters: DetectorParameters) -> Detections:
-    """Detections (best first) without those that repeat a better one; of unknown sizes, all."""
+    """Detections (best first) without those that repeat a better one; of unknown sizes, all.
+
+    Time grows with n log n, so that mosaics with a hundred thousand craters can be searched.
+    """
+    if len(found) <= MANY_DETECTIONS:
+        better, worse = np.nonzero(np.triu(np.ones((len(found), len(found)), bool), 1))
+    else:
+        better, worse = _neighbours(found, parameters)
     radius = 0.5 * found.diameter_px
+    distance = np.hypot(found.u_px[better] - found.u_px[worse], found.v_px[better] - found.v_px[worse])
     size = np.log(found.diameter_px)
-    distance = np.hypot(found.u_px[:, None] - found.u_px, found.v_px[:, None] - found.v_px)
-    same = (distance < parameters.duplicate_distance * np.minimum(radius[:, None], radius)) & (
-        np.abs(size[:, None] - size) < np.log(parameters.duplicate_ratio)
+    same = (distance < parameters.duplicate_distance * np.minimum(radius[better], radius[worse])) & (
+        np.abs(size[better] - size[worse]) < np.log(parameters.duplicate_ratio)
     )
-    better, worse = np.nonzero(np.triu(same, 1))
     keep = np.ones(len(found), bool)
-    for first, second in zip(better, worse, strict=True):  # in order of the better one's rank
+    for first, second in zip(better[same], worse[same], strict=True):  # in order of the better one's rank
         if keep[first]:
             keep[second] = False
     return found.select(keep)
+
+
+def _neighbours(found: Detections, parameters: DetectorParameters) -> tuple[IntArray, IntArray]:
+    """Pairs (better, worse) in rank order that include every pair that may be one crater found twice.
+
+    Sizes are sorted into bins as wide as the greatest ratio of such a pair, so it lies in one bin or in two adjacent
+    ones, and its distance is at most a share of the greatest radius of the smaller bin.
+    """
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(found.diameter_px) & (found.diameter_px > 0.0))
+    bins = np.floor(np.log(found.diameter_px[known]) / np.log(parameters.duplicate_ratio))
+    places = np.stack([found.u_px, found.v_px], axis=1)
+    pairs = [np.zeros((0, 2), np.int64)]
+    for low in np.unique(bins):
+        near = known[(bins == low) | (bins == low + 1.0)]
+        reach = 0.5 * parameters.duplicate_distance * parameters.duplicate_ratio ** (low + 1.0)
+        pairs.append(near[cKDTree(places[near]).query_pairs(reach, output_type="ndarray")])
+    every = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
+    return every[:, 0], every[:, 1]
 
 
 def _class_medians(session: onnxruntime.InferenceSession, metadata: dict[str, str]) -> FloatArray | None:

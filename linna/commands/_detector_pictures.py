@@ -1,0 +1,221 @@
+"""`linna detector detect` and `linna detector evaluate --coco`: single pictures and labelled sets of them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+from linna.commands._detector_common import add_model, model_octets
+
+
+def configure(verbs: Any) -> None:
+    """Add the verb `detect`."""
+    from linna.output import add_json_flag
+
+    detect = verbs.add_parser("detect", help="craters in any PNG, TIFF, JPEG or NPY")
+    detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
+    add_model(detect)
+    detect.add_argument(
+        "--altitude-km", type=float, default=None, help="above the ground; gives size classes"
+    )
+    detect.add_argument("--fov-deg", type=float, default=120.0)
+    detect.add_argument("--threshold", type=float, default=None)
+    _add_search(detect)
+    add_json_flag(detect)
+    detect.set_defaults(handler=_detect)
+
+
+def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
+    """Add the options of an evaluation on a labelled set; `tested` holds what can be evaluated on."""
+    tested.add_argument(
+        "--coco", type=Path, metavar="DIR", help="a set of images with crater boxes or polygons in COCO files"
+    )
+    of_set = evaluate.add_argument_group("with --coco")
+    _add_search(of_set)
+    of_set.add_argument(
+        "--pixel-m", type=float, default=math.nan, help="ground covered by a pixel; gives classes in km"
+    )
+    of_set.add_argument(
+        "--altitude-km", type=float, default=math.nan, help="above the ground, with --fov-deg, instead"
+    )
+    of_set.add_argument("--fov-deg", type=float, default=120.0)
+    of_set.add_argument(
+        "--range-px",
+        type=float,
+        nargs=2,
+        default=(8.0, 150.0),
+        metavar=("LOW", "HIGH"),
+        help="diameters that are scored (default: 8 150)",
+    )
+    of_set.add_argument(
+        "--level",
+        choices=("2", "3s", "3", "4", "5"),
+        default="5",
+        help="evidence level of the images (default: 5, photographs)",
+    )
+
+
+def evaluate_set(arguments: argparse.Namespace) -> int:
+    """Evaluate on a labelled set."""
+    from linna.errors import UsageError
+    from linna.output import emit, progress
+    from payload_emulator.training.evaluate.evaluate import open_for_evaluation
+    from payload_emulator.training.evaluate.pictures import (
+        PictureSetOptions,
+        evaluate_pictures,
+        format_picture_figures,
+    )
+
+    for name in ("report", "run", "rims", "source", "paper_classes"):
+        if getattr(arguments, name):
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{option}: expected together with --dataset, found with --coco")
+    for name in ("pixel_m", "altitude_km"):
+        if getattr(arguments, name) <= 0.0:
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{option}: expected a number above zero, found {getattr(arguments, name):g}")
+    _check_fov(arguments.fov_deg)
+    low, high = arguments.range_px
+    if not 0.0 <= low < high:
+        raise UsageError(f"--range-px: expected two diameters in rising order, found {low:g} {high:g}")
+    detector = open_for_evaluation(model_octets(arguments.model))
+    own = float(detector.metadata.get("score_threshold", "0.4"))
+    figures = evaluate_pictures(
+        detector,
+        arguments.coco,
+        own if arguments.threshold is None else arguments.threshold,
+        PictureSetOptions(
+            sun_azimuth_deg=arguments.sun_azimuth_deg,
+            pixel_m=arguments.pixel_m,
+            altitude_km=arguments.altitude_km,
+            fov_deg=arguments.fov_deg,
+            range_px=(low, high),
+            two_scales=arguments.two_scales,
+            level=arguments.level,
+        ),
+        lambda pictures: progress(pictures, len(pictures), "evaluate", "images"),
+    )
+    emit(arguments, figures, format_picture_figures(figures))
+    return 0
+
+
+def refuse_options_of_sets(arguments: argparse.Namespace) -> None:
+    """Refuse options of labelled sets where a data set of the project is evaluated.
+
+    Raises
+    ------
+    UsageError
+        One of them was given.
+    """
+    from linna.errors import UsageError
+
+    if arguments.two_scales:
+        raise UsageError("--two-scales: expected together with --coco, found with --dataset")
+    if arguments.sun_azimuth_deg is not None:
+        raise UsageError("--sun-azimuth-deg: expected together with --coco, found with --dataset")
+
+
+def _add_search(parser: Any) -> None:
+    parser.add_argument(
+        "--sun-azimuth-deg",
+        type=float,
+        default=None,
+        help="of the Sun in the image, clockwise from its top; without it, the azimuth is found from the image",
+    )
+    parser.add_argument(
+        "--two-scales",
+        action="store_true",
+        help="also search the image enlarged twice, for small craters; up to ten times the time",
+    )
+
+
+def _check_fov(fov_deg: float) -> None:
+    from linna.errors import UsageError
+
+    if not 0.0 < fov_deg < 180.0:
+        raise UsageError(f"--fov-deg: expected an angle between 0 and 180, found {fov_deg:g}")
+
+
+def _detect(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit, log
+    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
+    from payload_emulator.flight.vision.picture_search import search_picture, sun_at_azimuth
+    from payload_emulator.training.data.pictures import read_picture
+
+    if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
+        raise UsageError(
+            f"--altitude-km: expected a positive number of kilometres, found {arguments.altitude_km:g}"
+        )
+    _check_fov(arguments.fov_deg)
+    detector = OnnxDetector(
+        model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
+    )
+    sun = None if arguments.sun_azimuth_deg is None else sun_at_azimuth(arguments.sun_azimuth_deg)
+    images: list[dict[str, Any]] = []
+    for path in arguments.images:
+        image = read_picture(path)
+        outcome = search_picture(detector, image, sun, two_scales=arguments.two_scales)
+        item: dict[str, Any] = {
+            "file": str(path),
+            "quality": outcome.quality.name.lower(),
+            "sun": _sun(outcome, arguments.sun_azimuth_deg),
+            "detections": _detections(outcome.detections, image.shape[1], arguments),
+        }
+        if sun is None and item["quality"] == "ok":
+            log(f"{path}: {_sun_sentence(item['sun'])}")
+        images.append(item)
+    text = "\n".join(
+        f"{item['file']}: {item['quality']}, {len(item['detections'])} craters" for item in images
+    )
+    emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
+    return 0
+
+
+def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:
+    """Azimuth that a search used, and where it comes from."""
+    if given_deg is not None:
+        return {"source": "given", "azimuth_deg": given_deg, "confidence": None}
+    if outcome.sun is None:
+        return {"source": "unknown", "azimuth_deg": None, "confidence": None}
+    return {
+        "source": "found",
+        "azimuth_deg": round(outcome.sun.azimuth_deg, 1),
+        "confidence": round(outcome.sun.confidence, 3),
+    }
+
+
+def _sun_sentence(sun: dict[str, Any]) -> str:
+    if sun["azimuth_deg"] is None:
+        return "Sun azimuth not given and not found: no turn of the image shows a crater; searched as it is"
+    return (
+        f"Sun azimuth not given; found {sun['azimuth_deg']:.0f} degrees clockwise from the top "
+        f"(confidence {sun['confidence']:.2f})"
+    )
+
+
+def _detections(found: Any, width_px: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    import numpy as np
+
+    from lunar.catalogue import size_class
+    from payload_emulator.flight.vision.detections import states
+
+    classes = np.full(len(found), -1)
+    if arguments.altitude_km is not None:
+        focal = 0.5 * width_px / math.tan(math.radians(arguments.fov_deg) / 2.0)
+        classes = size_class(found.diameter_px * arguments.altitude_km * 1000.0 / focal)
+    ratios, called = found.depth_ratio, states(found)
+    return [
+        {
+            "u_px": round(float(found.u_px[k]), 3),
+            "v_px": round(float(found.v_px[k]), 3),
+            "diameter_px": round(float(found.diameter_px[k]), 3),
+            "score": round(float(found.score[k]), 4),
+            "sigma_px": round(float(found.sigma_px[k]), 3),
+            "class": int(classes[k]),
+            **({} if ratios is None else {"depth_ratio": round(float(ratios[k]), 3), "state": called[k]}),
+        }
+        for k in range(len(found))
+    ]

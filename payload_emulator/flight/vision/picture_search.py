@@ -1,0 +1,208 @@
+"""Search of single pictures, such as photographs: direction of the Sun where it is not stated, and small craters.
+
+The network is trained on images whose Sun is within 45 degrees of the top, so the direction of the Sun decides which of
+the four quarter turns is searched. Where it is not stated, it is found in two steps. First, up to four squares of the
+picture, enlarged twice, are searched in all four turns; the turn with the most evidence is taken. Evidence is the sum
+of the sixth powers of the scores of at least 0.44, so that sure craters decide and not the number of doubtful ones.
+Second, the azimuth follows from the brightness inside the craters found: the wall that faces the Sun is the bright one.
+
+The numbers of this module were fixed on rendered validation frames (`scenarios/detector-validation.toml`), never on
+photographs; `docs/detector.md` has the figures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.arrays import FloatArray
+from payload_emulator.flight.vision.detections import Detections, no_detections
+from payload_emulator.flight.vision.detector import INPUT_SIZE_PX, OnnxDetector, drop_duplicates, join
+from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_image, sun_up_turns, turn_back
+
+EVIDENCE_SCORE = 0.44
+EVIDENCE_POWER = 6.0
+CONFIDENCE_POWER = 2.6
+"""Evidence to this power, as shares of the four turns, is the probability of a turn (maximum likelihood, squares of
+128 px of the validation frames; larger pictures are somewhat surer than stated)."""
+
+_EVIDENCE_SQUARE_PX = INPUT_SIZE_PX // 2
+_LEAST_DIPOLE_PX = 8.0  # inside a smaller crater, a few pixels decide
+_DIPOLE_SHARE = 0.8  # of the radius: the rim itself and what lies beyond are left out
+
+SMALL_CRATERS_PX = 32.0
+"""Up to this diameter, in pixels of the picture, craters are taken from the enlarged picture. On every source of the
+validation frames its F1 from 12 to 32 px is at least that of the picture itself; above, that is not so."""
+
+
+@dataclass(frozen=True, slots=True)
+class SunEstimate:
+    """Direction of the Sun in a picture, from the picture.
+
+    azimuth_deg : clockwise from the top of the picture, 0 to 360.
+    confidence : probability that the turn with the most evidence is right; .25 would be a guess.
+    evidence : of the turns that have the Sun at 0, 90, 180 and 270 degrees.
+    craters : from which the azimuth was computed; 0 leaves the azimuth of the turn.
+    """
+
+    azimuth_deg: float
+    confidence: float
+    evidence: tuple[float, float, float, float]
+    craters: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureSearch:
+    """Outcome of the search of a picture; `sun` is None where its direction was stated or nothing shows it."""
+
+    quality: ImageQuality
+    detections: Detections
+    sun: SunEstimate | None = None
+
+
+def sun_at_azimuth(azimuth_deg: float) -> FloatArray:
+    """Direction to the Sun in the camera frame, (3,), in the image plane, of an azimuth clockwise from the top."""
+    azimuth = np.radians(azimuth_deg)
+    return np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+
+
+def search_picture(
+    detector: OnnxDetector,
+    image: NDArray[np.generic],
+    sun_in_camera: FloatArray | None = None,
+    *,
+    two_scales: bool = False,
+) -> PictureSearch:
+    """Craters of a picture of any size; the direction of the Sun is found where it is not given.
+
+    Parameters
+    ----------
+    image : as `OnnxDetector.detect` takes it.
+    sun_in_camera : direction to the Sun, (3,), camera frame; None: it is found from the picture.
+    two_scales : also search the picture enlarged twice, for craters of up to `SMALL_CRATERS_PX`; up to ten times
+        the time.
+    """
+    prepared = prepare_image(image, detector.preparation)
+    if prepared.quality is not ImageQuality.OK:
+        return PictureSearch(prepared.quality, no_detections())
+    estimate = find_sun(detector, prepared.gray) if sun_in_camera is None else None
+    if estimate is not None:
+        sun_in_camera = sun_at_azimuth(estimate.azimuth_deg)
+    turns = sun_up_turns(sun_in_camera)
+    upright = np.rot90(prepared.gray, turns)
+    found = detector.search(upright)
+    if two_scales:
+        found = _merge(found, _search_enlarged(detector, upright), detector)
+    u_px, v_px = turn_back(found.u_px, found.v_px, turns, *prepared.gray.shape)
+    found = detector.to_rim_plane(replace(found, u_px=u_px, v_px=v_px), *prepared.gray.shape)
+    return PictureSearch(ImageQuality.OK, found, estimate)
+
+
+def find_sun(detector: OnnxDetector, gray: NDArray[np.float32]) -> SunEstimate | None:
+    """Direction of the Sun from a prepared plane (H, W); None where no turn shows a crater."""
+    squares = [enlarge(square) for square in _squares(gray)]
+    evidence = np.zeros(4)
+    found: list[list[Detections]] = []
+    for turns in range(4):
+        found.append([detector.search(np.rot90(square, turns), EVIDENCE_SCORE) for square in squares])
+        evidence[turns] = sum(float((part.score**EVIDENCE_POWER).sum()) for part in found[-1])
+    if not evidence.any():
+        return None
+    best = int(np.argmax(evidence))
+    share = (evidence / evidence[best]) ** CONFIDENCE_POWER
+    upright = [np.rot90(square, best) for square in squares]
+    pulls = np.concatenate(
+        [_bright_walls(plane, part) for plane, part in zip(upright, found[best], strict=True)]
+    )
+    away = complex(pulls.sum()) if pulls.size else 0j
+    # In the turned plane: the Sun is opposite to the bright walls. Clockwise from the top: right is +90 degrees.
+    tilt = float(np.degrees(np.angle(complex(away.imag, -away.real)))) if away else 0.0
+    return SunEstimate(
+        azimuth_deg=(90.0 * best + tilt) % 360.0,
+        confidence=float(1.0 / share.sum()),
+        evidence=(float(evidence[0]), float(evidence[1]), float(evidence[2]), float(evidence[3])),
+        craters=int(pulls.size),
+    )
+
+
+def enlarge(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A plane (H, W) at twice its size (2 H, 2 W), by cubic interpolation (Keys, a = -0.5).
+
+    Pixel x of the plane lies at 2 x + 0.5 of the enlarged one.
+    """
+    for axis in (0, 1):
+        plane = _enlarge_rows(plane) if axis == 0 else _enlarge_rows(plane.T).T
+    return np.ascontiguousarray(plane)
+
+
+def _enlarge_rows(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    # Weights of the neighbours at distances 1.25, 0.25, 0.75 and 1.75 of Keys' kernel, mirrored for the other half.
+    weights = np.array([-0.0703125, 0.8671875, 0.2265625, -0.0234375], np.float32)
+    rows = plane.shape[0]
+    padded = np.pad(plane, ((2, 2), (0, 0)), mode="edge")
+    larger = np.empty((2 * rows, plane.shape[1]), np.float32)
+    part = [padded[k : k + rows] for k in range(5)]  # rows at -2, -1, 0, +1, +2
+    larger[0::2] = weights[3] * part[0] + weights[2] * part[1] + weights[1] * part[2] + weights[0] * part[3]
+    larger[1::2] = weights[0] * part[1] + weights[1] * part[2] + weights[2] * part[3] + weights[3] * part[4]
+    return larger
+
+
+def _squares(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """One to four squares of half the network's input, spread over a plane; the whole of a smaller one."""
+    starts = [
+        [0]
+        if length <= _EVIDENCE_SQUARE_PX
+        else sorted({int(q * (length - _EVIDENCE_SQUARE_PX)) for q in spread})
+        for length in gray.shape
+        for spread in [(0.0, 1.0) if length <= 2 * _EVIDENCE_SQUARE_PX else (0.25, 0.75)]
+    ]
+    return [
+        gray[top : top + _EVIDENCE_SQUARE_PX, left : left + _EVIDENCE_SQUARE_PX]
+        for top in starts[0]
+        for left in starts[1]
+    ]
+
+
+def _bright_walls(plane: NDArray[np.float32], found: Detections) -> NDArray[np.complex128]:
+    """For each crater of a plane the direction of its bright wall (right + i down, unit) times its score, (n,)."""
+    rows, columns = plane.shape
+    pulls = []
+    for u, v, diameter, score in zip(found.u_px, found.v_px, found.diameter_px, found.score, strict=True):
+        radius = 0.5 * _DIPOLE_SHARE * diameter
+        left, right = int(max(0, np.ceil(u - radius))), int(min(columns - 1, u + radius))
+        top, bottom = int(max(0, np.ceil(v - radius))), int(min(rows - 1, v + radius))
+        if not diameter >= _LEAST_DIPOLE_PX or right <= left or bottom <= top:
+            continue
+        down, across = np.mgrid[top : bottom + 1, left : right + 1]
+        inside = (across - u) ** 2 + (down - v) ** 2 <= radius**2
+        values = plane[top : bottom + 1, left : right + 1][inside].astype(np.float64)
+        values -= values.mean()
+        pull = complex(float((across - u)[inside] @ values), float((down - v)[inside] @ values))
+        if pull:
+            pulls.append(score * pull / abs(pull))
+    return np.array(pulls, dtype=np.complex128)
+
+
+def _search_enlarged(detector: OnnxDetector, upright: NDArray[np.float32]) -> Detections:
+    """Small craters of an upright plane from the plane enlarged twice, in its own pixels."""
+    found = detector.search(enlarge(upright))
+    return replace(
+        found,
+        u_px=(found.u_px - 0.5) / 2.0,
+        v_px=(found.v_px - 0.5) / 2.0,
+        diameter_px=found.diameter_px / 2.0,
+        sigma_px=found.sigma_px / 2.0,
+    )
+
+
+def _merge(coarse: Detections, fine: Detections, detector: OnnxDetector) -> Detections:
+    """Small craters of the enlarged plane and the larger ones of the plane itself, best first, each once."""
+    every = join(
+        [
+            coarse.select(coarse.diameter_px > SMALL_CRATERS_PX),
+            fine.select(fine.diameter_px <= SMALL_CRATERS_PX),
+        ]
+    )
+    return drop_duplicates(every.select(np.argsort(-every.score, kind="stable")), detector.parameters)

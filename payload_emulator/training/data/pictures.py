@@ -1,0 +1,288 @@
+"""Labelled image sets in COCO form, from any source, and the reading of image files.
+
+A set is a folder with one or more COCO files (`*.json`, at any depth). Image files lie beside their COCO file or in its
+folder `images`. A crater is a box or one or more polygons; of a polygon, centre and diameter are those of its area.
+Further keys are read where present: `centre` and `diameter` of an annotation (as `linna dataset build` writes them),
+`sun_azimuth_deg`, `pixel_m` and `altitude_km` of an image. Pixel centres are integers, so the centre of a box that
+starts at x and is w wide is x + w / 2 - 0.5.
+
+References
+----------
+T.-Y. Lin et al., "Microsoft COCO: Common Objects in Context", 2014; data format of the COCO object detection task.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.arrays import BoolArray, FloatArray
+from payload_emulator.errors import DatasetError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledPicture:
+    """One image of a set with its craters; arrays (n,), boxes (n, 4) as left, top, width, height from the image corner.
+
+    `crowd` marks regions that stand for many craters.
+    `sun_azimuth_deg` is that of the Sun in the image, clockwise from its top; NaN where the set does not state it, as
+    `pixel_m` and `altitude_km`.
+    """
+
+    path: Path
+    width_px: int
+    height_px: int
+    u_px: FloatArray
+    v_px: FloatArray
+    diameter_px: FloatArray
+    box_px: FloatArray
+    crowd: BoolArray
+    sun_azimuth_deg: float = math.nan
+    pixel_m: float = math.nan
+    altitude_km: float = math.nan
+
+
+def read_picture(path: Path) -> NDArray[np.generic]:
+    """Pixels of an image file (PNG, JPEG, TIFF, NPY), 8 or 16 bits or float in 0..1; colours in RGB order.
+
+    A 16-bit file whose greatest value would fit into 12 or 14 bits is taken for one of so many. Float pixels above 1
+    are divided by the greatest one.
+
+    Raises
+    ------
+    DatasetError
+        The file cannot be read as an image.
+    """
+    try:
+        octets = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: expected an image file, found none ({error.strerror})") from error
+    image = _decode_npy(path) if path.suffix.lower() == ".npy" else _decode(octets)
+    if image is None:
+        raise DatasetError(f"{path}: expected an image (PNG, TIFF, JPEG, NPY), found none that can be read")
+    if image.dtype == np.uint16 and image.size:
+        held = next(bits for bits in (12, 14, 16) if int(image.max()) < 1 << bits)
+        image = np.left_shift(image.astype(np.uint16), 16 - held)
+    if image.dtype.kind == "f" and image.size and float(image.max()) > 1.0:
+        image = np.divide(image, float(image.max()))
+    return image
+
+
+def load_pictures(folder: Path) -> list[LabelledPicture]:
+    """Images of a labelled set with their craters, in the order of the COCO files and of the images in them.
+
+    Raises
+    ------
+    DatasetError
+        The folder holds no COCO file, or one that contradicts itself or its images; the message names the place.
+    """
+    files = sorted(path for path in folder.rglob("*.json") if path.is_file())
+    documents = [(path, document) for path in files if (document := _coco(path)) is not None]
+    if not documents:
+        raise DatasetError(
+            f"{folder}: expected a COCO file (*.json with images, annotations and categories), found "
+            f"{'none' if folder.is_dir() else 'no such folder'}"
+        )
+    return [picture for path, document in documents for picture in _pictures(path, document)]
+
+
+def _decode(octets: bytes) -> NDArray[np.generic] | None:
+    import cv2
+
+    data = np.frombuffer(octets, np.uint8)
+    image: NDArray[np.generic] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if image is None or image.ndim == 2 or image.shape[2] < 3:
+        return image
+    return image[..., [2, 1, 0]]
+
+
+def _decode_npy(path: Path) -> NDArray[np.generic] | None:
+    try:
+        image = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError):
+        return None
+    if not isinstance(image, np.ndarray) or image.ndim not in (2, 3) or image.dtype.kind not in "uf":
+        return None
+    return image
+
+
+def _coco(path: Path) -> dict[str, Any] | None:
+    """The document of a COCO file; None where a JSON file is of another kind."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"{path}: expected JSON, found none ({error})") from error
+    if not isinstance(document, dict) or "annotations" not in document or "images" not in document:
+        return None
+    for name in ("images", "annotations"):
+        if not isinstance(document[name], list) or not all(isinstance(item, dict) for item in document[name]):
+            raise DatasetError(f"{path}, {name}: expected a list of objects, found another value")
+    return document
+
+
+def _pictures(path: Path, document: dict[str, Any]) -> list[LabelledPicture]:
+    labels: dict[Any, list[_Label]] = {}
+    for k, item in enumerate(document["images"]):
+        number = _value(item, "id", f"{path}, images[{k}]")
+        if number in labels:
+            raise DatasetError(
+                f"{path}, images[{k}].id: expected a number of its own, found {number!r} twice"
+            )
+        labels[number] = []
+    for k, item in enumerate(document["annotations"]):
+        place = f"{path}, annotations[{k}]"
+        number = _value(item, "image_id", place)
+        if number not in labels:
+            raise DatasetError(f"{place}.image_id: expected the id of an image, found {number!r}")
+        labels[number].append(_label(item, place))
+    return [
+        _picture(path, item, labels[item["id"]], f"{path}, images[{k}]")
+        for k, item in enumerate(document["images"])
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Label:
+    u_px: float
+    v_px: float
+    diameter_px: float
+    box: tuple[float, float, float, float]
+    crowd: bool
+
+
+def _picture(path: Path, item: Mapping[str, Any], labels: list[_Label], place: str) -> LabelledPicture:
+    name = _value(item, "file_name", place)
+    if not isinstance(name, str) or not name:
+        raise DatasetError(f"{place}.file_name: expected the name of an image file, found {name!r}")
+    found = next(
+        (file for file in (path.parent / name, path.parent / "images" / name) if file.is_file()), None
+    )
+    if found is None:
+        raise DatasetError(f"{place}.file_name: expected an image file, found no {path.parent / name}")
+    if found.suffix.lower() not in IMAGE_SUFFIXES:
+        raise DatasetError(
+            f"{place}.file_name: expected a file with one of {' '.join(IMAGE_SUFFIXES)}, found {found.name}"
+        )
+    height_px, width_px = read_picture(found).shape[:2]
+    stated = (_number(item, "width", place, width_px), _number(item, "height", place, height_px))
+    if stated != (width_px, height_px):
+        raise DatasetError(
+            f"{place}: expected the size of {found.name}, {width_px} x {height_px} pixels, "
+            f"found {stated[0]:g} x {stated[1]:g}"
+        )
+    box = np.array([label.box for label in labels], dtype=np.float64).reshape(-1, 4)
+    return LabelledPicture(
+        path=found,
+        width_px=width_px,
+        height_px=height_px,
+        u_px=np.array([label.u_px for label in labels], dtype=np.float64),
+        v_px=np.array([label.v_px for label in labels], dtype=np.float64),
+        diameter_px=np.array([label.diameter_px for label in labels], dtype=np.float64),
+        box_px=box,
+        crowd=np.array([label.crowd for label in labels], dtype=bool),
+        sun_azimuth_deg=_number(item, "sun_azimuth_deg", place, math.nan),
+        pixel_m=_positive(item, "pixel_m", place),
+        altitude_km=_positive(item, "altitude_km", place),
+    )
+
+
+def _label(item: Mapping[str, Any], place: str) -> _Label:
+    crowd = item.get("iscrowd", 0) in (1, True)
+    polygons = item.get("segmentation")
+    if isinstance(polygons, list) and polygons:
+        box, u, v, diameter = _of_polygons(polygons, place)
+    elif item.get("bbox"):
+        box = _box(item["bbox"], place)
+        u, v = box[0] + 0.5 * box[2] - 0.5, box[1] + 0.5 * box[3] - 0.5
+        diameter = math.sqrt(box[2] * box[3])
+    else:
+        found = "a run-length mask" if isinstance(polygons, dict) else "neither"
+        raise DatasetError(f"{place}: expected a box (bbox) or polygons (segmentation), found {found}")
+    if "centre" in item and "diameter" in item:
+        u, v = _numbers(item["centre"], 2, f"{place}.centre")
+        diameter = _positive(item, "diameter", place)
+    return _Label(u, v, diameter, box, crowd)
+
+
+def _box(value: Any, place: str) -> tuple[float, float, float, float]:
+    x, y, width, height = _numbers(value, 4, f"{place}.bbox")
+    if width <= 0.0 or height <= 0.0:
+        raise DatasetError(
+            f"{place}.bbox: expected [x, y, width, height] with a size above zero, found {value}"
+        )
+    return x, y, width, height
+
+
+def _of_polygons(
+    polygons: list[Any], place: str
+) -> tuple[tuple[float, float, float, float], float, float, float]:
+    """Box, centre and diameter of the circle of equal area of polygons, whose parts do not overlap."""
+    area, moment = 0.0, np.zeros(2)
+    corners = []
+    for k, polygon in enumerate(polygons):
+        where = f"{place}.segmentation[{k}]"
+        if not isinstance(polygon, list) or len(polygon) < 6 or len(polygon) % 2:
+            raise DatasetError(
+                f"{where}: expected at least three pairs x, y in one list, found {polygon!s:.60}"
+            )
+        points = np.array(_numbers(polygon, len(polygon), where)).reshape(-1, 2)
+        start = points[0]
+        x, y = (points - start).T  # about a corner, so that little is lost far from the origin
+        cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+        part = 0.5 * float(cross.sum())
+        if part == 0.0:
+            raise DatasetError(f"{where}: expected a polygon with an area, found {polygon!s:.60}")
+        middle = np.array([((p + np.roll(p, -1)) * cross).sum() for p in (x, y)]) / (6.0 * part) + start
+        area += abs(part)
+        moment += abs(part) * middle
+        corners.append(points)
+    every = np.concatenate(corners)
+    low, size = every.min(axis=0), np.ptp(every, axis=0)
+    centre = moment / area - 0.5
+    box = (float(low[0]), float(low[1]), float(size[0]), float(size[1]))
+    return box, float(centre[0]), float(centre[1]), math.sqrt(4.0 * area / math.pi)
+
+
+def _value(item: Mapping[str, Any], key: str, place: str) -> Any:
+    if key not in item or isinstance(item[key], (list, dict)):
+        raise DatasetError(
+            f"{place}.{key}: expected a value, found {'none' if key not in item else 'a list'}"
+        )
+    return item[key]
+
+
+def _numbers(value: Any, count: int, place: str) -> list[float]:
+    """`count` finite numbers."""
+    right = isinstance(value, list) and len(value) == count
+    if not right or not all(_is_number(part) for part in value):
+        raise DatasetError(f"{place}: expected {count} numbers, found {value!s:.60}")
+    return [float(part) for part in value]
+
+
+def _number(item: Mapping[str, Any], key: str, place: str, default: float) -> float:
+    value = item.get(key)
+    if value is None:
+        return default
+    if not _is_number(value):
+        raise DatasetError(f"{place}.{key}: expected a number, found {value!r}")
+    return float(value)
+
+
+def _positive(item: Mapping[str, Any], key: str, place: str) -> float:
+    value = _number(item, key, place, math.nan)
+    if value <= 0.0:
+        raise DatasetError(f"{place}.{key}: expected a number above zero, found {value:g}")
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,287 @@
+"""Labelled image sets: what is read, what is refused, and how detections are scored against boxes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from payload_emulator.errors import DatasetError
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, read_picture
+from payload_emulator.training.evaluate.evaluate import open_for_evaluation
+from payload_emulator.training.evaluate.pictures import (
+    Criterion,
+    PictureSetOptions,
+    evaluate_pictures,
+    format_picture_figures,
+    tally_pictures,
+)
+from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
+
+SQUARE = [10, 20, 30, 20, 30, 40, 10, 40]
+
+
+def write_set(folder, images=None, annotations=None, pixels=None):
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    pixels = np.full((64, 96), 99, np.uint8) if pixels is None else pixels
+    cv2.imwrite(str(folder / "a.png"), pixels)
+    document = {
+        "images": [{"id": 1, "file_name": "a.png"}] if images is None else images,
+        "annotations": [{"id": 1, "image_id": 1, "bbox": [10, 20, 20, 20]}]
+        if annotations is None
+        else annotations,
+        "categories": [],
+    }
+    (folder / "labels.json").write_text(json.dumps(document))
+    return folder
+
+
+def label(**keys):
+    return [{"id": 1, "image_id": 1} | keys]
+
+
+def test_a_box_has_its_centre_between_pixel_centres(tmp_path):
+    (picture,) = load_pictures(write_set(tmp_path, annotations=label(bbox=[10, 20, 20, 5])))
+    assert (picture.u_px[0], picture.v_px[0]) == (19.5, 22.0)
+    assert picture.diameter_px[0] == 10.0
+    assert (picture.width_px, picture.height_px) == (96, 64)
+    assert np.isnan(picture.sun_azimuth_deg) and not picture.crowd[0]
+
+
+def test_a_polygon_counts_by_its_area(tmp_path):
+    # A square of 20 px and, apart from it, one of 10 px: four fifths of the area pull the centre.
+    second = [60, 20, 70, 20, 70, 30, 60, 30]
+    (picture,) = load_pictures(write_set(tmp_path, annotations=label(segmentation=[SQUARE, second])))
+    assert picture.u_px[0] == pytest.approx(0.8 * 20 + 0.2 * 65 - 0.5)
+    assert picture.v_px[0] == pytest.approx(0.8 * 30 + 0.2 * 25 - 0.5)
+    assert picture.diameter_px[0] == pytest.approx(np.sqrt(4 * 500 / np.pi))
+    assert picture.box_px[0].tolist() == [10, 20, 60, 20]
+
+
+def test_a_polygon_in_the_other_sense_is_the_same(tmp_path):
+    back = [value for k in range(3, -1, -1) for value in SQUARE[2 * k : 2 * k + 2]]
+    (picture,) = load_pictures(write_set(tmp_path, annotations=label(segmentation=[back], bbox=[0, 0, 1, 1])))
+    assert (picture.u_px[0], picture.v_px[0]) == pytest.approx((19.5, 29.5))
+
+
+def test_what_an_image_states_of_sun_and_scale_is_read(tmp_path):
+    image = {"id": 1, "file_name": "a.png", "width": 96, "height": 64, "sun_azimuth_deg": 30, "pixel_m": 2.5}
+    (picture,) = load_pictures(write_set(tmp_path, images=[image]))
+    assert (picture.sun_azimuth_deg, picture.pixel_m) == (30.0, 2.5)
+
+
+def test_several_files_at_any_depth_are_one_set(tmp_path):
+    write_set(tmp_path / "train")
+    write_set(tmp_path / "deep" / "valid")
+    (tmp_path / "other.json").write_text("[1]")
+    assert len(load_pictures(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"annotations": label(bbox=[1, 2, 3])}, "annotations[0].bbox: expected 4 numbers, found [1, 2, 3]"),
+        ({"annotations": label(bbox=[1, 2, 0, 4])}, "annotations[0].bbox: expected [x, y, width, height]"),
+        ({"annotations": label(bbox=[1, 2, float("nan"), 4])}, "annotations[0].bbox: expected 4 numbers"),
+        (
+            {"annotations": label(image_id=9, bbox=[1, 2, 3, 4])},
+            "annotations[0].image_id: expected the id of an image, found 9",
+        ),
+        ({"annotations": [{"id": 1}]}, "annotations[0].image_id: expected a value, found none"),
+        ({"annotations": label()}, "expected a box (bbox) or polygons (segmentation), found neither"),
+        ({"annotations": label(segmentation={"counts": "x"})}, "found a run-length mask"),
+        (
+            {"annotations": label(segmentation=[[1, 2, 3, 4]])},
+            "segmentation[0]: expected at least three pairs",
+        ),
+        (
+            {"annotations": label(segmentation=[[1, 1, 2, 2, 3, 3]])},
+            "segmentation[0]: expected a polygon with an area",
+        ),
+        ({"annotations": {}}, "annotations: expected a list of objects"),
+        ({"images": [{"id": 1}]}, "images[0].file_name: expected a value, found none"),
+        ({"images": [{"id": 1, "file_name": "none.png"}]}, "images[0].file_name: expected an image file"),
+        ({"images": [{"id": 1, "file_name": "labels.json"}]}, "expected a file with one of .png"),
+        (
+            {"images": [{"id": 1, "file_name": "a.png"}, {"id": 1, "file_name": "a.png"}]},
+            "images[1].id: expected a number of its own, found 1 twice",
+        ),
+        (
+            {"images": [{"id": 1, "file_name": "a.png", "width": 95, "height": 64}]},
+            "images[0]: expected the size of a.png, 96 x 64 pixels, found 95 x 64",
+        ),
+        (
+            {"images": [{"id": 1, "file_name": "a.png", "sun_azimuth_deg": "east"}]},
+            "images[0].sun_azimuth_deg: expected a number, found 'east'",
+        ),
+        (
+            {"images": [{"id": 1, "file_name": "a.png", "pixel_m": 0}]},
+            "images[0].pixel_m: expected a number above zero, found 0",
+        ),
+    ],
+)
+def test_a_broken_set_is_refused_by_place(tmp_path, change, words):
+    with pytest.raises(DatasetError) as refusal:
+        load_pictures(write_set(tmp_path, **change))
+    assert words in str(refusal.value) and str(tmp_path) in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_what_is_no_set_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match=r"expected a COCO file .* found none"):
+        load_pictures(tmp_path)
+    with pytest.raises(DatasetError, match="no such folder"):
+        load_pictures(tmp_path / "none")
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(DatasetError, match=r"x\.json: expected JSON"):
+        load_pictures(tmp_path)
+
+
+def test_arrays_are_read_as_images(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[0.0, 5.0], [10.0, 2.5]]))
+    assert read_picture(tmp_path / "a.npy").tolist() == [[0.0, 0.5], [1.0, 0.25]]
+    np.save(tmp_path / "b.npy", np.array([[0, 200]], np.uint8))
+    assert read_picture(tmp_path / "b.npy").tolist() == [[0, 200]]
+
+
+@pytest.mark.parametrize("values", [np.array([1.0]), np.array([["x"]]), np.array([[-1]]), np.array([[None]])])
+def test_arrays_that_are_no_images_are_refused(tmp_path, values):
+    np.save(tmp_path / "a.npy", values, allow_pickle=True)
+    with pytest.raises(DatasetError, match="expected an image"):
+        read_picture(tmp_path / "a.npy")
+
+
+def picture(boxes, crowd=()):
+    box = np.array(boxes, float).reshape(-1, 4)
+    return LabelledPicture(
+        None,
+        200,
+        100,
+        box[:, 0] + 0.5 * box[:, 2] - 0.5,
+        box[:, 1] + 0.5 * box[:, 3] - 0.5,
+        np.sqrt(box[:, 2] * box[:, 3]),
+        box,
+        np.isin(np.arange(len(box)), crowd),
+    )
+
+
+def detections(rows):
+    u, v, diameter, score = np.array(rows, float).reshape(-1, 4).T
+    return Detections(u, v, diameter, score, np.ones(u.size))
+
+
+def figures(boxes, rows, criterion, limits=(8.0, 150.0), crowd=()):
+    tallied = tally_pictures(
+        [picture(boxes, crowd)], [detections(rows)], criterion, [limits], np.array([np.nan])
+    )
+    at = tallied.figures(0.5)
+    return at.detected_true, at.false_alarms, at.expected
+
+
+BOX = [10, 20, 20, 20]  # centre 19.5, 29.5
+
+
+@pytest.mark.parametrize(
+    ("row", "strict", "centre"),
+    [
+        ((19.5, 29.5, 20, 0.9), (1, 0, 1), (1, 0, 1)),
+        # Nine pixels off: squares overlap by 11 of 29 columns (.38), the centre is within 10 px.
+        ((28.5, 29.5, 20, 0.9), (0, 1, 1), (1, 0, 1)),
+        ((30.5, 29.5, 20, 0.9), (0, 1, 1), (0, 1, 1)),
+        # Half the area of the box is .5 of the union, less is not.
+        ((19.5, 29.5, 20 * 0.72, 0.9), (1, 0, 1), (1, 0, 1)),
+        ((19.5, 29.5, 20 * 0.70, 0.9), (0, 1, 1), (1, 0, 1)),
+        ((19.5, 29.5, 20, 0.4), (0, 0, 1), (0, 0, 1)),
+    ],
+)
+def test_strict_wants_half_the_union_and_centre_the_radius(row, strict, centre):
+    assert figures([BOX], [row], Criterion.strict) == strict
+    assert figures([BOX], [row], Criterion.centre) == centre
+
+
+def test_a_label_is_taken_once_by_the_best():
+    rows = [(19.5, 29.5, 20, 0.9), (20.5, 29.5, 20, 0.8)]
+    assert figures([BOX], rows, Criterion.centre) == (1, 1, 1)
+
+
+def test_labels_outside_the_range_are_neither_expected_nor_false():
+    rows = [(19.5, 29.5, 20, 0.9), (100.5, 50.5, 20, 0.8), (150.5, 50.5, 60, 0.7)]
+    # The first takes a label of 20 px, which is below the range; the others take none, and only the last is in it.
+    assert figures([BOX], rows, Criterion.centre, limits=(32.0, 150.0)) == (0, 1, 0)
+
+
+def test_a_label_in_the_range_goes_before_a_nearer_one_outside():
+    small, large = [14, 24, 12, 12], [4, 14, 40, 40]
+    assert figures([small, large], [(19.5, 29.5, 40, 0.9)], Criterion.centre, limits=(32, 150)) == (1, 0, 1)
+
+
+def test_a_box_cut_at_the_edge_is_compared_with_the_part_inside():
+    # A crater of 40 px whose centre is at the left edge shows its right half.
+    assert figures([[0, 30, 20, 40]], [(-0.5, 49.5, 40, 0.9)], Criterion.strict) == (1, 0, 1)
+
+
+def test_detections_in_a_crowd_are_not_counted():
+    rows = [(20, 30, 20, 0.9), (100, 50, 20, 0.8)]
+    assert figures([[0, 0, 60, 60]], rows, Criterion.centre, crowd=(0,)) == (0, 1, 0)
+
+
+def write_bowls(folder, azimuths, *, stated):
+    import cv2
+
+    images, annotations = [], []
+    for k, azimuth in enumerate(azimuths):
+        cv2.imwrite(str(folder / f"{k}.png"), bowl_image(sun_azimuth_deg=azimuth))
+        images.append({"id": k, "file_name": f"{k}.png"} | ({"sun_azimuth_deg": azimuth} if stated else {}))
+        annotations += [
+            {"id": 9 * k, "image_id": k, "bbox": [u - 19.5, v - 19.5, 40, 40]} for u, v in BOWL_CENTRES
+        ]
+    document = {"images": images, "annotations": annotations, "categories": []}
+    (folder / "labels.json").write_text(json.dumps(document))
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return open_for_evaluation(load_shipped_model())
+
+
+def test_a_set_without_its_sun_is_searched_with_the_sun_that_is_found(tmp_path, detector):
+    write_bowls(tmp_path, [180.0, 260.0], stated=False)
+    found = evaluate_pictures(detector, tmp_path, 0.44)
+    assert (found["rung"], found["images"], found["craters"]) == (5, 2, 8)
+    assert found["level"] == "5 (as declared)"
+    assert found["sun"]["headline"] == "found" and found["sun"]["not_found"] == 0
+    assert set(found["by_sun"]) == {"found", "upright"}
+    assert found["micro"] == found["by_sun"]["found"]["strict"]
+    assert found["centre"]["recall"] == 1.0
+    assert found["by_sun"]["upright"]["strict"]["f1"] < found["strict"]["f1"]
+    assert found["per_class"] is None and found["pixel_m"] is None
+    assert "Sun azimuth not given; found in 2 of 2 images" in format_picture_figures(found)
+
+
+def test_a_set_with_its_sun_tells_both(tmp_path, detector):
+    write_bowls(tmp_path, [180.0, 260.0], stated=True)
+    options = PictureSetOptions(pixel_m=200.0, range_px=(16.0, 64.0))
+    found = evaluate_pictures(detector, tmp_path, 0.44, options)
+    assert set(found["by_sun"]) == {"given", "found", "upright"}
+    assert found["sun"]["compared"] == 2 and found["sun"]["right_share"] == 1.0
+    assert found["sun"]["median_error_deg"] < 8.0
+    # 40 px of 200 m are craters of 8 km.
+    assert [row["expected"] for row in found["per_class"]] == [8, 0, 0]
+    assert found["per_class"][0]["recall"] == found["strict"]["recall"]
+    low, high = found["centre"]["f1_interval_95"]
+    assert low <= found["centre"]["f1"] <= high
+
+
+def test_the_altitude_gives_the_scale(tmp_path, detector):
+    write_bowls(tmp_path, [0.0], stated=True)
+    found = evaluate_pictures(detector, tmp_path, 0.44, PictureSetOptions(altitude_km=30.0))
+    # The focal length is 256 / tan 60 degrees = 147.8 px.
+    assert found["pixel_m"] == [pytest.approx(30_000.0 / 147.80, rel=1e-4)]
+
+
+def test_a_set_without_craters_is_refused(tmp_path, detector):
+    with pytest.raises(DatasetError, match="expected craters, found 1 images without any"):
+        evaluate_pictures(detector, write_set(tmp_path, annotations=[]), 0.44)
