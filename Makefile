@@ -19,7 +19,7 @@ SAMPLE ?= 60
 SEED   ?= 1
 
 # What is shipped: installed with hashes, audited, listed with licences.
-SHIPPED := $(foreach name,runtime postgres parquet traces terrain exports,requirements/$(name).txt)
+SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 
 .PHONY: demo test check openmct docs pictures links sbom licences package bench mutation up install install-dev clean
 
@@ -95,8 +95,8 @@ $(VENV)/.terrain: requirements/hashed/terrain.txt $(VENV)/.runtime
 	$(PIP) --no-compile --require-hashes --no-deps -r requirements/hashed/terrain.txt
 	touch $@
 
-$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/traces.txt requirements/exports.txt requirements/docs.txt $(VENV)/.runtime $(VENV)/.terrain
-	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/traces.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/docs.txt -r requirements/dev.txt
+$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/traces.txt requirements/oidc.txt requirements/objects.txt requirements/exports.txt requirements/docs.txt $(VENV)/.runtime $(VENV)/.terrain
+	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/traces.txt -r requirements/oidc.txt -r requirements/objects.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/docs.txt -r requirements/dev.txt
 	touch $@
 
 $(VENV)/.bench: requirements/bench.txt $(VENV)/.dev

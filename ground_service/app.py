@@ -11,6 +11,7 @@ from anyio import to_thread
 from fastapi import FastAPI
 from starlette.routing import Route
 
+from ground_service.access.provider import provider_of
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
@@ -28,6 +29,7 @@ from ground_service.web.documentation import documentation
 from ground_service.web.live import live
 from ground_service.web.pages import pages
 from ground_service.web.payload_console import payload_console
+from ground_service.web.sign_in import sign_in
 from ground_service.web.sockets import Sockets
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.follow_up import follow_in_process
@@ -106,11 +108,12 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         redoc_url=None,
         lifespan=lifespan,
     )
-    app.state.open_without_users = settings.host in LOOPBACK
+    app.state.provider = provider_of(settings)
+    app.state.open_without_users = settings.host in LOOPBACK and app.state.provider is None
     app.state.live_console = settings.resolved_live_console()
     app.state.openmct = settings.openmct or FOLDER
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    routers = (*(one.load() for one in OPERATIONS), operations, pages, displays, documentation)
+    routers = (*(one.load() for one in OPERATIONS), operations, pages, sign_in, displays, documentation)
     for one in (*routers, live, payload_console):
         app.include_router(one)
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]

@@ -20,6 +20,8 @@ GroundError
 ├── EvaluationError          a pass that cannot be evaluated
 ├── Stopping                 the service is being stopped during the work
 ├── NotAuthorised            the caller is unknown or not permitted to do this
+├── SignInRefused            a sign-in with an OpenID provider that is not accepted
+├── ProviderUnavailable      the OpenID provider cannot be reached or used
 └── ServerError              the HTTP server cannot start (port in use, unsafe address)
 """
 
@@ -195,6 +197,20 @@ class Forbidden(GroundError):
 
 class NotAuthorised(GroundError):
     """The caller is not known, or may not do this."""
+
+
+class SignInRefused(GroundError):
+    """A sign-in with an OpenID provider that is not accepted."""
+
+    def __init__(self, what: str, expected: str, found: str) -> None:
+        super().__init__(f"{what}: expected {expected}, found {found}")
+
+
+class ProviderUnavailable(GroundError):
+    """The OpenID provider cannot be reached, or its answer cannot be used."""
+
+    def __init__(self, place: str, expected: str, found: str) -> None:
+        super().__init__(f"OpenID provider, {place}: expected {expected}, found {found}")
 
 
 class ServerError(GroundError):

@@ -9,7 +9,7 @@ import ipaddress
 import os
 from pathlib import Path
 from typing import Annotated, Literal
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from pydantic import BeforeValidator, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -71,6 +71,32 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="Address that the HTTP server binds to")
     port: int = Field(default=8042, ge=0, le=65535, description="Port of the HTTP server")
+    oidc_issuer: str | None = Field(
+        default=None,
+        description="Issuer of an OpenID provider for sign-in, such as https://login.example.org/realms/ops; needs the "
+        "extra `oidc`; default: sign-in with tokens only",
+    )
+    oidc_client_id: str | None = Field(
+        default=None, description="Name of this service at the OpenID provider"
+    )
+    oidc_client_secret: SecretStr | None = Field(
+        default=None, description="Secret of this service at the OpenID provider; default: a public client"
+    )
+    oidc_scopes: Words = Field(
+        default=("profile",), description="Comma-separated scopes to ask for, in addition to openid"
+    )
+    oidc_name_claim: str = Field(
+        default="preferred_username", description="Claim of the ID token with the name of the user"
+    )
+    oidc_role_claim: str = Field(
+        default="roles",
+        description="Claim of the ID token with groups or roles; a dot leads into an object: realm_access.roles",
+    )
+    oidc_roles: Words = Field(
+        default=(),
+        description="Comma-separated entries ROLE=VALUE: which value of the claim gives which role, such as "
+        "admin=linna-admins,operator=linna-operators,viewer=linna-viewers",
+    )
     live_console: str | None = Field(
         default=None,
         pattern=r"^[A-Za-z0-9.:-]+:[0-9]{1,5}$",
@@ -150,6 +176,26 @@ class Settings(BaseSettings):
                 raise ValueError(f"expected IP addresses or networks, found {text!r}") from None
         return value
 
+    @field_validator("oidc_issuer")
+    @classmethod
+    def _issuer(cls, value: str | None) -> str | None:
+        parts = urlsplit(value or "https://none")
+        local = parts.hostname in ("127.0.0.1", "::1", "localhost")
+        if not parts.hostname or parts.query or parts.fragment or parts.username is not None:
+            raise ValueError(f"expected the address of an OpenID provider, found {value!r}")
+        if parts.scheme != "https" and not (parts.scheme == "http" and local):
+            raise ValueError(f"expected an https address, found {value!r}")
+        return value
+
+    @field_validator("oidc_roles")
+    @classmethod
+    def _roles(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for entry in value:
+            role, mark, word = entry.partition("=")
+            if role not in ("viewer", "operator", "admin") or not mark or not word:
+                raise ValueError(f"expected viewer=, operator= or admin= and a value, found {entry!r}")
+        return value
+
     def resolved_database_url(self) -> str:
         """The SQLAlchemy URL in force."""
         if self.database_url is not None:
@@ -177,9 +223,9 @@ class Settings(BaseSettings):
 def load_settings(**given: object) -> Settings:
     """Return the settings of the environment, overridden by the arguments that are not None.
 
-    ``LINNA_DATABASE_URL_FILE``, ``LINNA_MIGRATION_DATABASE_URL_FILE`` and ``LINNA_BROKER_URL_FILE`` name files that
-    contain the secret instead; ``LINNA_DATABASE_PASSWORD_FILE`` and the like name files with the password alone, for a
-    URL that has a user and no password.
+    ``LINNA_DATABASE_URL_FILE``, ``LINNA_MIGRATION_DATABASE_URL_FILE``, ``LINNA_BROKER_URL_FILE`` and
+    ``LINNA_OIDC_CLIENT_SECRET_FILE`` name files that contain the secret instead; ``LINNA_DATABASE_PASSWORD_FILE`` and
+    the like name files with the password alone, for a URL that has a user and no password.
 
     Raises
     ------
@@ -187,10 +233,11 @@ def load_settings(**given: object) -> Settings:
         If a value is invalid; the message names the setting.
     """
     values = {name: value for name, value in given.items() if value is not None}
-    for name in ("database_url", "migration_database_url", "broker_url"):
+    for name in ("database_url", "migration_database_url", "broker_url", "oidc_client_secret"):
         path = os.environ.get(f"LINNA_{name.upper()}_FILE")
         if path and name not in values:
             values[name] = _secret(name, path)
+    for name in ("database_url", "migration_database_url", "broker_url"):
         password = os.environ.get(f"LINNA_{name.removesuffix('_url').upper()}_PASSWORD_FILE")
         url = values.get(name) or os.environ.get(f"LINNA_{name.upper()}")
         if password and url:

@@ -58,7 +58,7 @@ def applies(
 
 RUNTIME = {
     name: pin
-    for file in ("runtime", "postgres", "parquet", "terrain", "exports", "traces")
+    for file in ("runtime", "postgres", "parquet", "terrain", "exports", "traces", "oidc", "objects")
     for name, pin in pins(file).items()
 }
 EVERYTHING = {**RUNTIME, **pins("train"), **pins("dev")}
@@ -95,7 +95,8 @@ def needed(python: str, files: tuple[str, ...]) -> dict[str, list[Requirement]]:
 
 @pytest.mark.parametrize("python", ["3.11.0", "3.11.2", "3.11.3", "3.12.0"])
 @pytest.mark.parametrize(
-    "files", [("runtime",), ("runtime", "terrain"), ("runtime", "postgres", "parquet", "traces")]
+    "files",
+    [("runtime",), ("runtime", "terrain"), ("runtime", "postgres", "parquet", "traces", "oidc", "objects")],
 )
 def test_what_packages_require_is_pinned_for_every_python(files: tuple[str, ...], python: str) -> None:
     """An installation with hashes fails for a package without a pin, also one that only some versions need."""
@@ -122,6 +123,8 @@ def test_every_declared_dependency_has_its_pin() -> None:
         ("postgres", "postgres"),
         ("parquet", "parquet"),
         ("traces", "traces"),
+        ("oidc", "oidc"),
+        ("objects", "objects"),
         ("docs", "docs"),
     ):
         known = {**pins("runtime"), **pins(file)}
@@ -136,7 +139,7 @@ def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
     assert stated and not licences.is_copyleft(stated), f"{name}: {stated}"
 
 
-@pytest.mark.parametrize("name", ["runtime", "postgres", "parquet", "traces", "terrain"])
+@pytest.mark.parametrize("name", ["runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain"])
 def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
     text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
     entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}

@@ -26,6 +26,20 @@ class User(Entity):
     role: Role
     state: Literal["active", "disabled"]
     created: UtcTime
+    provider: str | None = Field(
+        default=None, description="Issuer of the OpenID provider that states the role; null: added here"
+    )
+
+
+class ProviderIdentity(Entity):
+    """Who signed in with an OpenID provider."""
+
+    issuer: str
+    subject: str = Field(max_length=255)
+    name: str
+    role: Role | None = Field(description="Highest role that the provider states; None: none")
+    session: str = Field(description="Session of the provider; empty if it states none")
+    stated: str = Field(description="Where the role was looked for, and what was found")
 
 
 class UserRecord(User):
@@ -46,7 +60,10 @@ class Token(Entity):
     revoked: UtcTime | None
     used: UtcTime | None = Field(description="Last use, to the hour; null: never used")
     parent_id: int | None = Field(
-        default=None, description="Token that a browser session was started with; null: no session"
+        default=None, description="Token that a browser session was started with; null: no such session"
+    )
+    kind: Literal["token", "session", "provider session"] = Field(
+        description="Bearer token, or browser session started with a token or with an OpenID provider"
     )
 
 
@@ -61,6 +78,7 @@ class TokenRecord(Entity):
     revoked_utc_ns: int | None
     used_utc_ns: int | None
     parent_id: int | None
+    provider_session: str | None
     name: str
     role: Role
     state: Literal["active", "disabled"] = Field(description="State of the user")
@@ -73,7 +91,16 @@ class TokenRecord(Entity):
         """Return the token as it is at a time."""
         state = "expired" if self.expired(utc_ns) else "active"
         return Token.of(
-            dict(self), user=self.name, state="revoked" if self.revoked_utc_ns is not None else state
+            dict(self),
+            user=self.name,
+            state="revoked" if self.revoked_utc_ns is not None else state,
+            kind=(
+                "provider session"
+                if self.provider_session is not None
+                else "token"
+                if self.parent_id is None
+                else "session"
+            ),
         )
 
 
@@ -91,6 +118,9 @@ class Session(Entity):
     role: Role
     expires: UtcTime | None = Field(description="null: unlimited")
     browser: bool = Field(description="Whether the request used the cookie of a browser session")
+    provider: bool = Field(
+        default=False, description="Whether the session was started with an OpenID provider"
+    )
     time: UtcTime = Field(description="Mission time of the service: its clock, unless a simulation sets it")
 
 

@@ -75,7 +75,7 @@ def add_user(
     Conflict
         If the user exists already.
     """
-    _check(name, role)
+    check_user(name, role)
     lifetime_ns = _lifetime_ns(days_valid)
     now = utc_now_ns()
     with ground.database.writing() as connection:
@@ -121,7 +121,7 @@ def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str 
     """
     if len(token) < TOKEN_MINIMUM:
         raise InvalidInput("token", "", f"{TOKEN_MINIMUM} characters or more", f"{len(token)}")
-    _check(name, role)
+    check_user(name, role)
     now = utc_now_ns()
     hashed = token_sha256(token)
     with ground.database.writing() as connection:
@@ -186,7 +186,7 @@ def change_user(
     if state is not None and state not in STATES:
         raise InvalidInput("user", "state", " or ".join(STATES), repr(state)[:80])
     if role is not None:
-        _check(name, role)
+        check_user(name, role)
     with ground.database.writing() as connection:
         admins = store.lock_admins(connection)
         user = store.get_user(connection, name)
@@ -198,6 +198,8 @@ def change_user(
             store.change_user(connection, user, "state", before, state)
             audit(connection, actor, "disable user" if state == "disabled" else "enable user", name, {})
         if role is not None:
+            if user.provider is not None:
+                raise Conflict(f"user {name}: the OpenID provider {user.provider} states the role")
             _set_role(connection, user, role)
             audit(connection, actor, "change role", name, {"from": user.role, "to": role})
         return User.of(dict(store.get_user(connection, name)))
@@ -296,16 +298,18 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
 
 def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
     """Return who a caller is, and until when."""
-    expires = None
+    expires, provider = None, False
     if caller.token_id is not None:
         with ground.database.reading() as connection:
-            expires = store.get_token(connection, caller.token_id).expires_utc_ns
+            token = store.get_token(connection, caller.token_id)
+        expires, provider = token.expires_utc_ns, token.provider_session is not None
     until = None if expires is None else UtcTime(expires)
     return Session(
         name=caller.name,
         role=caller.role,
         expires=until,
         browser=browser,
+        provider=provider,
         time=UtcTime(mission_now_ns()),
     )
 
@@ -337,7 +341,21 @@ def audit(connection: Connection, actor: str, action: str, target: str, detail: 
     audit_log.add_note(connection, audit_log.Note(utc_now_ns(), actor, action, target, detail))
 
 
-def _check(name: str, role: str) -> None:
+def add_session_token(
+    connection: Connection, user: UserRecord, now: int, provider_session: str
+) -> tuple[int, str]:
+    """Add the token of a browser session that an OpenID provider started; return its id and secret."""
+    return _add_token(connection, user, now, SESSION_NS, provider_session=provider_session)
+
+
+def check_user(name: str, role: str) -> None:
+    """Check the name and the role of a user.
+
+    Raises
+    ------
+    InvalidInput
+        If one of them is not permitted.
+    """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InvalidInput("user", "name", "1 to 64 letters, digits and . _ @ -", repr(name)[:80])
     if name in RESERVED_NAMES:
@@ -382,6 +400,7 @@ def _add_token(
     now: int,
     lifetime_ns: int | None,
     parent_id: int | None = None,
+    provider_session: str | None = None,
 ) -> tuple[int, str]:
     token = "linna_" + secrets.token_urlsafe(TOKEN_OCTETS)
     expires = None if lifetime_ns is None else now + lifetime_ns
@@ -393,5 +412,6 @@ def _add_token(
         now_utc_ns=now,
         expires_utc_ns=expires,
         parent_id=parent_id,
+        provider_session=provider_session,
     )
     return key, token

@@ -16,12 +16,24 @@ from ground_service.store.states import change_if
 USERS, TOKENS = repository.USERS, repository.TOKENS
 ANSWERS, AUDIT = repository.ANSWERS, repository.AUDIT
 
+SESSION_LENGTH = 255
+"""Characters of the identity of a provider's session that are stored."""
+
 _ANYBODY = select(USERS.c.id).limit(1)
 
 
-def add_user(connection: Connection, name: str, role: str, now_utc_ns: int) -> bool:
-    """Add a user; return False if another transaction added it first."""
+def add_user(
+    connection: Connection,
+    name: str,
+    role: str,
+    now_utc_ns: int,
+    *,
+    issuer: str | None = None,
+    subject: str | None = None,
+) -> bool:
+    """Add a user, or with issuer and subject that of an OpenID provider; return False if another was faster."""
     values = {"name": name, "role": role, "state": "active", "created_utc_ns": now_utc_ns}
+    values |= {} if issuer is None else {"issuer": issuer, "subject": subject}
     return repository.add_new(connection, USERS, **values) is not None
 
 
@@ -33,7 +45,13 @@ def has_users(connection: Connection) -> bool:
 def find_user(connection: Connection, name: str) -> UserRecord | None:
     """Return a user; None if there is no such user."""
     row = repository.find(connection, USERS, name=name)
-    return None if row is None else UserRecord.of(row)
+    return None if row is None else _user(row)
+
+
+def find_provider_user(connection: Connection, issuer: str, subject: str) -> UserRecord | None:
+    """Return the user of an OpenID provider; None if there is no such user."""
+    row = repository.find(connection, USERS, issuer=issuer, subject=subject)
+    return None if row is None else _user(row)
 
 
 def get_user(connection: Connection, name: str) -> UserRecord:
@@ -52,7 +70,8 @@ def get_user(connection: Connection, name: str) -> UserRecord:
 
 def list_users(connection: Connection) -> list[User]:
     """Return all users, by name."""
-    return [User.of(row) for row in connection.execute(select(USERS).order_by(USERS.c.name)).mappings()]
+    rows = connection.execute(select(USERS).order_by(USERS.c.name)).mappings()
+    return [User.of(row, provider=row["issuer"]) for row in rows]
 
 
 def lock_admins(connection: Connection) -> list[int]:
@@ -84,8 +103,9 @@ def add_token(
     now_utc_ns: int,
     expires_utc_ns: int | None,
     parent_id: int | None = None,
+    provider_session: str | None = None,
 ) -> int:
-    """Add a token, or with `parent_id` that of a browser session; return its id."""
+    """Add a token, or with `parent_id` or `provider_session` that of a browser session; return its id."""
     return int(
         repository.add(
             connection,
@@ -96,6 +116,7 @@ def add_token(
             created_utc_ns=now_utc_ns,
             expires_utc_ns=expires_utc_ns,
             parent_id=parent_id,
+            provider_session=provider_session,
         )
     )
 
@@ -148,8 +169,24 @@ def delete_ended_sessions(connection: Connection, now_utc_ns: int) -> int:
 
     The audit log keeps the start of each session. Revoked sessions are deleted when they would have expired.
     """
-    query = delete(TOKENS).where(TOKENS.c.parent_id.is_not(None), TOKENS.c.expires_utc_ns < now_utc_ns)
+    sessions = or_(TOKENS.c.parent_id.is_not(None), TOKENS.c.provider_session.is_not(None))
+    query = delete(TOKENS).where(sessions, TOKENS.c.expires_utc_ns < now_utc_ns)
     return int(connection.execute(query).rowcount)
+
+
+def end_provider_sessions(
+    connection: Connection, issuer: str, subject: str | None, session: str | None, now_utc_ns: int
+) -> dict[str, int]:
+    """Revoke the browser sessions of a subject or of one session of an OpenID provider; return numbers by user."""
+    conditions = [USERS.c.issuer == issuer, TOKENS.c.provider_session.is_not(None)]
+    conditions += [] if subject is None else [USERS.c.subject == subject]
+    conditions += [] if session is None else [TOKENS.c.provider_session == session]
+    joined = select(TOKENS.c.id, USERS.c.name).join(USERS, USERS.c.id == TOKENS.c.user_id)
+    rows = connection.execute(joined.where(*conditions, TOKENS.c.revoked_utc_ns.is_(None))).all()
+    ended: dict[str, int] = {}
+    for key, name in rows:
+        ended[name] = ended.get(name, 0) + revoke_token(connection, key, now_utc_ns)
+    return ended
 
 
 def note_use(connection: Connection, token_id: int, used_utc_ns: int) -> None:
@@ -214,3 +251,7 @@ def list_entries(
 def _tokens() -> Select[Any]:
     joined = TOKENS.join(USERS, USERS.c.id == TOKENS.c.user_id)
     return select(TOKENS, USERS.c.name, USERS.c.role, USERS.c.state).select_from(joined)
+
+
+def _user(row: Mapping[str, Any]) -> UserRecord:
+    return UserRecord.of(row, provider=row["issuer"])

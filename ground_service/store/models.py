@@ -625,8 +625,14 @@ USERS = Table(
     column("role", String(16)),
     column("state", String(16)),
     column("created_utc_ns", BigInteger),
+    optional("issuer", String(512)),
+    optional("subject", String(255)),
+    UniqueConstraint("issuer", "subject"),
 )
-"""User of the service with one role; `state` is active or disabled."""
+"""User of the service with one role; `state` is active or disabled.
+
+`issuer` and `subject` identify a user of an OpenID provider; NULL for users that were added here.
+"""
 
 
 TOKENS = Table(
@@ -641,11 +647,13 @@ TOKENS = Table(
     optional("revoked_utc_ns", BigInteger),
     optional("used_utc_ns", BigInteger),
     optional("parent_id", ForeignKey("tokens.id")),
+    optional("provider_session", String(255)),
 )
 """Bearer token of a user; only its hash is stored.
 
 `hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour. The token of a browser
-session has the token that it was started with in `parent_id`, and is valid only while that one is.
+session has the token that it was started with in `parent_id`, and is valid only while that one is. The token of a
+session that an OpenID provider started has the provider's session in `provider_session`, empty if it states none.
 """
 
 

@@ -92,8 +92,8 @@ pages = APIRouter(include_in_schema=False)
 
 
 def _page_answer(page: Page) -> Any:
-    def answer() -> Response:
-        return page_response(rendered(page))
+    def answer(request: Request) -> Response:
+        return page_response(rendered(page, provider=request.app.state.provider is not None))
 
     return answer
 
@@ -195,28 +195,56 @@ def _version() -> str:
     return whole.hexdigest()[:12]
 
 
-@lru_cache(maxsize=len(PAGES) + 1)
-def rendered(page: Page, template: str = "", openmct: str = "") -> str:
-    """Return the HTML of a page, by default with the template of its name; `openmct` is a version of Open MCT."""
-    environment = Environment(
+@lru_cache(maxsize=2 * len(PAGES) + 1)
+def rendered(page: Page, template: str = "", openmct: str = "", *, provider: bool = False) -> str:
+    """Return the HTML of a page.
+
+    Parameters
+    ----------
+    template
+        Name of the template; by default that of the page.
+    openmct
+        Version of Open MCT.
+    provider
+        Whether the sign-in dialog offers an OpenID provider.
+    """
+    return (
+        _environment()
+        .get_template(f"{template or page.name}.html")
+        .render(
+            page=page,
+            openmct=openmct,
+            provider=provider,
+            pages=[one for one in PAGES if one.entry],
+            version=_version(),
+            dictionary=_dictionary(),
+            state_values=STATE_VALUES,
+            licences={
+                name.removeprefix("vendor/").removesuffix(".LICENSE"): body.decode()
+                for name, body in _files().items()
+                if name.endswith(".LICENSE")
+            },
+        )
+    )
+
+
+def sign_in_page(*, next_page: str = "/", refusal: str = "") -> str:
+    """Return the HTML of the answer to a sign-in: opens the next page, or states why it was refused."""
+    return (
+        _environment()
+        .get_template("sign_in.html")
+        .render(next_page=next_page, refusal=refusal, version=_version())
+    )
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
         loader=FileSystemLoader(_HERE / "templates"),
         autoescape=select_autoescape(default=True, default_for_string=True),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-    )
-    return environment.get_template(f"{template or page.name}.html").render(
-        page=page,
-        openmct=openmct,
-        pages=[one for one in PAGES if one.entry],
-        version=_version(),
-        dictionary=_dictionary(),
-        state_values=STATE_VALUES,
-        licences={
-            name.removeprefix("vendor/").removesuffix(".LICENSE"): body.decode()
-            for name, body in _files().items()
-            if name.endswith(".LICENSE")
-        },
     )
 
 

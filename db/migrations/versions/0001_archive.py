@@ -359,7 +359,10 @@ def upgrade() -> None:
         sa.Column("role", sa.String(length=16), nullable=False),
         sa.Column("state", sa.String(length=16), nullable=False),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("issuer", sa.String(length=512), nullable=True),
+        sa.Column("subject", sa.String(length=255), nullable=True),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_users")),
+        sa.UniqueConstraint("issuer", "subject", name=op.f("uq_users_issuer_subject")),
         sa.UniqueConstraint("name", name=op.f("uq_users_name")),
     )
     op.create_table(
@@ -665,6 +668,7 @@ def upgrade() -> None:
         sa.Column("revoked_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("used_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("parent_id", sa.Integer(), nullable=True),
+        sa.Column("provider_session", sa.String(length=255), nullable=True),
         sa.ForeignKeyConstraint(["parent_id"], ["tokens.id"], name=op.f("fk_tokens_parent_id_tokens")),
         sa.ForeignKeyConstraint(["user_id"], ["users.id"], name=op.f("fk_tokens_user_id_users")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_tokens")),

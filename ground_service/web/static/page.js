@@ -139,6 +139,17 @@ export function pager(load, size = 25) {
 
 // Sign-in, clock and feed of every page.
 const dialog = byId("sign-in");
+// Only pages of this service. The browser's own parser decides, which skips control characters in addresses.
+function wantedPage() {
+  const next = new URLSearchParams(location.search).get("next") ?? "";
+  const wanted = new URL(next || "/", location.origin);
+  if (!wanted.hash) wanted.hash = location.hash; // browsers keep it when they are sent to the sign-in
+  return next.startsWith("/") && wanted.origin === location.origin ? wanted : null;
+}
+byId("provider")?.addEventListener("click", () => {
+  const page = wantedPage() ?? location;
+  byId("provider").search = new URLSearchParams({ next: page.pathname + page.search + page.hash });
+});
 window.addEventListener("linna-sign-in", () => {
   if (!dialog.open) dialog.showModal();
 });
@@ -149,11 +160,8 @@ dialog.addEventListener("close", async () => {
   byId("token").value = "";
   try {
     await send("POST", "session", { token: given });
-    const next = new URLSearchParams(location.search).get("next") ?? "";
-    // Only pages of this service. The browser's own parser decides, which skips control characters in addresses.
-    const wanted = new URL(next || "/", location.origin);
-    if (!wanted.hash) wanted.hash = location.hash; // browsers keep it when they are sent to the sign-in
-    if (next.startsWith("/") && wanted.origin === location.origin) location.assign(wanted.href);
+    const wanted = wantedPage();
+    if (wanted) location.assign(wanted.href);
     else location.reload();
   } catch (error) {
     trouble(error);
@@ -165,9 +173,11 @@ async function signedIn() {
   const session = await get("session");
   setClock(session.time);
   byId("user").textContent = session.browser ? `${session.name}, ${session.role}` : "";
+  byId("user").title = session.browser && session.expires ? `The session ends ${timeText(session.expires)} UTC` : "";
   byId("caller").textContent = session.browser ? "Sign out" : "Sign in";
   byId("caller").hidden = session.name === "local";
   byId("caller").dataset.signedIn = session.browser;
+  byId("caller").dataset.provider = session.provider;
   document.body.dataset.role = session.role;
   return session;
 }
@@ -177,7 +187,8 @@ byId("caller").addEventListener("click", async () => {
     return;
   }
   await send("DELETE", "session");
-  location.reload();
+  if (byId("caller").dataset.provider === "true") location.assign("/sign-in/ended");
+  else location.reload();
 });
 
 // Mission time: the clock of the service, which a simulated mission sets.

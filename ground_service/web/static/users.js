@@ -65,6 +65,11 @@ function userActions(user) {
   );
 }
 
+function kindOf(token) {
+  if (token.kind === "session") return `browser session of token ${token.parent_id}`;
+  return token.kind === "token" ? "token" : "browser session by the provider";
+}
+
 function tokenAction(token) {
   if (token.state !== "active") return "";
   return button(
@@ -86,7 +91,8 @@ async function load() {
       "Users",
       [
         ["Name", (row) => row.name],
-        ["Role", roleChoice],
+        ["Role", (row) => (row.provider ? row.role : roleChoice(row))],
+        ["From", (row) => (row.provider ? element("span", { class: "breakable" }, row.provider) : "this service")],
         ["State", (row) => stateMark(row.state)],
         ["Since", (row) => timeText(row.created)],
         ["Actions", userActions],
@@ -102,7 +108,7 @@ async function load() {
       [
         ["No", (row) => String(row.id), "num"],
         ["User", (row) => row.user],
-        ["Kind", (row) => (row.parent_id === null ? "token" : `browser session of token ${row.parent_id}`)],
+        ["Kind", kindOf],
         ["Start", (row) => element("code", {}, `${row.hint}…`)],
         ["State", (row) => stateMark(row.state)],
         ["Created", (row) => timeText(row.created)],

@@ -49,7 +49,9 @@ def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> N
         "viewer",
     ]
     (token,) = client.get(f"{V1}/tokens?user=ann", headers=admin).json()["items"]
-    assert set(token) == {"id", "user", "hint", "state", "created", "expires", "revoked", "used", "parent_id"}
+    assert set(token) == {
+        *("id", "user", "hint", "state", "created", "expires", "revoked", "used", "parent_id", "kind")
+    }
     assert made.json()["token"] not in str(token)
     changed = client.patch(f"{V1}/users/ann", json={"state": "disabled"}, headers=admin)
     assert changed.json()["state"] == "disabled"
