@@ -21,7 +21,7 @@ SEED   ?= 1
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 
-.PHONY: demo test check openmct docs pictures links sbom licences package bench mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures links sbom licences package bench bench-planning mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -73,6 +73,10 @@ package: $(VENV)/.dev
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
 
+# The plans of the planner and optimal ones; OR-Tools has an environment of its own.
+bench-planning: $(VENV)/.dev $(VENV)-ortools/.stamp
+	$(BIN)/python -m benchmarks planning
+
 mutation: $(VENV)/.mutation
 	$(BIN)/python -m benchmarks.mutation --sample $(SAMPLE) --seed $(SEED) $(if $(GROUP),--group $(GROUP))
 
@@ -107,5 +111,10 @@ $(VENV)/.mutation: requirements/mutation.txt $(VENV)/.dev
 	$(PIP) -r requirements/mutation.txt
 	touch $@
 
+$(VENV)-ortools/.stamp: requirements/ortools.txt
+	$(PYTHON) -m venv $(if $(BASE_PIP),--without-pip) $(VENV)-ortools
+	$(subst $(BIN)/python,$(VENV)-ortools/bin/python,$(PIP)) -r requirements/ortools.txt
+	touch $@
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info linna-demo deploy/openmct/node_modules
+	rm -rf $(VENV) $(VENV)-ortools build dist *.egg-info linna-demo deploy/openmct/node_modules
