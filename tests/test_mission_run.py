@@ -8,17 +8,22 @@ import sqlite3
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
+from ground_service.evaluation.model import PassFigures
 from linna import cli
+from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run.checkpoints import Checkpoints
-from studies.mission_run.figures import contacts_until, trend
+from studies.mission_run.figures import _missing, contacts_until, trend
 from studies.mission_run.ground import EmbeddedGround
+from studies.mission_run.regions import Box, in_boxes, observed_boxes
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
 
@@ -64,7 +69,7 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
     assert 38 <= flown["frames"] <= 42  # 600 s / 15 s
     # This scenario has no rim heights in its catalogue and no filter: the report lacks what needs them, and says so.
     assert (flown["recall"] is None) == ("recall" in flown["lacks"]) and "nees" in flown["lacks"]
-    assert figures["reports_lack"]["nees"] == 1
+    assert [one.partition(":")[0] for one in figures["reports_lack"]].count("nees") == 1
     assert figures["frames"] == figures["frames_received"] == flown["frames"]
     assert flown["contacts_to_processed"] == 1
     # All that was posted is the set-up: catalogue, mission, ephemeris, commissioning, standing request.
@@ -242,3 +247,63 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
         key: value for key, value in whole.items() if key not in differ
     }
     assert of_mission_time(again["incidents"]) == of_mission_time(whole["incidents"])
+
+
+def flat_terrain(listed: list[tuple[float, float, bool]], tiles: list[tuple[float, float]]) -> Any:
+    """Return real terrain with craters (latitude, longitude, complete), and rasters on cells by their corners."""
+    latitude, longitude, complete = (np.array(column) for column in zip(*listed, strict=True))
+    catalogue = make_catalogue(
+        np.radians(latitude), np.radians(longitude), np.full(len(listed), 6e3), source="x", complete=complete
+    )
+
+    def covers(latitude_rad: Any, longitude_rad: Any) -> Any:
+        south, west = np.degrees(latitude_rad), np.degrees(longitude_rad)
+        held = np.zeros(np.broadcast(south, west).shape, dtype=bool)
+        for low, left in tiles:
+            held |= (south >= low) & (south < low + 15) & (west >= left) & (west < left + 15)
+        return held
+
+    return SimpleNamespace(is_real=True, catalogue=catalogue, covers=covers)
+
+
+def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground() -> None:
+    listed = [
+        # Catalogued from 30 S to 30 N at 0 to 15 E, from 30 N to 60 N at 15 to 30 E, in parts at 30 to 45 E.
+        *((latitude, 5.0, True) for latitude in (-20.0, -5.0, 5.0, 20.0)),
+        *((latitude, 20.0, True) for latitude in (35.0, 50.0)),
+        *((latitude, 35.0, latitude < 0.0) for latitude in (-5.0, 5.0)),
+    ]
+    equator = observed_boxes(flat_terrain(listed, []), 13.0)
+    assert equator == [Box(-13.0, 13.0, 0.0, 15.0), Box(32.0, 58.0, 15.0, 30.0)]
+    # Ground with height rasters comes first, also further away from the equator.
+    assert observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0)[0] == Box(
+        2.0, 28.0, 0.0, 15.0
+    )
+    # Part of the height is not enough.
+    assert observed_boxes(flat_terrain(listed, [(0.0, 0.0)]), 13.0) == equator
+    everywhere = SimpleNamespace(is_real=False)
+    assert observed_boxes(cast(Any, everywhere), 13.0) == [Box(-13.0, 13.0, -180.0, 180.0)]
+    widened = Box(-13.0, 13.0, -5.0, 15.0).widened(5.0)
+    places = np.array([0.0, 17.0, 19.0]), np.array([352.0, 19.0, 0.0])
+    assert in_boxes(*places, [widened]).tolist() == [True, True, False]
+
+
+def figures_of(**changes: Any) -> PassFigures:
+    detector = {"precision": None, "recall": None, "loc_px": None, "per_class": []}
+    values: dict[str, Any] = {
+        "pass_id": 1, "frames": 3, "packets": 9, "packets_lost": 0, "packets_expected": 9, "detector": detector,
+        "navigation": {}, "smoothed": {}, "baselines": {}, "verdict": "", "verdict_level": "unknown",
+        "requirements": [], "error_budget": {}, "instruments": {}, "evidence_level": "", "data": [],
+    }  # fmt: skip
+    return PassFigures.model_validate(values | changes)
+
+
+def test_a_report_that_lacks_something_has_the_reason() -> None:
+    reasons = {"recall": "no crater in view", "baselines": "no start state"}
+    assert _missing(figures_of(not_available=reasons)) == reasons | {
+        "nees": "unknown",
+        "evidence level": "not stated in the mission description",
+        "navigation": "no estimate came down",
+    }
+    refused = _missing(figures_of(not_available={"error": "no reference ephemeris covers this pass"}))
+    assert set(refused.values()) == {"no reference ephemeris covers this pass"}

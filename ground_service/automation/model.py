@@ -49,7 +49,9 @@ class AutomationAction(Entity):
         description="waiting: for approval; queued; done; failed; refused; skipped: after an action that failed"
     )
     result: dict[str, Any] | None = Field(description="What the action has produced or changed")
-    error: str | None
+    error: str | None = Field(description="Reason of the last failed attempt, or why it was skipped")
+    attempts: int = Field(description="Number of failed attempts")
+    next_attempt: UtcTime | None = Field(description="Earliest time of the next attempt after a failed one")
     decided_by: str | None = Field(description="Person who approved or refused it")
     created: UtcTime
     changed: UtcTime

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, func, select, update
 
 from ground_service.automation.core import Occurrence, PlannedAction
 from ground_service.automation.model import AutomationAction
@@ -132,6 +132,7 @@ def add_action(
         mission_id=mission_id,
         text=occurrence.text,
         state=state,
+        attempts=0,
         created_utc_ns=now_utc_ns,
         changed_utc_ns=now_utc_ns,
     )
@@ -213,6 +214,33 @@ def change_state(
         connection,
         AutomationChanged(id=action.id, event=action.event, action=action.action, state=state),
     )
+
+
+def note_attempt(
+    connection: Connection, action: AutomationAction, *, error: str, now_utc_ns: int, next_utc_ns: int
+) -> None:
+    """Count a failed attempt of a queued action, which is done again from a time on."""
+    connection.execute(
+        update(ACTIONS)
+        .where(ACTIONS.c.id == action.id, ACTIONS.c.state == "queued")
+        .values(
+            attempts=action.attempts + 1,
+            error=error,
+            next_attempt_utc_ns=next_utc_ns,
+            changed_utc_ns=now_utc_ns,
+        )
+    )
+
+
+def events_to_repeat(connection: Connection, now_utc_ns: int) -> list[tuple[int, int]]:
+    """Return the events with queued actions that are due again, each with the largest number of failed attempts."""
+    query = (
+        select(ACTIONS.c.event_number, func.max(ACTIONS.c.attempts))
+        .where(ACTIONS.c.state == "queued", ACTIONS.c.next_attempt_utc_ns <= now_utc_ns)
+        .group_by(ACTIONS.c.event_number)
+        .order_by(ACTIONS.c.event_number)
+    )
+    return [(int(event), int(attempts)) for event, attempts in connection.execute(query)]
 
 
 def _action(row: repository.Row) -> AutomationAction:

@@ -87,6 +87,8 @@ ESTIMATOR_DESCRIPTIONS = {
 }
 
 GALLERY_FRAMES = 6
+NO_BASELINE = "no propagate-only baseline"
+
 WORST_FRAMES = 6
 WORST_MINIMUM_EXPECTED = 3
 """A frame with fewer expected craters says nothing about the detector and is no candidate for the worst ones."""
@@ -182,6 +184,9 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         navigation = _without_reference(inputs)
     else:
         reference, navigation = _navigation(inputs, inputs.reference, provenance, remarks)
+        if not any(one.kind == "baseline" for one in navigation):
+            reasons = [one.partition(": ")[2] for one in remarks if one.startswith(NO_BASELINE)]
+            missing["baselines"] = reasons[0] if reasons else "no position of them could be computed"
         if len(reference.utc_ns) == 0:
             missing["reference"] = "no frame came down to set against the reference"
     detector, gallery, worst, craters = _detector(inputs, missing, remarks)
@@ -286,6 +291,7 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         },
         "evidence_level": report.evidence_level,
         "data": list(report.data_sources),
+        "not_available": dict(report.not_available),
     }
 
 
@@ -320,10 +326,10 @@ def _navigation(
                 f"{inputs.gravity.name}, degree {min(BASELINE_DEGREE, inputs.gravity.degree)}, with Earth and Sun"
             )
         except LunarError as error:
-            remarks.append(f"no propagate-only baseline: {error}")
+            remarks.append(f"{NO_BASELINE}: {error}")
     else:
         reason = inputs.refused.get("gravity") if inputs.start_state is not None else None
-        remarks.append(f"no propagate-only baseline: {reason or 'the pass names no start state'}")
+        remarks.append(f"{NO_BASELINE}: {reason or 'the pass names no start state'}")
     series = _with_extras(inputs, series, track, path_m)
     return (
         TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
@@ -603,6 +609,12 @@ def _detector(
         None if sun is None else sun.azimuth_deg,
         pointing=_pointing_text(inputs, remarks),
     )
+    if score.micro is None or score.micro.expected == 0:
+        missing["recall"] = (
+            "no usable image came down"
+            if not detections.usable.any()
+            else "the crater catalogue has no complete crater of 5 to 30 km in view"
+        )
     chosen, worst = _choose_frames(inputs, expected, matches)
     frames = {frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
     return (

@@ -196,6 +196,11 @@ class PassFigures(Entity):
     evidence_level: str
     data: list[str] = Field(description="Data sources")
     conditions: PassConditions | None = Field(default=None, description="null: report of an older version")
+    not_available: dict[str, str] = Field(
+        default_factory=dict,
+        description="Reasons of missing content",
+        examples=[{"recall": "the crater catalogue has no complete crater of 5 to 30 km in view"}],
+    )
 
 
 class ReportOverview(Entity):

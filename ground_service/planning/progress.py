@@ -31,6 +31,7 @@ MARGIN_NS = 60 * NANOSECONDS_PER_SECOND
 
 _EVENT_CODES = {name: code for code, name in EVENTS}
 STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
+REASON_LENGTH = 500
 HEARD_TICKS = 7 * 86_400 << 16
 
 
@@ -63,6 +64,14 @@ def close_window(ground: Ground, window_id: int) -> str:
     advance_windows(ground, vehicle)
     with ground.database.reading() as connection:
         return store.get_window(connection, window_id).state
+
+
+def note_reason(ground: Ground, window_id: int, reason: str) -> None:
+    """Record why a window whose data are on the ground is not processed; its next state replaces the reason."""
+    with ground.database.writing() as connection:
+        window = store.get_record(connection, window_id)
+        if window.state in ("executed", "downlinked"):
+            store.change_window(connection, window, reason=reason[:REASON_LENGTH])
 
 
 def _advance(

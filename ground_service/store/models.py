@@ -983,6 +983,8 @@ AUTOMATION_ACTIONS = Table(
     column("state", String(16), index=True),
     optional("result", JSON),
     optional("error", Text),
+    column("attempts", SmallInteger),
+    optional("next_attempt_utc_ns", BigInteger),
     optional("decided_by", String(64)),
     column("created_utc_ns", BigInteger),
     column("changed_utc_ns", BigInteger),
@@ -991,6 +993,7 @@ AUTOMATION_ACTIONS = Table(
 """Action of an automation rule that an event caused; one for the same event, rule, place in it and subject.
 
 `subject` is the pass, vehicle or mission. `mission_id` is the revision in force; NULL without any.
+`attempts` have failed; `next_attempt_utc_ns`: it is queued again from this time on.
 """
 
 

@@ -31,8 +31,9 @@ from ground_service.evaluation.service import make_report, pass_summary, reevalu
 from ground_service.evaluation.store import newest_report
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
+from ground_service.jobs.service import add_job
 from ground_service.missions.rules import DEFAULT_RULES, Rule
-from ground_service.planning.progress import close_window
+from ground_service.planning.progress import close_window, note_reason
 from ground_service.timekeeping.recorrelation import recorrelate
 from ground_service.worker.notifications import NotDelivered, send
 from ground_service.worker.upkeep import broken_limits
@@ -48,6 +49,10 @@ _changed = threading.Condition()
 """Grounds and events whose actions run in this process, and the notification of changes of this set."""
 
 WAIT_S = 0.2
+
+ATTEMPTS = 3
+RETRY_NS = (0, 60_000_000_000)
+"""Time from a failed attempt to the next one: at once, then after a minute."""
 
 
 def run_actions(ground: Ground, event: int, job_id: str) -> dict[str, Any]:
@@ -92,7 +97,10 @@ def _alone(ground: Ground, event: int) -> Iterator[None]:
 
 
 def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:
-    """Run the actions of one rule on one subject in order, up to one that waits; skip those after a failed one."""
+    """Run the actions of one rule on one subject in order, up to one that waits or is to be repeated later.
+
+    Actions after one that finally failed are skipped.
+    """
     stopped = ""
     for action in chain:
         ground.check_stopping()
@@ -104,24 +112,78 @@ def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:
             continue
         if stopped:
             _end(ground, action, "skipped", error=f"{stopped} before it was not done")
-        elif not _run_one(ground, action):
+            continue
+        state = _run_attempts(ground, action)
+        if state == "queued":
+            return
+        if state == "failed":
             stopped = action.action
 
 
-def _run_one(ground: Ground, action: AutomationAction) -> bool:
-    """Run one action and record its end; return whether it succeeded."""
+def _run_attempts(ground: Ground, action: AutomationAction) -> str:
+    """Run one action, again after a failure if it is due at once; return its state then."""
+    while action.next_attempt is None or action.next_attempt.utc_ns <= utc_now_ns():
+        ground.check_stopping()
+        error = _run_one(ground, action)
+        if error is None:
+            return "done"
+        attempts = action.attempts + 1
+        if attempts >= ATTEMPTS:
+            _give_up(ground, action, f"{error} (attempt {attempts} of {ATTEMPTS})")
+            return "failed"
+        now = utc_now_ns()
+        with ground.database.writing() as connection:
+            due = now + RETRY_NS[attempts - 1]
+            store.note_attempt(connection, action, error=error, now_utc_ns=now, next_utc_ns=due)
+            action = store.get_action(connection, action.id)
+        if action.state != "queued":  # another process has decided it meanwhile
+            return action.state
+    return "queued"
+
+
+def _run_one(ground: Ground, action: AutomationAction) -> str | None:
+    """Run one action and record its success; return None, or why it failed."""
     try:
         _end(ground, action, "done", result=DOING[action.action](ground, action))
-        return True
+        return None
     except PASSING:
         raise
     except GroundError as error:
         log.warning("automation action %d (%s) failed: %s", action.id, action.action, error)
-        _end(ground, action, "failed", error=public_text(error))
+        return public_text(error)
     except Exception as error:  # one faulty action must not stop those of other rules
         log.exception("automation action %d (%s): unexpected error", action.id, action.action)
-        _end(ground, action, "failed", error=public_text(error))
-    return False
+        return public_text(error)
+
+
+def _give_up(ground: Ground, action: AutomationAction, error: str) -> None:
+    """Record that an action finally failed, and the reason at its window, which stays as it is."""
+    _end(ground, action, "failed", error=error)
+    if action.window_id is not None:
+        note_reason(ground, action.window_id, f"{action.action} failed: {error}")
+
+
+def repeat_due(ground: Ground) -> list[str]:
+    """Add the jobs of actions whose next attempt is due; return their ids."""
+    with ground.database.reading() as connection:
+        due = store.events_to_repeat(connection, utc_now_ns())
+    if not due:
+        return []
+    with ground.database.writing() as connection:
+        return [
+            add_job(connection, "automation", {"event": event}, job_id=_repetition_id(event, attempts))
+            for event, attempts in due
+        ]
+
+
+def has_repetitions(ground: Ground) -> bool:
+    """Return whether failed actions are to be done again, now or later."""
+    with ground.database.reading() as connection:
+        return bool(store.events_to_repeat(connection, utc_now_ns() + sum(RETRY_NS)))
+
+
+def _repetition_id(event: int, attempts: int) -> str:
+    return hashlib.blake2b(f"repeat {event} {attempts}".encode(), digest_size=16).hexdigest()
 
 
 def _end(ground: Ground, action: AutomationAction, state: str, **values: Any) -> None:

@@ -20,6 +20,7 @@ from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.links.supervisor import process_name
 from ground_service.planning.standing import needs_plan
 from ground_service.store import leases
+from ground_service.worker.actions import repeat_due
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
 
 log = logging.getLogger(__name__)
@@ -93,6 +94,7 @@ class Scheduler:
             log.info("this process does the recurring work", extra={"owner": self.owner})
         self._do("unfinished jobs", self._dispatcher.resume)
         self._do("events of other processes", self._drain)
+        self._do("failed actions", self._repeat_actions)
         self._do("overdue telecommands", self._note_timeouts)
         self._do("plan", self._enter_plan)
         self._do("nightly job", self._enter_night)
@@ -105,6 +107,10 @@ class Scheduler:
             log.warning("recurring work (%s) could not be done: %s", name, error)
         except Exception as error:  # one faulty part must not stop the others
             log.warning("recurring work (%s) could not be done: %s", name, error, exc_info=True)
+
+    def _repeat_actions(self) -> None:
+        for job_id in repeat_due(self._ground):
+            self._dispatcher.start(job_id)
 
     def _note_timeouts(self) -> None:
         until = utc_now_ns()

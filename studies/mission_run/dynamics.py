@@ -23,6 +23,7 @@ from payload_emulator.session.world import (
     sample_truth,
     with_reference_error,
 )
+from studies.mission_run.regions import Box, in_boxes, observed_boxes
 
 DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
@@ -59,13 +60,17 @@ class FlightDynamics:
         save_oem(with_reference_error(arc, scenario.reference, scenario.seed + 1_000 * (1 + day)), path)
         return path
 
+    def boxes(self, latitude_limit_deg: float) -> list[Box]:
+        """Return where windows are requested: on the ground that the data describe, see `observed_boxes`."""
+        return observed_boxes(self.world.terrain, latitude_limit_deg)
+
     def save_craters(self, latitude_limit_deg: float, path: Path) -> int:
-        """Write the craters around the latitudes of the windows with their rim heights; their number."""
+        """Write the craters around the places of the windows with their rim heights; their number."""
         world, navigation = self.world, self.world.scenario.navigation
         listed = world.terrain.catalogue
-        limit_rad = np.radians(latitude_limit_deg + CATALOGUE_MARGIN_DEG)
+        near = [one.widened(CATALOGUE_MARGIN_DEG) for one in self.boxes(latitude_limit_deg)]
         chosen = np.flatnonzero(
-            (np.abs(listed.latitude_rad) < limit_rad)
+            in_boxes(np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad), near)
             & (listed.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km)
             & (listed.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km)
         )
@@ -74,5 +79,6 @@ class FlightDynamics:
             catalogue = listed.select(chosen)
         else:
             catalogue = world.terrain.measured(chosen)
+            world.terrain.release_ground()
         save_catalogue(catalogue, path)
         return len(catalogue)

@@ -73,7 +73,9 @@ def closing_figures(
         "packets_lost_of_passes": sum(one.packets_lost for one in evaluated),
         "reports": len(evaluated),
         "reports_complete": sum(not _missing(one) for one in evaluated),
-        "reports_lack": _counted(name for one in evaluated for name in _missing(one)),
+        "reports_lack": _counted(
+            f"{name}: {reason}" for one in evaluated for name, reason in _missing(one).items()
+        ),
         "evidence": _counted(one.evidence_level for one in evaluated),
         "interventions": len(interventions),
         "interventions_list": interventions,
@@ -110,8 +112,8 @@ def _figures_of(ground: EmbeddedGround, window: Window) -> PassFigures | None:
     return ground.client.get_report_summary(reports[0].id) if reports else None
 
 
-def _missing(one: PassFigures) -> list[str]:
-    """Return what a report has to have and has not."""
+def _missing(one: PassFigures) -> dict[str, str]:
+    """Return what a report has to have and has not, with the reasons."""
     found: Mapping[str, bool] = {
         "recall": one.detector.recall is not None,
         "baselines": bool(one.baselines),
@@ -119,7 +121,21 @@ def _missing(one: PassFigures) -> list[str]:
         "evidence level": bool(one.evidence_level),
         "navigation": any(row.median_3d_m is not None for row in one.navigation.values()),
     }
-    return [name for name, has in found.items() if not has]
+    return {name: _reason(one, name) for name, has in found.items() if not has}
+
+
+def _reason(one: PassFigures, name: str) -> str:
+    """Return why a report has no recall, baselines, NEES, evidence level or navigation error."""
+    stated = one.not_available
+    if "error" in stated:
+        return stated["error"]
+    if name == "recall":
+        return stated.get("recall") or stated.get("detector") or "unknown"
+    if name == "baselines":
+        return stated.get("baselines") or "no start state was uploaded, or the gravity field is not known"
+    if name == "nees":
+        return next((row.note for row in one.requirements if row.key == NEES), "") or "unknown"
+    return "not stated in the mission description" if name == "evidence level" else "no estimate came down"
 
 
 def _value(one: PassFigures, key: str) -> float | None:

@@ -25,7 +25,10 @@ from ground_service.links.supervisor import LinkSupervisor
 from ground_service.planning.model import Window
 from ground_service.store.telemetry import packet_headers
 from ground_service.store.vehicles import all_vehicles
+from ground_service.worker.actions import has_repetitions, repeat_due
+from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
+from studies.mission_run.regions import Box
 
 USER = "mission-run"
 FLIGHT_DYNAMICS = "flight-dynamics"
@@ -100,9 +103,16 @@ class EmbeddedGround:
             lambda: (
                 all(one.is_settled for one in self.links.runners.values())
                 and not unfinished_jobs(self.ground)
+                and not self._repeats_actions()
             ),
             "contacts ended",
         )
+
+    def _repeats_actions(self) -> bool:
+        """Repeat the failed actions that are due; return whether any are to be repeated later."""
+        for job_id in repeat_due(self.ground):
+            run_job(self.ground, job_id)
+        return has_repetitions(self.ground)
 
     def octets_sent(self) -> dict[str, int]:
         """Return the octets of telecommands that were sent, by link."""
@@ -151,10 +161,10 @@ def is_of_person(entry: AuditEntry) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class PlanTerms:
-    """What is asked for: windows a day until a time, over latitudes, with a longest duration."""
+    """What is asked for: windows a day until a time, over boxes on the ground, with a longest duration."""
 
     windows_per_day: int
-    latitude_limit_deg: float
+    boxes: tuple[Box, ...]
     duration_s: float
     cadence_s: float
     start: str
@@ -170,7 +180,7 @@ class PlanTerms:
             "horizon_days": 1.0,
             "start": self.start,
             "stop": self.stop,
-            "regions": [{"latitude_deg": {"min": -self.latitude_limit_deg, "max": self.latitude_limit_deg}}],
+            "regions": [one.region() for one in self.boxes],
             "minimum_duration_s": 0.8 * self.duration_s,
             "maximum_duration_s": 1.25 * self.duration_s,
             "cadence_s": self.cadence_s,

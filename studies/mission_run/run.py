@@ -80,7 +80,7 @@ class RunTerms:
 
     @property
     def latitude_limit_deg(self) -> float:
-        """Latitude north and south of the equator within which a pass lasts about as long as a window."""
+        """Half the band of latitudes that a pass crosses within about the duration of a window."""
         return min(180.0 * self.window_s / ORBIT_S, 60.0)
 
 
@@ -267,7 +267,7 @@ class MissionRun:
             self._commission(ground)
             terms = PlanTerms(
                 self._terms.windows_per_day,
-                self._terms.latitude_limit_deg,
+                tuple(dynamics.boxes(self._terms.latitude_limit_deg)),
                 self._terms.window_s,
                 self._scenario.camera.frame_interval_s,
                 format_utc(self._scenario.epoch_utc_ns),

@@ -954,6 +954,8 @@ def upgrade() -> None:
         sa.Column("state", sa.String(length=16), nullable=False),
         sa.Column("result", sa.JSON(), nullable=True),
         sa.Column("error", sa.Text(), nullable=True),
+        sa.Column("attempts", sa.SmallInteger(), nullable=False),
+        sa.Column("next_attempt_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("decided_by", sa.String(length=64), nullable=True),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),

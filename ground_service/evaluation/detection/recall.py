@@ -243,11 +243,14 @@ def _tally(detections: DetectionSamples, expected: ExpectedCraters, matches: Mat
 
 
 def _complete_share(expected: ExpectedCraters) -> FloatArray:
-    """Share of the craters of each frame (f,) that lie where the catalogue is complete; 1 for a frame of none."""
+    """Return the share of the craters of each frame (f,) that lie where the catalogue is complete.
+
+    For a frame without craters it is 1, or 0 if the catalogue is complete nowhere along the pass.
+    """
     total = np.diff(expected.offsets)
     frame = np.repeat(np.arange(len(total)), total)
     complete = np.bincount(frame, weights=expected.complete.astype(np.float64), minlength=len(total))
-    return np.where(total > 0, complete / np.maximum(total, 1), 1.0)
+    return np.where(total > 0, complete / np.maximum(total, 1), float(expected.complete.any()))
 
 
 def _class_score(tally: _Tally, classes: Sequence[int], number: int, label: str) -> ClassScore:

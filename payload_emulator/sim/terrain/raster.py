@@ -26,7 +26,7 @@ from payload_emulator.sim.terrain.procedural import (
     mottled_albedo,
     stamp,
 )
-from payload_emulator.sim.terrain.rasters import RasterLayer, open_layers
+from payload_emulator.sim.terrain.rasters import ChunkCache, RasterLayer, open_layers
 from payload_emulator.sim.terrain.tiles import (
     Heights,
     TiledTerrain,
@@ -90,8 +90,9 @@ class RasterTerrain(TiledTerrain):
         """
         if not paths:
             raise TerrainError("terrain rasters: expected at least one height raster, found none")
-        self._fine = open_layers(paths)
-        self._layers = [*open_layers(coarse_paths), *self._fine]
+        self._chunks = ChunkCache()
+        self._fine = open_layers(paths, chunks=self._chunks)
+        self._layers = [*open_layers(coarse_paths, chunks=self._chunks), *self._fine]
         self._layers.sort(key=lambda layer: layer.pixels_per_degree)
         self.registration_north_m = registration_north_m
         self.registration_east_m = registration_east_m
@@ -121,6 +122,11 @@ class RasterTerrain(TiledTerrain):
         for layer in self._fine:
             held |= layer.holds(latitude, longitude)
         return held
+
+    def release_ground(self) -> None:
+        """Drop the tiles and the decoded pixels of the files; both are made again when they are needed."""
+        super().release_ground()
+        self._chunks.clear()
 
     def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Heights on an even grid of places (rows, columns) in metres."""

@@ -23,7 +23,8 @@ from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
-CHUNKS_KEPT = 40
+CHUNK_LIMIT_OCTETS = 96 << 20
+"""Decoded pixels that a terrain keeps of all its files: those under some consecutive frames."""
 
 RADIUS_TOLERANCE = 0.01
 """A file whose sphere differs from the Moon's by more is of another body."""
@@ -50,11 +51,44 @@ class RasterFile:
     nodata: float | None
 
 
+class ChunkCache:
+    """Decoded chunks of the layers of one terrain; the oldest in use are dropped above `limit_octets`."""
+
+    def __init__(self, limit_octets: int = CHUNK_LIMIT_OCTETS) -> None:
+        self.limit_octets = limit_octets
+        self.octets = 0
+        self._chunks: OrderedDict[tuple[int, int, int, int], Heights] = OrderedDict()
+
+    def get(self, key: tuple[int, int, int, int]) -> Heights | None:
+        """Return a chunk and note its use; None if it is not kept."""
+        found = self._chunks.get(key)
+        if found is not None:
+            self._chunks.move_to_end(key)
+        return found
+
+    def put(self, key: tuple[int, int, int, int], chunk: Heights) -> None:
+        """Keep a chunk; the newest is kept whatever its size."""
+        self._chunks[key] = chunk
+        self.octets += chunk.nbytes
+        while self.octets > self.limit_octets and len(self._chunks) > 1:
+            self.octets -= self._chunks.popitem(last=False)[1].nbytes
+
+    def clear(self) -> None:
+        """Drop all chunks."""
+        self._chunks.clear()
+        self.octets = 0
+
+
 class RasterLayer:
     """Files of one resolution on one global pixel lattice, read in chunks as they are needed."""
 
     def __init__(
-        self, pixels_per_degree: float, north_offset: float, west_offset: float, files: Sequence[RasterFile]
+        self,
+        pixels_per_degree: float,
+        north_offset: float,
+        west_offset: float,
+        files: Sequence[RasterFile],
+        chunks: ChunkCache,
     ) -> None:
         """The lattice has pixel centres at latitude ``90 - (row + 0.5 + north_offset) / ppd``, likewise longitude."""
         self.pixels_per_degree = pixels_per_degree
@@ -62,7 +96,7 @@ class RasterLayer:
         self.west_offset = west_offset
         self.files = tuple(files)
         self.turn = round(360.0 * pixels_per_degree)
-        self._chunks: OrderedDict[tuple[int, int, int], Heights] = OrderedDict()
+        self._chunks = chunks
 
     def read(self, first_row: int, first_column: int, rows: int, columns: int) -> Heights:
         """Heights (rows, columns) in metres of a window of the lattice; NaN where no file has data."""
@@ -121,10 +155,9 @@ class RasterLayer:
                 np.copyto(place, part, where=~np.isnan(part))
 
     def _chunk(self, number: int, file: RasterFile, i: int, j: int) -> Heights:
-        key = (number, i, j)
+        key = (id(self), number, i, j)
         found = self._chunks.get(key)
         if found is not None:
-            self._chunks.move_to_end(key)
             return found
         import rasterio
         from rasterio.windows import Window
@@ -145,16 +178,17 @@ class RasterLayer:
             values *= np.float32(file.scale_m)
         if file.offset_m != 0.0:
             values += np.float32(file.offset_m)
-        if len(self._chunks) >= CHUNKS_KEPT:
-            self._chunks.popitem(last=False)
-        self._chunks[key] = values
+        self._chunks.put(key, values)
         return values
 
 
-def open_layers(paths: Sequence[Path | str], heights: bool = True) -> list[RasterLayer]:
+def open_layers(
+    paths: Sequence[Path | str], heights: bool = True, chunks: ChunkCache | None = None
+) -> list[RasterLayer]:
     """Files grouped by resolution into layers, coarsest first; reads headers only.
 
-    ``heights``: values are brought to metres above the map sphere; else they are left as they are.
+    ``heights``: values are brought to metres above the map sphere; else they are left as they are. ``chunks``: the
+    cache that the layers share with others; None: one of their own.
 
     Raises
     ------
@@ -166,7 +200,8 @@ def open_layers(paths: Sequence[Path | str], heights: bool = True) -> list[Raste
     for path in paths:
         key, file = _open_header(Path(path), heights)
         groups.setdefault(key, []).append(file)
-    layers = [RasterLayer(ppd, north, west, files) for (ppd, north, west), files in groups.items()]
+    shared = ChunkCache() if chunks is None else chunks
+    layers = [RasterLayer(ppd, north, west, files, shared) for (ppd, north, west), files in groups.items()]
     return sorted(layers, key=lambda layer: layer.pixels_per_degree)
 
 

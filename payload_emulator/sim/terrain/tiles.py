@@ -351,6 +351,24 @@ class TiledTerrain(ABC):
             self._rim_tilt_m[part] = tilt
             self._measured[part] = True
 
+    def _open_pool(self) -> None:
+        size, small = TILE_PIXELS + 3, (1 << ALBEDO_SHIFT) + 1
+        self._pool = np.empty((self.cache_tiles, size, size), np.float32)
+        self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
+
+    def reserve(self) -> None:
+        """Take the memory of all tiles now, so that a long session does not grow as it comes to other ground."""
+        if self._pool is None or self._albedo is None:
+            self._open_pool()
+            assert self._pool is not None and self._albedo is not None
+            self._pool.fill(0.0)
+            self._albedo.fill(0.0)
+
+    def release_ground(self) -> None:
+        """Drop the tiles; they are made again when they are needed."""
+        self._pool = self._albedo = None
+        self._slots.clear()
+
     def release_thread(self) -> None:
         """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
         self._owner = None
@@ -371,10 +389,7 @@ class TiledTerrain(ABC):
             self._slots.move_to_end(key)
             return slot
         if self._pool is None:
-            size = TILE_PIXELS + 3
-            self._pool = np.empty((self.cache_tiles, size, size), np.float32)
-            small = (1 << ALBEDO_SHIFT) + 1
-            self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
+            self._open_pool()
         latitude, longitude = tile_angles(key[1], key[2], self._level_rows[key[0]] * TILE_PIXELS / 180.0)
         heights = self.make_heights(latitude, longitude)
         step = TILE_PIXELS >> ALBEDO_SHIFT

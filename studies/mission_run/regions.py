@@ -1,0 +1,137 @@
+"""Where a mission run requests its windows: over ground that the crater catalogue and the height rasters describe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from lunar.arrays import BoolArray, FloatArray
+from payload_emulator.sim.terrain.tiles import TiledTerrain
+
+CELL_DEG = 15
+"""Cells of the choice: the size of the tiles of the height rasters, half that of the tiles of the crater catalogue."""
+
+LATITUDE_LIMIT_DEG = 60
+CRATER_DIAMETER_M = 5e3
+"""Smallest craters that are scored; a cell of the catalogue without any is not catalogued."""
+
+SAMPLES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Places between two latitudes, and from `west_deg` to the east to `east_deg`."""
+
+    south_deg: float
+    north_deg: float
+    west_deg: float
+    east_deg: float
+
+    def widened(self, margin_deg: float) -> Box:
+        """Return the box with a margin on all sides."""
+        width = min(self.east_deg - self.west_deg + 2.0 * margin_deg, 360.0)
+        return Box(
+            max(self.south_deg - margin_deg, -90.0),
+            min(self.north_deg + margin_deg, 90.0),
+            self.west_deg - margin_deg,
+            self.west_deg - margin_deg + width,
+        )
+
+    def region(self) -> dict[str, Any]:
+        """Return the box as a region of a standing request."""
+        return {
+            "latitude_deg": {"min": self.south_deg, "max": self.north_deg},
+            "west_deg": self.west_deg,
+            "east_deg": self.east_deg,
+        }
+
+
+def in_boxes(latitude_deg: FloatArray, longitude_deg: FloatArray, boxes: Sequence[Box]) -> BoolArray:
+    """Return whether places (n,) are in any of the boxes."""
+    inside = np.zeros(len(latitude_deg), dtype=np.bool_)
+    for one in boxes:
+        inside |= (
+            (latitude_deg >= one.south_deg)
+            & (latitude_deg <= one.north_deg)
+            & ((longitude_deg - one.west_deg) % 360.0 <= one.east_deg - one.west_deg)
+        )
+    return inside
+
+
+def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box]:
+    """Return the boxes of the windows, each twice `latitude_limit_deg` high.
+
+    A terrain without data is the same everywhere: its windows are at the equator. On real terrain, each 15 deg of
+    longitude have one box: where height rasters cover all of it if there is such a place, else where the crater
+    catalogue does; of several the nearest to the equator. Longitudes without a catalogued place have none.
+    """
+    if not terrain.is_real:
+        return [Box(-latitude_limit_deg, latitude_limit_deg, -180.0, 180.0)]
+    rows = max(math.ceil(2.0 * latitude_limit_deg / CELL_DEG), 1)
+    catalogued, covered = _catalogued(terrain), _covered(terrain)
+    columns = [
+        _band(catalogued[:, k], covered[:, k], rows, latitude_limit_deg) for k in range(360 // CELL_DEG)
+    ]
+    boxes = []
+    for band, group in groupby(enumerate(columns), key=lambda one: one[1]):
+        numbers = [number for number, _ in group]
+        if band is not None:
+            boxes.append(
+                Box(band[0], band[1], float(CELL_DEG * numbers[0]), float(CELL_DEG * (numbers[-1] + 1)))
+            )
+    if len(boxes) > 1 and boxes[0].west_deg == 0.0 and boxes[-1].east_deg == 360.0:
+        first, last = boxes[0], boxes[-1]
+        if (first.south_deg, first.north_deg) == (last.south_deg, last.north_deg):
+            boxes = [replace(first, west_deg=last.west_deg - 360.0), *boxes[1:-1]]
+    return boxes
+
+
+def _band(
+    catalogued: BoolArray, covered: BoolArray, rows: int, limit_deg: float
+) -> tuple[float, float] | None:
+    """Return south and north of the best box of one column of cells; None without a catalogued one."""
+
+    def found() -> Iterator[tuple[bool, float, float]]:
+        for first in range(len(catalogued) - rows + 1):
+            part = slice(first, first + rows)
+            if catalogued[part].all():
+                centre = -LATITUDE_LIMIT_DEG + CELL_DEG * (first + rows / 2.0)
+                yield not covered[part].all(), abs(centre), centre
+
+    best = min(found(), default=None)
+    return None if best is None else (best[2] - limit_deg, best[2] + limit_deg)
+
+
+def _cells() -> tuple[int, int]:
+    return 2 * LATITUDE_LIMIT_DEG // CELL_DEG, 360 // CELL_DEG
+
+
+def _catalogued(terrain: TiledTerrain) -> BoolArray:
+    """Return whether the catalogue is complete in each cell (rows from the south, columns from 0 E)."""
+    listed = terrain.catalogue
+    scored = listed.diameter_m >= CRATER_DIAMETER_M
+    counts = []
+    for chosen in (scored & listed.complete, scored & ~listed.complete):
+        number, _, _ = np.histogram2d(
+            np.degrees(listed.latitude_rad[chosen]),
+            np.degrees(listed.longitude_rad[chosen]) % 360.0,
+            bins=_cells(),
+            range=((-LATITUDE_LIMIT_DEG, LATITUDE_LIMIT_DEG), (0.0, 360.0)),
+        )
+        counts.append(number)
+    return np.asarray((counts[0] > 0) & (counts[1] == 0))
+
+
+def _covered(terrain: TiledTerrain) -> BoolArray:
+    """Return whether height rasters cover each cell (rows from the south, columns from 0 E)."""
+    rows, columns = _cells()
+    steps = (np.arange(SAMPLES) + 0.5) * CELL_DEG / SAMPLES
+    latitude = np.radians(-LATITUDE_LIMIT_DEG + CELL_DEG * np.arange(rows)[:, None] + steps).reshape(-1)
+    longitude = np.radians(CELL_DEG * np.arange(columns)[:, None] + steps).reshape(-1)
+    held = terrain.covers(latitude[:, None], longitude[None, :])
+    return np.asarray(held.reshape(rows, SAMPLES, columns, SAMPLES).all(axis=(1, 3)))
