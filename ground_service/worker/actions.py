@@ -128,6 +128,9 @@ def _run_attempts(ground: Ground, action: AutomationAction) -> str:
         if error is None:
             return "done"
         attempts = action.attempts + 1
+        if action.action == "notify":  # each channel has had its attempts
+            _give_up(ground, action, error)
+            return "failed"
         if attempts >= ATTEMPTS:
             _give_up(ground, action, f"{error} (attempt {attempts} of {ATTEMPTS})")
             return "failed"

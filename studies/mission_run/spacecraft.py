@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -22,6 +23,9 @@ ANSWER_S = 600.0
 
 
 START_ATTEMPTS = 3
+
+ALLOCATOR = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": str(4 << 20)}
+"""Settings of the C library: large arrays go back to the system when they are dropped, so that memory stays flat."""
 
 
 def free_ports(count: int) -> list[int]:
@@ -71,7 +75,9 @@ class SpacecraftProcess:
         command = [sys.executable, "-m", "linna", *map(str, words)]
         with files.log.open("ab") as log:
             # A group of its own: Ctrl-C reaches the runner, which stops the spacecraft in order.
-            self.process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            self.process = subprocess.Popen(
+                command, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **ALLOCATOR}
+            )
         self._console = self._connected(console)
 
     def messages(self) -> Iterator[dict[str, Any]]:

@@ -499,9 +499,23 @@ def test_without_an_orientation_nothing_is_compared(refused: dict[str, str], rea
     assert report.not_available == dict.fromkeys(("error", "reference", "detector", "craters"), reason)
 
 
+def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_and_says_why() -> None:
+    found = inputs()
+    assert found.catalogue is not None
+    elsewhere = replace(found.catalogue, complete=np.zeros(len(found.catalogue), dtype=np.bool_))
+    report = evaluate_pass(inputs(catalogue=elsewhere))
+    assert report.detector is not None and report.detector.micro is not None
+    assert np.isnan([report.detector.micro.recall, report.detector.micro.precision]).all()
+    assert (
+        report.not_available["recall"] == "the crater catalogue has no complete crater of 5 to 30 km in view"
+    )
+    assert "recall" not in evaluate_pass(inputs()).not_available
+
+
 def test_what_did_not_come_down_is_named() -> None:
     nothing = evaluate_pass(inputs(detections=no_detections(), navigation=(), images={}))
     assert nothing.not_available == {
+        "baselines": "the pass names no start state",
         "reference": "no frame came down to set against the reference",
         "detector": "no detections came down",
         "craters": "no detections came down",
@@ -774,7 +788,15 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
         "evidence_level": "", "data": [],
     }  # fmt: skip
     assert {name: summary[name] for name in named} == named
-    assert set(summary) == {*named, "detector", "instruments", "navigation", "requirements", "error_budget"}
+    assert set(summary) == {
+        *named,
+        "detector",
+        "instruments",
+        "navigation",
+        "requirements",
+        "error_budget",
+        "not_available",
+    }
     assert summary["navigation"]["paper"] == {
         "median_3d_m": pytest.approx(500.0, abs=0.01),
         "p68_3d_m": paper_of.statistics.p68_3d_m,

@@ -12,6 +12,7 @@ import pytest
 
 from ground_service import events
 from ground_service.automation.service import decide, list_actions, list_rules, record_actions
+from ground_service.clock import utc_now_ns
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput, StateConflict, StorageFull
 from ground_service.evaluation import service as evaluation
@@ -29,8 +30,10 @@ from ground_service.planning.service import WindowEntry, add_window, change_wind
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.pass_archives import LIVE
 from ground_service.worker import actions
+from ground_service.worker.actions import has_repetitions, repeat_due
 from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.follow_up import FollowUp, follow_in_process
+from ground_service.worker.jobs import run_job
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import (
     CADENCE_S,
@@ -242,14 +245,45 @@ def test_a_failed_action_skips_those_after_it_and_states_why(
         raise InvalidInput("pass", "", "a pass", "none")
 
     monkeypatch.setitem(actions.DOING, "align", broken)  # type: ignore[arg-type]  # a dictionary behind a Mapping
+    monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
     found, _ = list_actions(ground)
+    why = "pass: expected a pass, found none (attempt 3 of 3)"
     assert [(one.action, one.state, one.error) for one in reversed(found)] == [
-        ("align", "failed", "pass: expected a pass, found none"),
+        ("align", "failed", why),
         ("report", "skipped", "align before it was not done"),
     ]
-    assert get_window(ground, window_id).state == "downlinked"
+    window = get_window(ground, window_id)
+    assert (window.state, window.reason) == ("downlinked", f"align failed: {why}")
+    assert not has_repetitions(ground)
+
+
+def test_a_report_that_failed_is_made_later(
+    either: Ground, flown: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, then by whoever does the recurring work: until then the action is queued and says what is wrong."""
+    attempts = []
+
+    def broken(*_: Any, **__: Any) -> Any:
+        attempts.append(1)
+        raise InvalidInput("report", "", "a renderer", "none")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(actions, "make_report", broken)
+        window_id = prepared(either, flown)
+        receive(either, flown.packets, tmp_path)
+    report, align = list_actions(either)[0]
+    assert (align.state, report.state, report.attempts, len(attempts)) == ("done", "queued", 2, 2)
+    assert report.error == "report: expected a renderer, found none" and report.next_attempt is not None
+    assert get_window(either, window_id).state == "downlinked"
+    assert has_repetitions(either) and repeat_due(either) == []  # not before its time
+    monkeypatch.setattr(actions, "utc_now_ns", lambda: utc_now_ns() + 61 * NS)
+    [job_id] = repeat_due(either)
+    assert repeat_due(either) == [job_id]  # of several processes one does it
+    run_job(either, job_id)
+    assert get_window(either, window_id).state == "processed"
+    assert {one[2] for one in recorded(either)} == {"done"} and not has_repetitions(either)
 
 
 APPROVED = """
@@ -307,7 +341,10 @@ def test_rules_in_force_show_which_are_default(ground: Ground, flown: SyntheticP
     ]
 
 
-def test_a_gate_acts_for_every_mission_that_reacts_to_it(ground: Ground, flown: SyntheticPass) -> None:
+def test_a_gate_acts_for_every_mission_that_reacts_to_it(
+    ground: Ground, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
     rule = '[[automation.rules]]\nname = "gate"\non = "gate done"\nwhen = { verdict = ["fail"] }\n'
     prepared(ground, flown, rule + 'do = ["compute_trends"]\n')
     with ground.database.writing() as connection:
