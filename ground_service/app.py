@@ -24,6 +24,7 @@ from ground_service.http.uploads import UploadPool
 from ground_service.links.supervisor import LinkSupervisor
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings, start_tracing
+from ground_service.store.wakeups import is_redis
 from ground_service.web.displays import FOLDER, displays
 from ground_service.web.documentation import documentation
 from ground_service.web.live import live
@@ -53,6 +54,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         Do jobs before the answer is sent (without a broker only), for tests and scripts.
     """
 
+    broker = settings.resolved_broker_url()
     budgets = shared_budgets(settings)
 
     @asynccontextmanager
@@ -79,6 +81,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             open_without_users=app.state.open_without_users,
             per_user=settings.sockets_per_user,
             total=settings.sockets,
+            redis_url=broker if is_redis(broker) else None,
         )
         sockets = asyncio.create_task(app.state.sockets.run())
         scheduler = Scheduler(
@@ -145,6 +148,6 @@ def _add_middleware(app: FastAPI, settings: Settings, budgets: SharedBudgets | N
 def shared_budgets(settings: Settings) -> SharedBudgets | None:
     """Return the rate limit budgets that API processes share in a Redis broker; None without one."""
     broker = settings.resolved_broker_url()
-    if settings.rate_limit_per_s <= 0.0 or broker is None or not broker.startswith(("redis://", "rediss://")):
+    if settings.rate_limit_per_s <= 0.0 or broker is None or not is_redis(broker):
         return None
     return SharedBudgets(broker, settings.rate_limit_per_s)

@@ -32,13 +32,17 @@ class Event(BaseModel):
 
 
 class TelemetryReceived(Event):
-    """New packets of a vehicle were stored; `first_ticks` and `last_ticks` are None if no packet has a time."""
+    """New packets of a vehicle were stored; `first_ticks` and `last_ticks` are None if no packet has a time.
+
+    `kinds` are the kinds of samples in the packets: housekeeping, states, events, and so on.
+    """
 
     event_kind = "telemetry"
     vehicle_id: int
     packets: int
     first_ticks: int | None = None
     last_ticks: int | None = None
+    kinds: tuple[str, ...] = ()
 
 
 class ReceptionsEntered(Event):

@@ -14,6 +14,7 @@ from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.files import UNPACKING, FileArchive, make_durable_folder, remove_leftovers
 from ground_service.store.roles import check_role
+from ground_service.store.wakeups import Waker, is_redis
 from lunar.datafolder import DataFolder, default_orientation, find_data
 
 if TYPE_CHECKING:
@@ -128,6 +129,9 @@ def ground_from_settings(settings: Settings) -> Ground:
     except BaseException:
         ground.close()
         raise
+    broker = settings.resolved_broker_url()
+    if broker is not None and is_redis(broker):
+        ground.database.listeners.add(Waker(broker))
     return ground
 
 

@@ -332,7 +332,7 @@ class Deployment:
 class ManyApis:
     """Several API processes with one database and one broker, without workers: jobs are added but not run."""
 
-    def __init__(self, folder: Path, url: str, count: int = 2) -> None:
+    def __init__(self, folder: Path, url: str, count: int = 2, **settings: str) -> None:
         if shutil.which("redis-server") is None:
             raise SystemExit("expected redis-server on this machine, found none")
         self.url = url
@@ -340,11 +340,15 @@ class ManyApis:
         self.parts: dict[str, Part] = {}
         broker, ports = free_port(), [free_port() for _ in range(count)]
         self.ports = tuple(ports)
+        self.broker_url = f"redis://127.0.0.1:{broker}/0"
         environment = service_environment(
-            LINNA_HOME=str(self.home),
-            LINNA_DATABASE_URL=url,
-            LINNA_BROKER_URL=f"redis://127.0.0.1:{broker}/0",
-            LINNA_RATE_LIMIT_PER_S="0",
+            **{
+                "LINNA_HOME": str(self.home),
+                "LINNA_DATABASE_URL": url,
+                "LINNA_BROKER_URL": self.broker_url,
+                "LINNA_RATE_LIMIT_PER_S": "0",
+            }
+            | settings
         )
         redis = [
             "redis-server",

@@ -107,7 +107,15 @@ def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored
         first, last = (int(ticks.min()), int(ticks.max())) if ticks.size else (None, None)
         publish(
             connection,
-            TelemetryReceived(vehicle_id=vehicle_id, packets=added, first_ticks=first, last_ticks=last),
+            TelemetryReceived(
+                vehicle_id=vehicle_id,
+                packets=added,
+                first_ticks=first,
+                last_ticks=last,
+                kinds=tuple(
+                    sorted(kind for kind, columns in batch.rows.items() if (ids[columns["packet"]] > 0).any())
+                ),
+            ),
         )
     return Stored(added, count - added, samples)
 

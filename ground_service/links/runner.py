@@ -40,6 +40,9 @@ POLL_S = 0.05
 """A station that pauses for this long has sent what it has: the segment is ingested."""
 
 SPOOL_LIMIT_OCTETS = 256 << 20
+LIVE_S = 0.1
+"""Shortest segment of a station that does not pause."""
+
 RETRY_S = 1.0
 MISSED_S = 1.0
 INCOMING = "incoming"
@@ -84,7 +87,7 @@ class LinkRunner:
         self._ingest_fault: str | None = None
         self._renewed_s = self._missed_s = self._sent_s = 0.0
         self._acknowledged = 0
-        self._last_block_s = 0.0
+        self._last_block_s = self._segment_s = 0.0
         self._repeated_for: int | None = None
         self.lost = False
 
@@ -216,20 +219,29 @@ class LinkRunner:
                 self._progress.empty_utc_ns = before
         octets = self._block
         if octets is None:
-            idle = self._progress.received - self._spool.size <= self._progress.ingested
             pause = time.monotonic() - self._last_block_s >= PAUSE_S or not self._down.connected
             # Less than a frame stays in the segment, to be continued by what comes next.
-            if (idle or pause) and self._spool.holds_a_unit():
+            if (self._ingest_is_idle or pause) and self._spool.holds_a_unit():
                 self._cut()
             return
         self._last_block_s = time.monotonic()
+        if self._spool.size == 0:
+            self._segment_s = self._last_block_s
         self._hear()
         self._keep(octets)
         if self.declared.link.acknowledge:
             self._acknowledged += len(octets)
             self._down.send(ACKNOWLEDGEMENT.pack(self._acknowledged))
-        if self._spool.size >= SEGMENT_OCTETS:
+        # A station that never pauses is shown as well: what came is ingested while the ingest has nothing else to do.
+        due = time.monotonic() - self._segment_s >= LIVE_S and self._ingest_is_idle
+        if self._spool.size >= SEGMENT_OCTETS or (due and self._spool.holds_a_unit()):
             self._cut()
+        elif due:
+            self._segment_s = time.monotonic()
+
+    @property
+    def _ingest_is_idle(self) -> bool:
+        return self._progress.received - self._spool.size <= self._progress.ingested
 
     def _keep(self, octets: bytes) -> None:
         """Write the received block to the spool; after an error it stays in `_block` for the next attempt."""

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
+from sqlalchemy import Connection
 
 from ground_service.clock import mission_now_ns
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
-from ground_service.passes.model import LiveParameter, SpacecraftInstance
+from ground_service.passes.model import LiveParameter, LiveValue, NewestPacket, SpacecraftInstance
 from ground_service.store import telemetry
-from ground_service.store.vehicles import FLOWN, all_vehicles, find_vehicle
+from ground_service.store.vehicles import FLOWN, Vehicle, all_vehicles, find_vehicle, get_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from tmtc.dictionary import DICTIONARY
@@ -42,39 +43,71 @@ def live_parameters(ground: Ground, spacecraft_id: int, instance: str) -> list[L
     NotFound
         There is no such spacecraft.
     """
-    found: list[LiveParameter] = []
     with ground.database.reading() as connection:
-        vehicle = find_vehicle(connection, spacecraft_id, instance)
-        correlations = load_correlations(connection, vehicle.id)
-        for name in LIVE_PACKETS:
-            octets = telemetry.newest_packet(connection, vehicle.id, DICTIONARY.packet(name).apid)
-            if octets is not None:
-                packet = DICTIONARY.unpack_packet(octets)
-                utc_ns = int(utc_ns_of_ticks(np.array([packet.ticks]), correlations)[0][0])
-                found.extend(_values(packet, utc_ns))
+        newest = _newest(connection, find_vehicle(connection, spacecraft_id, instance))
+    return [_described(packet, value) for packet in newest for value in packet.values]
+
+
+def newest_packets(ground: Ground, vehicle_id: int) -> list[NewestPacket]:
+    """Return the values of the newest packet of each kind of a vehicle.
+
+    Raises
+    ------
+    NotFound
+        There is no such vehicle.
+    """
+    with ground.database.reading() as connection:
+        return _newest(connection, get_vehicle(connection, vehicle_id))
+
+
+def _newest(connection: Connection, vehicle: Vehicle) -> list[NewestPacket]:
+    correlations = load_correlations(connection, vehicle.id)
+    found = []
+    for name in LIVE_PACKETS:
+        octets = telemetry.newest_packet(connection, vehicle.id, DICTIONARY.packet(name).apid)
+        if octets is None:
+            continue
+        packet = DICTIONARY.unpack_packet(octets)
+        utc_ns = int(utc_ns_of_ticks(np.array([packet.ticks]), correlations)[0][0])
+        age_s = (mission_now_ns() - utc_ns) / 1e9
+        found.append(
+            NewestPacket(
+                spacecraft_id=vehicle.ccsds_id,
+                instance=vehicle.instance,
+                packet=packet.name,
+                time=UtcTime(utc_ns),
+                age_s=age_s if age_s >= 0.0 else None,
+                values=tuple(_values(packet)),
+            )
+        )
     return found
 
 
-def _values(packet: DecodedPacket, utc_ns: int) -> Iterator[LiveParameter]:
-    age_s = (mission_now_ns() - utc_ns) / 1e9
-    known_age_s = age_s if age_s >= 0.0 else None
+def _values(packet: DecodedPacket) -> Iterator[LiveValue]:
     for field in DICTIONARY.packet(packet.name).fields:
         if field.size == 1:
             value = float(packet.values[field.name])
-            limits = field.warning or field.alarm
-            state = LIMIT_STATES[int(field.limit_states(value))]
-            yield LiveParameter(
+            limited = field.warning is not None or field.alarm is not None
+            yield LiveValue(
                 name=field.name,
-                packet=packet.name,
-                description=field.description,
-                unit=field.unit,
                 value=value,
                 text=_text(field, packet.raw[field.name], value),
-                limit_state="none" if limits is None else state,
-                limits="" if limits is None else f"{limits[0]:g} to {limits[1]:g}",
-                time=UtcTime(utc_ns),
-                age_s=known_age_s,
+                limit_state=LIMIT_STATES[int(field.limit_states(value))] if limited else "none",
             )
+
+
+def _described(packet: NewestPacket, value: LiveValue) -> LiveParameter:
+    field = next(one for one in DICTIONARY.packet(packet.packet).fields if one.name == value.name)
+    limits = field.warning or field.alarm
+    return LiveParameter(
+        **dict(value),
+        packet=packet.packet,
+        description=field.description,
+        unit=field.unit,
+        limits="" if limits is None else f"{limits[0]:g} to {limits[1]:g}",
+        time=packet.time,
+        age_s=packet.age_s,
+    )
 
 
 def _text(field: Field, raw: Any, value: float) -> str:

@@ -251,16 +251,34 @@ class SpacecraftInstance(Entity):
     instance: str = Field(examples=["flight"])
 
 
-class LiveParameter(Entity):
-    """Value of a parameter in the newest packet of its APID, by on-board time."""
+class LiveValue(Entity):
+    """Value of a parameter, with its state by the limits."""
 
     name: str = Field(examples=["temperature_c"])
-    packet: str = Field(examples=["housekeeping"])
-    description: str
-    unit: str = Field(examples=["degC"])
     value: Annotated[float | None, BeforeValidator(_known)] = Field(description="Null: not known")
     text: str = Field(description="Value as people read it: the name of a code, or the number")
     limit_state: Literal["none", "within", "warning", "alarm"] = Field(description="none: no limits")
+
+
+class NewestPacket(Entity):
+    """Values of the newest packet of one kind of a spacecraft, by on-board time: the live message ``values``."""
+
+    spacecraft_id: int
+    instance: str
+    packet: str
+    time: UtcTime = Field(description="Spacecraft time of the packet")
+    age_s: float | None = Field(
+        description="Time since then; null: the packet is later than the clock of the service"
+    )
+    values: tuple[LiveValue, ...]
+
+
+class LiveParameter(LiveValue):
+    """Value of a parameter in the newest packet of its APID, by on-board time."""
+
+    packet: str = Field(examples=["housekeeping"])
+    description: str
+    unit: str = Field(examples=["degC"])
     limits: str = Field(description="Warning limits, else alarm limits; empty: none", examples=["-20 to 60"])
     time: UtcTime = Field(description="Spacecraft time of the packet")
     age_s: float | None = Field(

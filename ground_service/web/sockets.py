@@ -1,6 +1,9 @@
 """Open WebSockets: their callers and limits, periodic authorisation, and the event log.
 
-The event log is read once for all sockets of a process. Callers are verified again every `VERIFY_S`: a socket is
+The event log is read once for all sockets of a process, as soon as events were committed: by this process, or by
+another one that sends a wake-up over Redis. Without Redis the events of other processes are found by polling. Newest
+values are sent to the sockets that request them. A socket that is too slow for them skips intermediate values, and only
+those. Callers are verified again every `VERIFY_S`: a socket is
 closed if its token was revoked or has expired, or if its user was disabled.
 """
 
@@ -10,7 +13,7 @@ import asyncio
 import contextlib
 import json
 import logging
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -21,14 +24,17 @@ from starlette.concurrency import run_in_threadpool
 
 from ground_service.access.security import SESSION_COOKIE
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
+from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, NotAuthorised
-from ground_service.events import last_number, read_events
+from ground_service.events import TelemetryReceived, last_number, read_events
 from ground_service.ground import Ground
 from ground_service.http.limits import VERIFIED_CALLER
 from ground_service.http.problems import problem
 from ground_service.http.proxies import address_key
 from ground_service.http.times import time_text
 from ground_service.store.events import LoggedEvent
+from ground_service.store.wakeups import listen
+from ground_service.web.newest import NewestValues, Source
 
 log = logging.getLogger(__name__)
 
@@ -46,13 +52,19 @@ TRY_AGAIN_LATER = 1013
 
 @dataclass(eq=False, slots=True)
 class Session:
-    """Socket and its caller, as last verified; `ended` holds the close code."""
+    """Socket and its caller, as last verified; `ended` holds the close code.
+
+    `messages` are queued events with their numbers, `values` the newest values that were not sent yet (None: not
+    requested).
+    """
 
     socket: WebSocket
     caller: Caller
     token: str | None
     ended: asyncio.Future[int]
-    messages: asyncio.Queue[tuple[int, str]] = field(default_factory=lambda: asyncio.Queue(QUEUED_LIMIT))
+    messages: deque[tuple[int, str]] = field(default_factory=deque)
+    values: dict[Source, str] | None = None
+    ready: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def accept(self) -> None:
         """Accept the socket; a client that sent its token as a sub-protocol receives the sub-protocol name back."""
@@ -66,17 +78,41 @@ class Session:
 
     def offer(self, number: int, text: str) -> None:
         """Queue an event."""
-        try:
-            self.messages.put_nowait((number, text))
-        except asyncio.QueueFull:
+        if len(self.messages) >= QUEUED_LIMIT:
             self.end(TRY_AGAIN_LATER)
+            return
+        self.messages.append((number, text))
+        self.ready.set()
+
+    def offer_values(self, source: Source, text: str) -> None:
+        """Keep the newest values of a source until they are sent."""
+        if self.values is not None:
+            self.values[source] = text
+            self.ready.set()
+
+    async def send_offered(self, after: int) -> None:
+        """Send what is offered, events with numbers above `after` first, until cancelled."""
+        while True:
+            await self.ready.wait()
+            self.ready.clear()
+            while self.messages or self.values:
+                if self.messages:
+                    number, text = self.messages.popleft()
+                    if number > after:
+                        await self.socket.send_text(text)
+                elif self.values:  # after the events that they have the number of
+                    await self.socket.send_text(self.values.pop(next(iter(self.values))))
 
 
 class Sockets:
     """WebSockets of one process."""
 
-    def __init__(self, ground: Ground, *, open_without_users: bool, per_user: int, total: int) -> None:
+    def __init__(
+        self, ground: Ground, *, open_without_users: bool, per_user: int, total: int, redis_url: str | None
+    ) -> None:
         self._ground = ground
+        self._redis_url = redis_url
+        self._newest = NewestValues(ground)
         self._open_without_users = open_without_users
         self._per_user, self._total = per_user, total
         self._sessions: set[Session] = set()
@@ -119,8 +155,9 @@ class Sockets:
                 del self._holders[holder]
             session.end(POLICY_VIOLATION)
 
-    async def open(self, session: Session) -> int:
+    async def open(self, session: Session, *, values: bool = False) -> int:
         """Accept a socket, queue new events for it, and return the number of the newest event before them."""
+        session.values = {} if values else None
         newest = await run_in_threadpool(last_number, self._ground.database)
         if not self._readers:
             self._number = newest
@@ -139,11 +176,7 @@ class Sockets:
                 if item.number <= known:
                     await session.socket.send_text(text_of(item))
             at = items[-1].number if items else known
-        number = max(number, known)
-        while True:
-            at, text = await session.messages.get()
-            if at > number:
-                await session.socket.send_text(text)
+        await session.send_offered(max(number, known))
 
     async def run(self) -> None:
         """Read the event log for all sockets and verify their callers until cancelled."""
@@ -154,11 +187,14 @@ class Sockets:
                 loop.call_soon_threadsafe(self._committed.set)
 
         self._ground.database.listeners.add(wake)
-        await asyncio.gather(self._read(), self._verify())
+        work = [self._read(), self._verify()]
+        if self._redis_url is not None:
+            work.append(listen(self._redis_url, self._committed.set))
+        await asyncio.gather(*work)
 
     async def _read(self) -> None:
         while True:
-            # Events of this process are read at once, those of other processes after POLL_S.
+            # Without a wake-up, events of other processes are read after POLL_S.
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._committed.wait(), POLL_S)
             self._committed.clear()
@@ -174,6 +210,28 @@ class Sockets:
                 for session in self._readers:
                     session.offer(item.number, text)
                 self._number = item.number
+            if len(items) == BATCH:
+                self._committed.set()
+            await self._offer_values(items)
+
+    async def _offer_values(self, items: list[LoggedEvent]) -> None:
+        vehicles = {
+            TelemetryReceived.of(item).vehicle_id
+            for item in items
+            if item.kind == TelemetryReceived.event_kind
+        }
+        if not vehicles or all(session.values is None for session in self._readers):
+            return
+        try:
+            found = await run_in_threadpool(self._newest.changed, vehicles)
+        except GroundError as error:
+            log.warning("newest values cannot be read: %s", error)
+            return
+        time = time_text(utc_now_ns())
+        for source, payload in found:
+            text = f'{{"sequence":{self._number},"time":"{time}","kind":"values","payload":{payload}}}'
+            for session in self._readers:
+                session.offer_values(source, text)
 
     async def _verify(self) -> None:
         while True:

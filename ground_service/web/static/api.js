@@ -50,15 +50,17 @@ export async function finished(jobId, progress = () => {}) {
 }
 
 // The feed of what happens: reconnects and misses nothing, since every message has the next number.
-export function follow(onMessage, onState = () => {}) {
+// With `values` the newest values of all spacecraft are among the messages, as they are received.
+export function follow(onMessage, onState = () => {}, values = false) {
   let last = null;
   let wait = 1000;
   let stopped = false;
   let socket = null;
   function open() {
-    const after = last === null ? "" : `?after=${last}`;
-    const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${PREFIX}/live${after}`;
-    socket = new WebSocket(url);
+    const query = new URLSearchParams();
+    if (last !== null) query.set("after", last);
+    if (values) query.set("values", "true");
+    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${PREFIX}/live?${query}`);
     socket.onopen = () => {
       wait = 1000;
       onState(true);

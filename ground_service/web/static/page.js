@@ -221,10 +221,13 @@ byId("menu").addEventListener("click", () => {
 });
 
 // `again` reads the contents of a page again: no message reports changes from before the feed connected.
+// A page that watches `values` gets the newest values of all spacecraft as messages.
 const watchers = [];
 const readers = [];
-export function watch(onMessage, again = null) {
+let valuesWatched = false;
+export function watch(onMessage, again = null, { values = false } = {}) {
   watchers.push(onMessage);
+  valuesWatched ||= values;
   if (again) readers.push(again);
 }
 
@@ -242,6 +245,7 @@ session
         if (connected) readers.forEach((again) => Promise.resolve(again()).catch(trouble));
         byId("feed-light").setAttribute("aria-label", `live feed: ${connected ? "connected" : "not connected"}`);
       },
+      valuesWatched,
     ),
   )
   .catch((error) => {

@@ -1,16 +1,19 @@
 // Newest values of the parameters of a spacecraft: value, limit state, age and recent course, updated by the feed.
 import { bind, restore } from "./address.js";
 import { get } from "./api.js";
+import { merged } from "./newest.js";
 import { acting, byId, element, lengthText, parameterName, show, stateMark, svg, table, timeText, trouble, unitText, watch } from "./page.js";
 
 const KEPT = 60; // values of the recent course
 const STALE_S = 120; // older values are marked
-const AGAIN_MS = 200; // shortest time between two requests
+const AGAIN_MS = 100; // shortest time between two drawings
 
 const course = new Map();
 let values = [];
-let received = 0;
-let waiting = null;
+let drawing = null;
+let asked = 0; // number of the last request
+let asking = false;
+const early = []; // messages that came during a request
 
 const key = (one) => `${byId("spacecraft").value} ${one.packet} ${one.name}`;
 
@@ -30,7 +33,7 @@ function spark(one) {
 
 function age(one) {
   if (one.age_s === null) return "unknown";
-  const now = one.age_s + (Date.now() - received) / 1000;
+  const now = one.age_s + (Date.now() - one.received) / 1000;
   return element("span", { class: now > STALE_S ? "stale" : null }, now > STALE_S ? `${lengthText(now)}, stale` : lengthText(now));
 }
 
@@ -57,8 +60,14 @@ function draw() {
 async function refresh() {
   const [spacecraft, instance] = byId("spacecraft").value.split(" ");
   if (!instance) return;
-  values = (await get("parameters", { spacecraft_id: spacecraft, instance })).items;
-  received = Date.now();
+  const request = ++asked;
+  asking = true;
+  early.length = 0;
+  const { items } = await get("parameters", { spacecraft_id: spacecraft, instance }).finally(() => {
+    if (request === asked) asking = false;
+  });
+  if (request !== asked) return;
+  values = early.splice(0).reduce(merged, items.map((one) => ({ ...one, received: Date.now() })));
   values.forEach(note);
   const packet = byId("packet").value;
   const packets = [...new Set(values.map((one) => one.packet))];
@@ -68,14 +77,27 @@ async function refresh() {
   draw();
 }
 
-function soon() {
-  waiting ??= setTimeout(() => {
-    waiting = null;
+// Values of the feed; a packet that was not there before brings its parameters by a request.
+function take(packet) {
+  if (`${packet.spacecraft_id} ${packet.instance}` !== byId("spacecraft").value) return;
+  if (asking) {
+    early.push(packet);
+    return;
+  }
+  if (!values.some((one) => one.packet === packet.packet)) {
     refresh().catch(trouble);
+    return;
+  }
+  values = merged(values, packet);
+  values.filter((one) => one.packet === packet.packet).forEach(note);
+  drawing ??= setTimeout(() => {
+    drawing = null;
+    draw();
   }, AGAIN_MS);
 }
 
 export async function showLive() {
+  watch((message) => message.kind === "values" && take(message.payload), refresh, { values: true });
   try {
     const { items } = await get("spacecraft");
     show("spacecraft", items.map((one) => element("option", { value: `${one.spacecraft_id} ${one.instance}` }, `${one.spacecraft_id}, ${one.instance}`)));
@@ -88,6 +110,5 @@ export async function showLive() {
   byId("spacecraft").addEventListener("change", acting(refresh));
   bind("spacecraft", "packet");
   byId("packet").addEventListener("change", draw);
-  watch((message) => message.kind === "telemetry" && soon(), soon);
   setInterval(draw, 5000);
 }

@@ -24,6 +24,7 @@ from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 WAIT_MS = 30_000
+AFTER = parse_utc("2029-08-07T06:15:00Z")
 SOURCE = Path(__file__).parents[3] / "deploy" / "openmct"
 
 
@@ -94,21 +95,26 @@ def spacecraft(url):
 
 def receive(url, temperature_c, second):
     """Upload a housekeeping packet and a camera fault, later than the packets of the pass."""
-    zeros = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
-    values = zeros | {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c, "mode": 1}
-    ticks = int(ticks_from_utc_ns(parse_utc("2029-08-07T06:15:00Z"))) + second * 65_536
-    fault = {"event_id": 20, "frame_number": second, "value_1": 0.0, "value_2": 0.0}
-    packets = [
-        DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=900 + second),
-        DICTIONARY.pack("event_high", fault, ticks=ticks, sequence_count=900 + second),
-    ]
+    values = {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c, "mode": 1}
+    upload(url, second, {"housekeeping": values, "event_high": {"event_id": 20, "frame_number": second}})
+
+
+def upload(url, second, packets):
+    """Upload packets, fields by name, of a second after the end of the synthetic pass; return its time in ms."""
+    ticks = int(ticks_from_utc_ns(AFTER)) + second * 65_536
+    packed = []
+    for name, values in packets.items():
+        fields = DICTIONARY.packet(name).fields
+        zeros = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
+        packed.append(DICTIONARY.pack(name, zeros | values, ticks=ticks, sequence_count=900 + second))
     request = urllib.request.Request(
         f"{url}/api/v1/telemetry?name=live-{second}.cadu&instance={spacecraft(url)['instance']}",
-        data=encode_cadus(packets, spacecraft_id=76),
+        data=encode_cadus(packed, spacecraft_id=76),
         headers={"Content-Type": "application/octet-stream"},
     )
-    with urllib.request.urlopen(request, timeout=20) as answer:
+    with urllib.request.urlopen(request, timeout=60) as answer:
         assert answer.status == 202
+    return AFTER // 1_000_000 + 1_000 * second
 
 
 def test_without_open_mct_the_page_says_how_to_install_it(service):
@@ -184,6 +190,42 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     assert found == {"temperature_c": "acknowledged", "camera_fault": "raised"}
     event = mct.locator(".c-telemetry-table tr").filter(has_text="camera fault")
     expect(event).to_contain_text("high", timeout=WAIT_MS)
+
+
+FOLLOW = """async (key) => {
+    const object = await openmct.objects.get({ namespace: "linna", key });
+    window.followed = [];
+    openmct.telemetry.subscribe(object, (given) => followed.push(...[given].flat()), { strategy: "batch" });
+}"""
+
+
+@pytest.mark.parametrize(("kind", "second"), [("events", 10), ("parameter", 20)])
+def test_what_comes_within_a_minute_of_the_newest_telemetry_is_shown_once(mct, shown, kind, second):
+    instance = spacecraft(shown.url)["instance"]
+    receive(shown.url, 20.0, second - 1)
+    mct.goto(f"/mct#/browse/linna:spacecraft/linna:vehicle~76~{instance}")
+    expect(mct.get_by_text("Live feed connected")).to_be_visible(timeout=WAIT_MS)
+    labels = DICTIONARY.labels("navigation_state", "estimator")
+    (estimator,) = (code for code, name in labels.items() if name == "spherical")
+    state = "navigation_state.spherical.altitude_m"
+    key = {"events": f"events~76~{instance}", "parameter": f"parameter~76~{instance}~{state}"}[kind]
+    mct.evaluate(FOLLOW, key)
+    for at in (second, second + 1):
+        ticks = int(ticks_from_utc_ns(AFTER)) + at * 65_536
+        packets = {
+            "navigation_state": {"image_ticks": ticks, "estimator": estimator},
+            "event_high": {"event_id": 20, "frame_number": at},
+        }
+        # Open MCT shows the interval until a minute after the newest telemetry.
+        time = upload(shown.url, at, packets)
+        mct.wait_for_function(
+            "(time) => followed.some((one) => Math.abs(one.utc - time) < 500)", arg=time, timeout=2 * WAIT_MS
+        )
+    given = mct.evaluate("followed.map((one) => JSON.stringify(one))")
+    assert len(given) == len(set(given))
+    assert sorted(mct.evaluate("followed.map((one) => one.utc)"))[-2:] == mct.evaluate(
+        "followed.map((one) => one.utc).slice(-2)"
+    )
 
 
 def test_the_layout_of_a_payload_engineer_shows_states_series_and_images(mct, shown):

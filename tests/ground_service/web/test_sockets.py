@@ -4,6 +4,7 @@ import asyncio
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,21 @@ from starlette.websockets import WebSocketDisconnect
 
 from ground_service.access import service as users
 from ground_service.app import create_app
+from ground_service.ingest.service import ingest_file
 from ground_service.settings import Settings
 from ground_service.store.events import publish
 from ground_service.web import sockets
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
     warnings.simplefilter("ignore")
     from fastapi.testclient import TestClient
+    from starlette.testclient import WebSocketDenialResponse
 
 LIVE = "/api/v1/live"
+TICKS = 900_000_000 * 65_536
 
 
 @pytest.fixture
@@ -129,8 +135,6 @@ def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(
 
 
 def refused(client: TestClient, token: str | None) -> bool:
-    from starlette.testclient import WebSocketDenialResponse
-
     headers = bearer(token) if token else {}
     try:
         with client.websocket_connect(LIVE, headers=headers):
@@ -210,7 +214,7 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
         while not hub._readers and time.monotonic() < until:
             time.sleep(0.01)
         (session,) = hub._readers
-        session.messages._maxsize = 2
+        monkeypatch.setattr(sockets, "QUEUED_LIMIT", 2)
 
         async def stuck(_text: str) -> None:
             await asyncio.sleep(60.0)
@@ -219,3 +223,105 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
         for number in range(8):
             say(ground, number)
         assert closing_code(socket) == sockets.TRY_AGAIN_LATER
+
+
+def receive(ground: Any, folder: Path, second: int, name: str = "housekeeping", **values: float) -> None:
+    """Ingest a packet of spacecraft 76 of a second."""
+    fields = DICTIONARY.packet(name).fields
+    zeros: dict[str, Any] = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
+    packet = DICTIONARY.pack(name, zeros | values, ticks=TICKS + second * 65_536, sequence_count=second)
+    file = folder / f"{name}-{second}.cadu"
+    file.write_bytes(encode_cadus([packet], spacecraft_id=76))
+    ingest_file(ground, file)
+
+
+def messages_until(socket: Any, kind: str) -> list[dict[str, Any]]:
+    """Return the messages up to the next one of a kind."""
+    found = [socket.receive_json()]
+    while found[-1]["kind"] != kind:
+        found.append(socket.receive_json())
+    return found
+
+
+def test_newest_values_are_sent_on_request_and_only_those_that_changed(
+    client: TestClient, tmp_path: Path
+) -> None:
+    ground = ground_of(client)
+    with client.websocket_connect(f"{LIVE}?values=true") as socket, client.websocket_connect(LIVE) as plain:
+        receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25, mode=2)
+        *before, first = messages_until(socket, "values")
+        telemetry = next(one for one in before if one["kind"] == "telemetry")
+        assert telemetry["payload"]["kinds"] == ["housekeeping"]
+        assert first["sequence"] >= telemetry["sequence"]
+        packet = first["payload"]
+        assert (packet["spacecraft_id"], packet["instance"], packet["packet"]) == (
+            76,
+            "flight",
+            "housekeeping",
+        )
+        values = {one["name"]: one for one in packet["values"]}
+        assert values["temperature_c"] == {
+            "name": "temperature_c", "value": 70.25, "text": "70.25", "limit_state": "warning",
+        }  # fmt: skip
+        assert values["mode"]["text"] == "observing"
+        receive(ground, tmp_path, 2, "frame_outcome")
+        assert messages_until(socket, "values")[-1]["payload"]["packet"] == "frame_outcome"
+        receive(ground, tmp_path, 3, structure_id=1)
+        packet = messages_until(socket, "values")[-1]["payload"]
+        assert (packet["packet"], {one["value"] for one in packet["values"] if one["name"] == "mode"}) == (
+            "housekeeping",
+            {0.0},
+        )
+        say(ground, 7)
+        kinds = [one["kind"] for one in messages_until(plain, "test")]
+        assert kinds.count("telemetry") == 3 and "values" not in kinds
+
+
+def test_values_of_the_feed_are_those_of_the_parameters(client: TestClient, tmp_path: Path) -> None:
+    ground = ground_of(client)
+    with client.websocket_connect(f"{LIVE}?values=true") as socket:
+        receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25)
+        packet = messages_until(socket, "values")[-1]["payload"]
+    listed = client.get("/api/v1/parameters?spacecraft_id=76").json()["items"]
+    shared = ("name", "value", "text", "limit_state")
+    assert packet["values"] == [{name: one[name] for name in shared} for one in listed]
+    assert {one["time"] for one in listed} == {packet["time"]}
+
+
+def test_a_slow_socket_skips_values_and_no_events() -> None:
+    sent: list[str] = []
+
+    class Slow:
+        async def send_text(self, text: str) -> None:
+            sent.append(text)
+            if text == "event 1":  # what comes while this is being sent
+                for number in (2, 3):
+                    session.offer(number, f"event {number}")
+                    session.offer_values((1, "housekeeping"), f"values {number}")
+            await asyncio.sleep(0)
+
+    session: Any = None
+
+    async def run() -> None:
+        nonlocal session
+        session = sockets.Session(
+            Slow(),  # type: ignore[arg-type]  # only what is sent matters
+            sockets.LOCAL_CALLER, None, asyncio.get_running_loop().create_future(), values={},
+        )  # fmt: skip
+        session.offer(1, "event 1")
+        session.offer_values((1, "housekeeping"), "values 1")
+        session.offer_values((1, "detections"), "values of detections")
+        task = asyncio.create_task(session.send_offered(0))
+        while "values of detections" not in sent:
+            await asyncio.sleep(0)
+        task.cancel()
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(asyncio.run, run()).result()
+    assert sent == ["event 1", "event 2", "event 3", "values 3", "values of detections"]
+
+
+@pytest.mark.parametrize("query", ["values=maybe", "values=true&values=true", "value=true"])
+def test_an_invalid_query_is_refused(client: TestClient, query: str) -> None:
+    with pytest.raises((WebSocketDisconnect, WebSocketDenialResponse)):
+        client.websocket_connect(f"{LIVE}?{query}").__enter__()

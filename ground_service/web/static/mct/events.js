@@ -1,7 +1,7 @@
 // Event reports of a spacecraft as a table.
 import { get } from "../api.js";
 import { addExtra } from "./dictionary.js";
-import { listen, milliseconds } from "./feed.js";
+import { afterTelemetry, FAR, milliseconds } from "./feed.js";
 
 const PAGE = 1000;
 const MOST = 5000; // newest events of an interval that are shown
@@ -32,14 +32,18 @@ async function request({ spacecraft }, { start, end, size, signal }) {
   return found.reverse();
 }
 
+// From the start of what is shown: the interval ends after the newest telemetry, so its end would hide what follows.
 function subscribe(openmct, object, callback) {
-  let last = openmct.time.getBounds().end;
-  return listen("telemetry", async () => {
+  let from = openmct.time.getBounds().start;
+  let known = new Set(); // events at that time
+  return afterTelemetry("events", async () => {
     try {
-      const found = await request(object, { start: last + 1, end: Date.UTC(2129, 0) });
-      if (!found.length) return;
-      last = found.at(-1).utc;
-      callback(found);
+      const found = await request(object, { start: from, end: FAR });
+      const fresh = found.filter((one) => !known.has(one.id));
+      if (!fresh.length) return;
+      from = fresh.at(-1).utc;
+      known = new Set(found.filter((one) => one.utc >= from).map((one) => one.id));
+      callback(fresh);
     } catch (error) {
       console.warn(`${object.name}: ${error.message}`);
     }

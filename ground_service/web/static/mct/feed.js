@@ -1,7 +1,8 @@
-// Live feed of the displays: one socket, told to all that listen, and newest values requested once for all of them.
+// Live feed of the displays: one socket for all listeners. Newest values come over it and are requested once at its start.
 import { follow, get } from "../api.js";
+import { merged } from "../newest.js";
 
-const AGAIN_MS = 250; // shortest time between two requests of the newest values of a spacecraft
+const AGAIN_MS = 250; // shortest time between two requests after telemetry
 
 const listeners = new Map(); // event kind -> functions
 let connected = false;
@@ -27,62 +28,104 @@ export function startFeed() {
       if (state) for (const kind of ["telemetry", "alarm"]) listeners.get(kind)?.forEach((listener) => listener({ kind }));
       states.forEach((listener) => listener(state));
     },
+    true,
   );
 }
+
+// Do work after telemetry with samples of a kind (null: any): at once, then at most every AGAIN_MS, one at a time.
+export function afterTelemetry(kind, work) {
+  let busy = false;
+  let again = false;
+  async function run() {
+    if (busy) {
+      again = true;
+      return;
+    }
+    busy = true;
+    do {
+      again = false;
+      const pause = new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+      await work();
+      await pause;
+    } while (again);
+    busy = false;
+  }
+  const concerns = (payload) => !payload || kind === null || payload.kinds.includes(kind);
+  const end = listen("telemetry", ({ payload }) => concerns(payload) && run());
+  return () => {
+    again = false;
+    end();
+  };
+}
+
+export const FAR = Date.UTC(2129, 0); // later than all telemetry
 
 export const milliseconds = (text) => Date.parse(`${text.slice(0, 23).replace(/Z$/, "")}Z`);
 
 const keyOf = (spacecraft) => `${spacecraft.spacecraft_id} ${spacecraft.instance}`;
 
-const request = (spacecraft) => get("parameters", spacecraft).then(({ items }) => items.filter((one) => one.value !== null));
+const request = (spacecraft) => get("parameters", { spacecraft_id: spacecraft.spacecraft_id, instance: spacecraft.instance }).then(({ items }) => items);
 
 // Newest values of a spacecraft: the result is shared by requests that come while one is under way.
 const running = new Map();
 export function newest(spacecraft) {
   const key = keyOf(spacecraft);
   if (!running.has(key)) {
-    const asked = request(spacecraft);
+    const asked = request(spacecraft).then((values) => values.filter((one) => one.value !== null));
     running.set(key, asked);
     asked.catch(() => {}).finally(() => running.delete(key));
   }
   return running.get(key);
 }
 
-// Requests of the newest values of one spacecraft after telemetry events: at once, then at most every AGAIN_MS.
+// Newest values of one spacecraft: all of them at the start and after each connection, then those that the feed sends.
 class Follower {
   constructor(spacecraft) {
-    Object.assign(this, { spacecraft, followers: new Set(), busy: false, again: false });
-    listen("telemetry", () => this.refresh());
+    Object.assign(this, { spacecraft, followers: new Set(), values: [], packets: new Set(), early: [], asked: null });
+    listen("telemetry", ({ payload }) => !payload && this.followers.size && this.refresh());
+    listen("values", ({ payload }) => this.followers.size && keyOf(payload) === keyOf(spacecraft) && this.take(payload));
   }
 
   async refresh() {
-    if (!this.followers.size) return;
-    if (this.busy) {
-      this.again = true;
-      return;
-    }
-    this.busy = true;
-    this.again = false;
-    const next = new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    const asked = (this.asked = request(this.spacecraft));
+    this.early = [];
     try {
-      const values = await request(this.spacecraft); // not one that began before the event
-      this.followers.forEach(([listener]) => listener(values));
+      const values = await asked;
+      if (asked !== this.asked) return;
+      this.packets = new Set(values.map((one) => one.packet));
+      this.asked = null;
+      this.values = this.early.splice(0).reduce(merged, values);
+      this.tell();
     } catch (error) {
+      if (asked !== this.asked) return;
+      this.asked = null;
       this.followers.forEach(([, onError]) => onError(error));
     }
-    await next;
-    this.busy = false;
-    if (this.again) this.refresh();
+  }
+
+  take(packet) {
+    if (this.asked) this.early.push(packet);
+    else if (!this.packets.has(packet.packet)) this.refresh();
+    else {
+      this.values = merged(this.values, packet);
+      this.tell();
+    }
+  }
+
+  tell() {
+    this.followers.forEach(([listener]) => listener(this.values.filter((one) => one.value !== null)));
   }
 }
 
-// Tell the newest values of a spacecraft after each telemetry event; returns the function that ends it.
+// Tell the newest values of a spacecraft whenever they change; returns the function that ends it.
 const followed = new Map();
 export function followNewest(spacecraft, listener, onError) {
   const key = keyOf(spacecraft);
   if (!followed.has(key)) followed.set(key, new Follower(spacecraft));
   const { followers } = followed.get(key);
   const entry = [listener, onError];
+  const first = !followers.size;
   followers.add(entry);
+  if (first) followed.get(key).refresh();
   return () => followers.delete(entry);
 }

@@ -1,6 +1,6 @@
 // Historical and live values of parameters, and their limits.
 import { get } from "../api.js";
-import { followNewest, listen, milliseconds, newest } from "./feed.js";
+import { afterTelemetry, FAR, followNewest, milliseconds, newest } from "./feed.js";
 
 const POINTS = 1000;
 const MOST_POINTS = 10000;
@@ -70,39 +70,27 @@ async function history(object, options) {
   return samplesOf(buckets, options.strategy === "minmax" && !Object.keys(object.parameter.labels).length);
 }
 
-// Parameters whose packet is not among the newest values: what is later than the last value, after each event.
+// Parameters whose packet is not among the newest values: what is later than the last value, after each reception.
+// The first request is that of the history: its interval ends after the newest telemetry, so its end would hide what follows.
 function followSeries(object, callback, since) {
-  let last = since;
-  let busy = false;
-  let again = false;
-  async function refresh() {
-    if (busy) {
-      again = true;
-      return;
-    }
-    busy = true;
+  let last = since - 1;
+  let points = MOST_POINTS;
+  return afterTelemetry(isNewest(object) ? null : "navigation_states", async () => {
     try {
-      const { buckets } = await series(object, last + 1, Date.UTC(2129, 0), POINTS);
+      const { buckets } = await series(object, last + 1, FAR, points);
+      points = POINTS;
       const found = samplesOf(buckets, false).filter((one) => one.utc > last);
-      if (found.length) {
-        last = found.at(-1).utc;
-        callback(found);
-      }
+      if (!found.length) return;
+      last = found.at(-1).utc;
+      callback(found);
     } catch (error) {
       console.warn(`${object.name}: ${error.message}`);
-    } finally {
-      busy = false;
-      if (again) {
-        again = false;
-        refresh();
-      }
     }
-  }
-  return listen("telemetry", refresh);
+  });
 }
 
 function subscribe(openmct, object, callback) {
-  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().end);
+  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().start);
   let last = -Infinity;
   let stop = null;
   const warn = (error) => console.warn(`${object.name}: ${error.message}`);

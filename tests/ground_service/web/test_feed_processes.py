@@ -1,0 +1,200 @@
+"""Live feed and rate limits of several API processes: PostgreSQL holds the events, Redis carries the wake-ups."""
+
+import asyncio
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+
+from benchmarks.campaigns._deployment import ManyApis
+from ground_service.app import create_app
+from ground_service.settings import Settings
+from ground_service.store import wakeups
+from ground_service.store.database import prepare_database
+from ground_service.web import sockets
+from tests.ground_service.links.conftest import HEAD, Station
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+NEVER_S = 3600.0
+LIVE = "/api/v1/live?values=true"
+
+
+@pytest.fixture
+def server_url(new_postgres_database: Callable[[], str]) -> str:
+    """An empty PostgreSQL database with the schema."""
+    if shutil.which("redis-server") is None:
+        pytest.skip("redis-server is not installed")
+    url = new_postgres_database()
+    prepare_database(url, upgrade=True).engine.dispose()
+    return url
+
+
+def ask(port: int, path: str, body: bytes | None = None) -> tuple[int, bytes, Any]:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/api/v1/{path}", data=body)
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            return answer.status, answer.read(), answer.headers
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read(), error.headers
+
+
+def housekeeping(second: int, **values: float) -> bytes:
+    fields = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    packet = DICTIONARY.pack(
+        "housekeeping",
+        fields | values | {"structure_id": 1},
+        ticks=(900_000_000 + second) * 65_536,
+        sequence_count=second,
+    )
+    return encode_cadus([packet], spacecraft_id=76)
+
+
+def keep_sending(connection: Any, stop: threading.Event) -> None:
+    """Send a packet each tenth of a second, from second 23."""
+    second = 23
+    while not stop.wait(0.1):
+        connection.sendall(housekeeping(second, temperature_c=float(second)))
+        second += 1
+
+
+def until(reached: Callable[[], bool], what: str) -> None:
+    """Wait for a state, with patience."""
+    end = time.monotonic() + 60.0
+    while not reached():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+def temperature_after(socket: Any) -> float:
+    """Return the temperature of the next message with values."""
+    while (message := socket.receive_json())["kind"] != "values":
+        pass
+    (value,) = (one["value"] for one in message["payload"]["values"] if one["name"] == "temperature_c")
+    return float(value)
+
+
+@pytest.fixture
+def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
+    """An API process A with links, and the client of an API B in this process, which never polls."""
+    monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
+    monkeypatch.setattr(wakeups, "RETRY_S", 0.1)
+    with ManyApis(tmp_path, server_url, count=1) as processes:
+        settings = Settings(
+            home=processes.home,
+            database_url=server_url,
+            broker_url=processes.broker_url,
+            links=False,
+            rate_limit_per_s=0.0,
+        )
+        with TestClient(create_app(settings)) as client:
+            yield processes, client
+
+
+def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_restart_of_redis(
+    other: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processes, client = other
+    log = MagicMock()
+    monkeypatch.setattr(wakeups, "log", log)
+    station = Station()
+    try:
+        with client.websocket_connect(LIVE) as socket:
+            status, body, _ = ask(processes.ports[0], "missions", (HEAD + station.link()).encode())
+            assert status == 201, body
+            connection = station.accept(60.0)
+            connection.sendall(housekeeping(1, temperature_c=21.0))
+            assert temperature_after(socket) == 21.0  # by a wake-up: this process does not poll
+
+            processes.parts["broker"].kill()
+            until(lambda: log.warning.called, "the loss of Redis is noticed")
+            monkeypatch.setattr(sockets, "POLL_S", 0.1)
+            client.app.state.sockets._committed.set()  # polls from now on
+            connection.sendall(housekeeping(2, temperature_c=22.0))
+            assert temperature_after(socket) == 22.0
+
+            monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
+            processes.parts["broker"].start()
+            until(lambda: log.info.called, "the return of Redis is noticed")
+            # The process that receives tries Redis again some time after its last attempt.
+            stop = threading.Event()
+            sender = threading.Thread(target=keep_sending, args=(connection, stop))
+            sender.start()
+            try:
+                assert temperature_after(socket) >= 23.0
+            finally:
+                stop.set()
+                sender.join()
+        history = client.get(
+            "/api/v1/spacecraft/76/telemetry/temperature_c",
+            params={"start": "1998-01-01T00:00:00Z", "stop": "2040-01-01T00:00:00Z", "max_points": 1000},
+        ).json()
+        assert {21.0, 22.0} <= {one["mean"] for one in history["buckets"]}
+    finally:
+        station.close()
+
+
+def test_two_processes_share_rate_limits_and_have_their_own_without_redis(
+    tmp_path: Path, server_url: str
+) -> None:
+    with ManyApis(tmp_path, server_url, count=2, LINNA_RATE_LIMIT_PER_S="0.001") as processes:
+        one, two = processes.ports
+        assert ask(one, "missions")[0] == 200
+        status, _, headers = ask(two, "missions")
+        assert status == 429 and 0 < int(headers["Retry-After"]) <= 1000
+        processes.parts["broker"].kill()
+        assert [ask(two, "missions")[0] for _ in range(2)] == [200, 429]
+
+
+def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: str) -> None:
+    heard: list[str] = []
+    connected, woken = threading.Event(), threading.Event()
+
+    def wake() -> None:
+        (woken if connected.is_set() else connected).set()
+        heard.append("wake")
+
+    async def run() -> None:
+        task = asyncio.create_task(wakeups.listen(redis_url, wake))
+        assert await asyncio.to_thread(connected.wait, 60.0)
+        wakeups.Waker(redis_url)(frozenset({"telemetry"}))
+        wakeups.Waker(redis_url, b"another process")(frozenset({"telemetry"}))
+        assert await asyncio.to_thread(woken.wait, 60.0)
+        task.cancel()
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(asyncio.run, run()).result()
+    assert heard == ["wake", "wake"]
+
+
+def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    log = MagicMock()
+    monkeypatch.setattr(wakeups, "log", log)
+    waker = wakeups.Waker("redis://127.0.0.1:1/0")
+    for _ in range(3):
+        waker(frozenset({"telemetry"}))
+    assert log.warning.call_count == 1
+    client = MagicMock()
+    waker._client = client
+    waker(frozenset({"telemetry"}))
+    assert not client.publish.called
+    monkeypatch.setattr(wakeups.time, "monotonic", lambda: float("inf"))
+    waker(frozenset({"telemetry"}))
+    assert client.publish.call_count == 1 and log.info.call_count == 1
