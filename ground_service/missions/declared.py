@@ -74,6 +74,8 @@ def _world(terrain: str, seed: object) -> World | None:
     """Return the world of a terrain name; a manifest does not state whether real terrain was used in training."""
     if terrain in REAL_TERRAINS:
         return "real-terrain"
+    if terrain.startswith("photograph "):
+        return "photographs"
     made = terrain == f"procedural Moon, seed {seed}" or terrain.endswith(
         f" on a procedural base, seed {seed}"
     )

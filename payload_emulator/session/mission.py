@@ -284,15 +284,17 @@ def _in_any(
 
 
 def level_of(world: str, unseen: float | None) -> str:
-    """Return the evidence level ("2", "3s", "3") of a world with a share of frames over unseen terrain; "" if unknown.
+    """Return the evidence level ("2", "3s", "3", "5") of a world; "" if unknown.
 
     Parameters
     ----------
     world
-        World as the mission description names it: "procedural" or "real-terrain".
+        World as the mission description names it: "procedural", "real-terrain" or "photographs".
+    unseen
+        Share of frames over unseen terrain.
     """
-    if world == "procedural":
-        return "2"
+    if world in ("procedural", "photographs"):
+        return "2" if world == "procedural" else "5"
     if world != "real-terrain" or unseen is None:
         return ""
     return "3" if unseen == 1.0 else "3s"
@@ -305,6 +307,8 @@ def level_text(level: str, unseen: float | None) -> str:
 
 
 def _evidence(world: World) -> dict[str, Value]:
+    if world.scenario.terrain.source == "photograph":
+        return {"world": "photographs", "seed": world.scenario.seed}
     if world.terrain.is_real:
         share = unseen_share(world)
         return {"world": "real-terrain", "seed": world.scenario.seed, "unseen_share": share}

@@ -154,12 +154,17 @@ class TerrainSection:
     """`auto`: the real terrain where its rasters are available, else the procedural Moon.
 
     `catalogue`: the craters of the data folder's catalogue, at their places and sizes, on a procedural base.
+    `photograph`: the light of georeferenced photographs (`photographs`) over height rasters (`heights`; empty: those of
+    the data folder), both named by their paths in the data folder. The Sun of the scenario must be that of the
+    photographs, for example `light.mode = "paper"` with equal limits.
     `registration_north_east_m` shifts height rasters on the ground, in metres to the north and to the east; empty: the
     shift that belongs to the rasters (-59 m to the north for GLD100). A procedural Moon has no registration.
     """
 
-    source: Literal["auto", "raster", "procedural", "catalogue"] = "auto"
+    source: Literal["auto", "raster", "procedural", "catalogue", "photograph"] = "auto"
     registration_north_east_m: tuple[float, ...] = ()
+    photographs: tuple[str, ...] = ()
+    heights: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -608,10 +613,24 @@ def _check_terrain(scenario: Scenario, require: Require) -> None:
         shift,
     )
     require(
-        not shift or scenario.terrain.source in ("auto", "raster"),
+        not shift or scenario.terrain.source in ("auto", "raster", "photograph"),
         "terrain.registration_north_east_m",
         f"empty where terrain.source is {scenario.terrain.source!r}",
         shift,
+    )
+
+    photographs = scenario.terrain.photographs
+    require(
+        bool(photographs) == (scenario.terrain.source == "photograph"),
+        "terrain.photographs",
+        "files where terrain.source is 'photograph', and none elsewhere",
+        photographs,
+    )
+    require(
+        not scenario.terrain.heights or scenario.terrain.source == "photograph",
+        "terrain.heights",
+        f"empty where terrain.source is {scenario.terrain.source!r}",
+        scenario.terrain.heights,
     )
 
 

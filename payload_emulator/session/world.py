@@ -142,12 +142,7 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
     ScenarioError
         No window over the terrain within the days searched, or a trajectory below the ground.
     """
-    terrain = open_terrain(
-        scenario.terrain.source,
-        data,
-        scenario.seed,
-        registration_north_east_m=scenario.terrain.registration_north_east_m,
-    )
+    terrain = scenario_terrain(scenario, data)
     model = force_model(scenario, data)
     truth, burns, windows = _fly_to_windows(scenario, model, terrain)
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
@@ -179,16 +174,24 @@ def open_world(scenario: Scenario, data: DataFolder, duration_s: float) -> World
         raise ScenarioError(
             f"scenario {scenario.name}: expected an orbit to propagate without end, found {found}"
         )
-    terrain = open_terrain(
-        scenario.terrain.source,
-        data,
-        scenario.seed,
-        registration_north_east_m=scenario.terrain.registration_north_east_m,
-    )
+    terrain = scenario_terrain(scenario, data)
     model = force_model(scenario, data)
     truth, burns = _propagate(scenario, model, duration_s / 86_400.0)
     first = np.array([scenario.epoch_utc_ns], dtype=np.int64)
     return World(scenario, truth, terrain, model, burns, first, _names(terrain, model))
+
+
+def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
+    """Return the terrain of a scenario."""
+    section = scenario.terrain
+    return open_terrain(
+        section.source,
+        data,
+        scenario.seed,
+        registration_north_east_m=section.registration_north_east_m,
+        photographs=section.photographs,
+        heights=section.heights,
+    )
 
 
 def _names(terrain: TiledTerrain, model: ForceModel) -> tuple[str, ...]:

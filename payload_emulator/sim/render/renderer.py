@@ -24,6 +24,7 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.render.lens import pixel_shifts
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
+from payload_emulator.sim.terrain.photograph import PhotographTerrain
 from payload_emulator.sim.terrain.tiles import (
     ALBEDO_SHIFT,
     MEAN_ALBEDO,
@@ -122,7 +123,38 @@ def render(
     if np.isnan(rendering.range_m).any():
         # Ground deeper than what the border showed, or sky: look at everything that could be there.
         rendering = _render_grid(terrain, camera, view, surely, level, photometry)
+    if isinstance(terrain, PhotographTerrain):
+        sample_m = (view.altitude_m - ground_m) / camera.focal_px
+        return photographed(terrain, camera, rendering, position_mcmf_m, camera_from_mcmf, sample_m)
     return rendering
+
+
+PHOTOGRAPH_RADIANCE = 0.25
+"""Radiance of the brightest photographed ground: that of sunlit ground under a low Sun, for a fixed exposure."""
+
+
+def photographed(
+    terrain: PhotographTerrain,
+    camera: PinholeCamera,
+    rendering: Rendering,
+    position_mcmf_m: npt.ArrayLike,
+    camera_from_mcmf: npt.ArrayLike,
+    sample_m: float,
+) -> Rendering:
+    """A rendering whose light is that of the photograph where its pixels meet the ground; 0 outside the photograph.
+
+    `sample_m` is the ground covered by a pixel below the camera.
+    """
+    u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    rays = camera.rays(np.stack([u, v], axis=-1).astype(np.float64))
+    ground = np.asarray(position_mcmf_m, dtype=np.float64) + rendering.range_m[..., None] * (
+        rays @ np.asarray(camera_from_mcmf, dtype=np.float64)
+    )
+    latitude, longitude, _ = spherical_from_mcmf(ground)
+    brightness = terrain.brightness(latitude, longitude, sample_m)
+    return Rendering(
+        np.nan_to_num(brightness) * np.float32(PHOTOGRAPH_RADIANCE), rendering.lit, rendering.range_m
+    )
 
 
 def _render_grid(

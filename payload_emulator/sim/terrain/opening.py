@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from payload_emulator.errors import TerrainError
@@ -10,7 +11,7 @@ if TYPE_CHECKING:
     from lunar.datafolder import DataFolder
     from payload_emulator.sim.terrain.tiles import TiledTerrain
 
-KINDS = ("auto", "raster", "procedural", "catalogue")
+KINDS = ("auto", "raster", "procedural", "catalogue", "photograph")
 
 SLDEM_RESOLUTION_M = 150.0
 """SLDEM2015 resolves about 60 m at the equator (Barker et al. 2016); at 256 pixels per degree its pixels limit it."""
@@ -22,12 +23,16 @@ def open_terrain(
     seed: int,
     *,
     registration_north_east_m: tuple[float, ...] = (),
+    photographs: tuple[str, ...] = (),
+    heights: tuple[str, ...] = (),
     **options: object,
 ) -> TiledTerrain:
     """The terrain of a kind.
 
     ``raster``: real heights and catalogue of the data folder; ``procedural``: a seeded Moon; ``auto``: the first where
     the data allow it, else the second; ``catalogue``: the craters of the data folder's catalogue on a procedural base.
+    ``photograph``: the light of georeferenced photographs over height rasters; both are files of the data folder, or
+    absolute paths. Without `heights`, the rasters of the data folder are used.
     `registration_north_east_m` shifts height rasters instead of the shift that belongs to them.
     Of the height models SLDEM2015 is preferred to GLD100, of the albedos georeferenced mosaics to pictures.
 
@@ -54,6 +59,8 @@ def open_terrain(
         from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
         return ProceduralTerrain(seed, catalogue=load_catalogue(catalogue_path), **options)  # type: ignore[arg-type]
+    if kind == "photograph":
+        return _open_photograph(data, catalogue_path, photographs, heights, registration_north_east_m)
     if kind == "procedural" or not (tiles and catalogue_path):
         from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
@@ -84,6 +91,55 @@ def open_terrain(
         seed=seed,
         **(chosen | options),  # type: ignore[arg-type]
     )
+
+
+def _open_photograph(
+    data: DataFolder,
+    catalogue_path: Path | None,
+    photographs: tuple[str, ...],
+    heights: tuple[str, ...],
+    registration_north_east_m: tuple[float, ...],
+) -> TiledTerrain:
+    from lunar.catalogue import load_catalogue
+    from payload_emulator.sim.terrain.photograph import PhotographTerrain
+
+    pictures = [_found(name, data, "photograph") for name in photographs]
+    rasters = [_found(name, data, "height raster") for name in heights] or list(data.dem_tiles)
+    if not (pictures and rasters and catalogue_path):
+        raise TerrainError(
+            f"terrain: expected photographs, height rasters and a crater catalogue, found {len(pictures)} photographs, "
+            f"{len(rasters)} rasters and {'a' if catalogue_path else 'no'} catalogue"
+        )
+    shift = {}
+    if registration_north_east_m:
+        north_m, east_m = registration_north_east_m
+        shift = {"registration_north_m": north_m, "registration_east_m": east_m}
+    names = ", ".join(path.name for path in pictures)
+    return PhotographTerrain(
+        rasters,
+        pictures,
+        load_catalogue(catalogue_path),
+        coarse_paths=(data.dem_global,) if data.dem_global else (),
+        name=f"photograph {names}",
+        data_names=(
+            *(f"photograph {path.name}" for path in pictures),
+            *(f"height raster {path.name}" for path in rasters if heights),
+            *(
+                name
+                for name in _names(data)
+                if not heights or not name.startswith("height model LROC WAC GLD100 (")
+            ),
+        ),
+        **shift,
+    )
+
+
+def _found(name: str, data: DataFolder, what: str) -> Path:
+    """A file of the data folder or an absolute path."""
+    path = (data.root or Path()) / name
+    if not path.is_file():
+        raise TerrainError(f"terrain: expected the {what} {path}, found none")
+    return path
 
 
 def _names(data: DataFolder) -> tuple[str, ...]:

@@ -260,6 +260,7 @@ def test_text_that_mentions_terrain_does_not_decide_the_evidence_level() -> None
     assert level(terrain="LROC WAC GLD100") == ("real-terrain", None)
     assert level(terrain="procedural Moon, seed 7") == ("procedural", "2")
     assert level(terrain="a procedural Moon beside GLD100") == (None, None)
+    assert level(terrain="photograph big_tile.tif") == ("photographs", "5")
 
 
 def test_values_of_a_wrong_type_in_a_manifest_are_not_stated() -> None:

@@ -11,26 +11,12 @@ from payload_emulator.sim.terrain import kernels
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.rasters import open_layers
+from tests.payload_emulator.sim.rasters import write_raster
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
 
-MOON = "+proj=longlat +R=1737400 +no_defs"
 NONE = make_catalogue([], [], [], source="none")
-PPD = 32
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
-
-
-def write_raster(path, west, north, size_deg, formula, crs=MOON, dtype="float32", ppd=PPD, **profile):
-    """A raster of ``formula(latitude_deg, longitude_deg)`` at pixel centres."""
-    size = round(size_deg * ppd)
-    index = np.arange(size) + 0.5
-    latitude, longitude = north - index / ppd, west + index / ppd
-    values = np.broadcast_to(formula(latitude[:, None], longitude[None, :]), (size, size)).astype(dtype)
-    transform = rasterio.Affine(1.0 / ppd, 0.0, west, 0.0, -1.0 / ppd, north)
-    profile = {"driver": "GTiff", "width": size, "height": size, "count": 1, "dtype": dtype} | profile
-    with rasterio.open(path, "w", crs=crs, transform=transform, **profile) as target:
-        target.write(values, 1)
-    return path
 
 
 def slope(latitude, longitude):
@@ -152,7 +138,7 @@ def test_opening_says_what_is_missing():
     with pytest.raises(TerrainError, match="0 rasters and no catalogue"):
         open_terrain("raster", DataFolder(), 1)
     with pytest.raises(
-        TerrainError, match="expected one of auto, raster, procedural, catalogue, found 'flat'"
+        TerrainError, match="expected one of auto, raster, procedural, catalogue, photograph, found 'flat'"
     ):
         open_terrain("flat", DataFolder(), 1)
     assert open_terrain("auto", DataFolder(), 1).name == "procedural Moon, seed 1"

@@ -1,0 +1,163 @@
+"""Worlds whose light is that of a photograph: geometry against the sphere, registration, edges, what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lunar.camera import PinholeCamera, ground_point_sphere
+from lunar.catalogue import make_catalogue, save_catalogue
+from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import DataFolder
+from lunar.frames import spherical_from_mcmf
+from lunar.lens import pointed_camera_from_mcmf
+from payload_emulator.errors import ScenarioError, TerrainError
+from payload_emulator.session.mission import level_of
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.renderer import PHOTOGRAPH_RADIANCE, render
+from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.sim.terrain.photograph import PhotographTerrain
+from tests.payload_emulator.sim.rasters import write_raster
+
+rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
+
+NONE = make_catalogue([], [], [], source="none")
+LATITUDE, LONGITUDE = 15.0, 14.0
+
+
+def flat(latitude, longitude):
+    return 0.0 * latitude + 0.0 * longitude
+
+
+def ramp(latitude, longitude):
+    """Brightness of .5 in the middle, falling to the north and rising to the east."""
+    return 0.5 - 0.1 * (latitude - LATITUDE) + 0.2 * (longitude - LONGITUDE)
+
+
+def terrain_of(folder, formula=ramp, ppd=64, size_deg=4.0, **options):
+    heights = write_raster(folder / "h.tif", 2.0, 29.0, 28.0, flat, ppd=16)
+    corner = LONGITUDE - 0.5 * size_deg, LATITUDE + 0.5 * size_deg
+    photograph = write_raster(folder / "p.tif", *corner, size_deg, formula, ppd=ppd, **options)
+    return PhotographTerrain([heights], [photograph], NONE, registration_north_m=0.0)
+
+
+def pose(altitude_m, tilt_deg=0.0):
+    latitude, longitude = math.radians(LATITUDE), math.radians(LONGITUDE)
+    up = np.array(
+        [
+            math.cos(latitude) * math.cos(longitude),
+            math.cos(latitude) * math.sin(longitude),
+            math.sin(latitude),
+        ]
+    )
+    position = (MOON_RADIUS_M + altitude_m) * up
+    rotation = pointed_camera_from_mcmf(position, math.radians(tilt_deg), 0.3)
+    return position, rotation, sun_direction_mcmf(math.radians(20.0), math.radians(90.0), latitude, longitude)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 12.0])
+def test_each_pixel_has_the_brightness_of_the_ground_it_looks_at(tmp_path, tilt_deg):
+    camera = PinholeCamera(64, 48, math.radians(90.0))
+    position, rotation, sun = pose(20_000.0, tilt_deg)
+    radiance = render(terrain_of(tmp_path), camera, position, rotation, sun).radiance
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    ground = ground_point_sphere(camera, rotation, position, np.stack([u, v], axis=-1).astype(float))
+    latitude, longitude, _ = spherical_from_mcmf(ground)
+    expected = PHOTOGRAPH_RADIANCE * ramp(np.degrees(latitude), np.degrees(longitude))
+    # The renderer finds the ground to some metres; the ramp changes by .007 in a kilometre.
+    np.testing.assert_allclose(radiance, expected, atol=2e-4)
+    assert np.ptp(radiance) > 0.05
+
+
+def test_ground_outside_the_photograph_is_black_and_not_covered(tmp_path):
+    terrain = terrain_of(tmp_path, size_deg=0.5)
+    position, rotation, sun = pose(20_000.0)
+    picture = render(terrain, PinholeCamera(64, 64, math.radians(90.0)), position, rotation, sun)
+    assert picture.radiance[32, 32] > 0.1 and picture.radiance[0, 0] == 0.0
+    places = np.radians([LATITUDE, LATITUDE]), np.radians([LONGITUDE, LONGITUDE + 0.3])
+    assert terrain.covers(*places).tolist() == [True, False]
+
+
+def test_the_registration_of_the_heights_moves_the_photograph_too(tmp_path):
+    terrain_of(tmp_path)
+    moved = PhotographTerrain(
+        [tmp_path / "h.tif"],
+        [tmp_path / "p.tif"],
+        NONE,
+        registration_north_m=3_000.0,
+        registration_east_m=-2_000.0,
+    )
+    place = np.array([[math.radians(LATITUDE)]]), np.array([[math.radians(LONGITUDE)]])
+    north_deg = math.degrees(3_000.0 / MOON_RADIUS_M)
+    east_deg = math.degrees(-2_000.0 / MOON_RADIUS_M) / math.cos(math.radians(LATITUDE))
+    # What the file has 3 km farther south and 2 km farther east is here.
+    assert moved.brightness(*place, 10.0)[0, 0] == pytest.approx(
+        ramp(LATITUDE - north_deg, LONGITUDE - east_deg), abs=1e-4
+    )
+
+
+def test_a_finer_photograph_is_averaged_to_the_pixels_of_the_camera(tmp_path):
+    def board(latitude, longitude):
+        return (np.floor(latitude * 64.0) + np.floor(longitude * 64.0)) % 2.0
+
+    terrain = terrain_of(tmp_path, board)
+    latitude, longitude = np.radians(
+        np.meshgrid(LATITUDE + (np.arange(9) + 0.5) / 64, LONGITUDE + (np.arange(9) + 0.5) / 64)
+    )
+    fine = terrain.brightness(latitude, longitude, 100.0)
+    coarse = terrain.brightness(latitude, longitude, 3_000.0)
+    assert np.ptp(coarse) < 0.02 < 0.3 < float(np.abs(fine - 0.5).max())
+    assert coarse == pytest.approx(0.5, abs=0.02)
+
+
+def test_eight_bits_are_a_share_of_full_scale(tmp_path):
+    terrain = terrain_of(
+        tmp_path, lambda latitude, longitude: 51.0 + flat(latitude, longitude), dtype="uint8"
+    )
+    place = np.array([[math.radians(LATITUDE)]]), np.array([[math.radians(LONGITUDE)]])
+    assert terrain.brightness(*place, 100.0)[0, 0] == pytest.approx(0.2, abs=1e-6)
+
+
+def test_no_data_of_the_photograph_is_not_a_number(tmp_path):
+    terrain = terrain_of(tmp_path, lambda a, b: np.where(a > LATITUDE, -1.0, 0.5 + 0 * b), nodata=-1.0)
+    places = np.radians([[LATITUDE + 0.5, LATITUDE - 0.5]]), np.radians([[LONGITUDE, LONGITUDE]])
+    seen = terrain.brightness(*places, 100.0)
+    assert np.isnan(seen[0, 0]) and seen[0, 1] == 0.5
+
+
+def test_files_are_named_in_the_data_folder(tmp_path):
+    terrain_of(tmp_path)
+    catalogue = tmp_path / "craters.csv"
+    save_catalogue(make_catalogue([0.26], [0.24], [8e3], source="x"), catalogue)
+    data = DataFolder(root=tmp_path, catalogue_lu=catalogue)
+    terrain = open_terrain("photograph", data, 1, photographs=("p.tif",), heights=("h.tif",))
+    assert terrain.name == "photograph p.tif"
+    assert terrain.data_names[:2] == ("photograph p.tif", "height raster h.tif")
+    assert terrain.registration_north_m == -59.0
+    with pytest.raises(TerrainError, match=r"expected the photograph .*none\.tif, found none"):
+        open_terrain("photograph", data, 1, photographs=("none.tif",), heights=("h.tif",))
+    with pytest.raises(TerrainError, match="found 1 photographs, 0 rasters and a catalogue"):
+        open_terrain("photograph", data, 1, photographs=("p.tif",))
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ('source = "photograph"', "terrain.photographs must be files where terrain.source is 'photograph'"),
+        ('source = "raster"\nphotographs = ["a.tif"]', "terrain.photographs must be files where"),
+        (
+            'source = "raster"\nheights = ["a.tif"]',
+            "terrain.heights must be empty where terrain.source is 'raster'",
+        ),
+    ],
+)
+def test_a_scenario_has_photographs_where_its_terrain_is_photographic(section, words):
+    with pytest.raises(ScenarioError) as refusal:
+        parse_scenario(f'name = "x"\n[terrain]\n{section}', "x.toml")
+    assert words in str(refusal.value)
+
+
+def test_photographs_are_level_five():
+    assert level_of("photographs", None) == "5"
+    assert level_of("procedural", None) == "2"
