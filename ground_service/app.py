@@ -15,7 +15,7 @@ from ground_service.access.provider import provider_of
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
-from ground_service.http.limits import BodyLimit, HeadersAndTags, RateLimit, SharedBudgets
+from ground_service.http.limits import BodyLimit, HeadersAndTags, LastRequests, RateLimit, SharedBudgets
 from ground_service.http.openapi import DescribedApi
 from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
@@ -111,6 +111,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         redoc_url=None,
         lifespan=lifespan,
     )
+    app.state.draining = False
     app.state.provider = provider_of(settings)
     app.state.open_without_users = settings.host in LOOPBACK and app.state.provider is None
     app.state.live_console = settings.resolved_live_console()
@@ -141,6 +142,7 @@ def _add_middleware(app: FastAPI, settings: Settings, budgets: SharedBudgets | N
     app.add_middleware(PlainText)
     app.add_middleware(SameOrigin, hosts=(settings.host, *settings.allowed_hosts), api_prefix=API_PREFIX)
     app.add_middleware(HeadersAndTags)
+    app.add_middleware(LastRequests, state=app.state)
     app.add_middleware(Watch, metrics=app.state.metrics)
     app.add_middleware(ForwardedHeaders, proxies=TrustedProxies(settings.trusted_proxies))
 

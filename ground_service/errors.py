@@ -120,6 +120,13 @@ class StorageReadOnly(StoreError):
         )
 
 
+class Draining(StoreError):
+    """The process answers its last requests; others have to go to another process."""
+
+    def __init__(self) -> None:
+        super().__init__("the process is being stopped; use another one")
+
+
 class Stopping(GroundError):
     """The service is being stopped in the middle of the work, which goes on when it runs again."""
 

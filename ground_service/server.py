@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import mmap
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -29,7 +31,10 @@ from ground_service.logs import logging_config
 from ground_service.settings import Settings
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     import uvicorn
+    from starlette.datastructures import State
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +45,7 @@ QUEUED = 4096
 TAKEN_AT_ONCE = 16
 BEAT_S = 0.5
 SOCKET_MESSAGE_OCTETS = 4096
+FINISH_S = 5.0
 
 SWITCH_S = 0.0005
 """Interval after which computing Python threads yield to the event loop (default of Python: 5 ms)."""
@@ -71,8 +77,9 @@ def serve(settings: Settings) -> None:
         body_s=settings.request_timeout_s,
     )
     http, websocket = Door(limits, TrustedProxies(settings.trusted_proxies)).protocols()
+    app = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings),
+        app,
         http=http,
         ws=websocket,
         ws_max_size=SOCKET_MESSAGE_OCTETS,
@@ -92,21 +99,31 @@ def serve(settings: Settings) -> None:
     print(f"LINNA ground service on http://{shown}:{port}/", file=sys.stderr, flush=True)
     listener.listen(QUEUED)
     with listener:
-        _server(config, listener).run(sockets=[listener])
+        _server(config, listener, app.state, settings.drain_s).run(sockets=[listener])
 
 
-def _server(config: uvicorn.Config, listener: socket.socket) -> uvicorn.Server:
-    """Return a server that receives its connections from a front process."""
+def _server(config: uvicorn.Config, listener: socket.socket, state: State, drain_s: float) -> uvicorn.Server:
+    """Return a server that receives its connections from a front process and drains after SIGTERM."""
     import uvicorn
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            self._loop = asyncio.get_running_loop()
             await super().startup([])
             self._front = FrontProcess(listener, self._serve_connection)
-            self._front.start(asyncio.get_running_loop())
+            self._front.start(self._loop)
+
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            if sig != signal.SIGTERM or drain_s <= 0.0 or state.draining or not self.started:
+                super().handle_exit(sig, frame)
+                return
+            state.draining = True
+            end = super().handle_exit
+            self._loop.call_soon_threadsafe(self._loop.call_later, drain_s, end, sig, frame)
 
         async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-            self._front.stop()
+            state.draining = True
+            await self._front.finish()
             await super().shutdown(sockets)
 
         def _serve_connection(self, client: socket.socket) -> Coroutine[Any, Any, object]:
@@ -136,6 +153,7 @@ class FrontProcess:
         self._listener = listener
         self._serve = serve
         self._tasks: set[asyncio.Task[object]] = set()
+        self._finished: asyncio.Future[None] | None = None
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         """Start the process and receive connections from it; restart it if it ends."""
@@ -159,6 +177,16 @@ class FrontProcess:
         os.close(descriptor)
         loop.add_reader(self._channel, self._take)
 
+    async def finish(self) -> None:
+        """Stop listening, receive the connections that were accepted, and stop the process."""
+        self._listener.close()
+        self._finished = self._loop.create_future()
+        with contextlib.suppress(OSError, TimeoutError):
+            self._channel.shutdown(socket.SHUT_WR)
+            await asyncio.wait_for(self._finished, FINISH_S)
+        self.stop()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
     def stop(self) -> None:
         """Stop accepting connections; the process ends when its channel is closed."""
         self._beats.cancel()
@@ -177,7 +205,11 @@ class FrontProcess:
             except BlockingIOError:
                 return
             if not message:
-                self._again()
+                if self._finished is None:
+                    self._again()
+                elif not self._finished.done():
+                    self._loop.remove_reader(self._channel)
+                    self._finished.set_result(None)
                 return
             for descriptor in descriptors:
                 client = socket.socket(fileno=descriptor)

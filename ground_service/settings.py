@@ -164,6 +164,13 @@ class Settings(BaseSettings):
         le=3600.0,
         description="Time limit in seconds for the head of a request, and for every 4 KiB of its body",
     )
+    drain_s: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=600.0,
+        description="Seconds for which `linna serve` answers requests after SIGTERM while /readyz tells proxies to use "
+        "other processes; then it finishes its requests and ends",
+    )
     upload_limit_mib: int = Field(default=4096, ge=1, description="Largest upload accepted, MiB")
 
     @field_validator("trusted_proxies")

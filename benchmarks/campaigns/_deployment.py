@@ -101,6 +101,12 @@ class Part:
         if self._process is not None:
             self.kill()
 
+    def finish(self, seconds: float = 120.0) -> None:
+        """Ask it to end (SIGTERM), as a supervisor would, and wait until it has."""
+        assert self._process is not None
+        self._process.terminate()
+        self._process.wait(seconds)
+
     def kill(self) -> None:
         assert self._process is not None
         if self._process.poll() is not None:
@@ -288,7 +294,7 @@ class Deployment:
         addresses = []
         try:
             if cluster is None:
-                self._prepare(database.url)
+                self.prepare(database.url)
             else:
                 cluster.prepare()
             self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
@@ -312,7 +318,7 @@ class Deployment:
         self.api = self.apis[0]
 
     @staticmethod
-    def _prepare(owner_url: str) -> None:
+    def prepare(owner_url: str) -> None:
         """Create the schema as its owner, and the role of the service."""
         database = prepare_database(owner_url, upgrade=True)
         with database.writing() as connection:

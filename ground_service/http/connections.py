@@ -30,6 +30,9 @@ from ground_service.http.proxies import TrustedProxies, address_key
 SLICE_S = 0.004
 SWEEP_S = 0.5
 HELD_OCTETS = 1 << 16
+FIRST_REQUEST_S = 1.0
+"""Time that a new connection has for its first request when the server stops."""
+
 WATCHED_PATHS = ("/healthz", "/readyz", "/metrics")
 
 
@@ -246,6 +249,8 @@ class GuardedProtocol(H11Protocol):
             return
         if self._stop_at is not None and now >= self._stop_at and not self._is_answered():
             self.end(503, "the service is being stopped")
+        elif self._stop_at is not None and now >= self._stop_at and self.cycle is None:
+            self.transport.close()
         elif self._head_since is not None:
             if now - self._head_since > (limits.reserve_head_s if self._in_reserve else limits.head_s):
                 self.end(408, "the head of the request took too long")
@@ -267,8 +272,13 @@ class GuardedProtocol(H11Protocol):
         return self.cycle is None or self.cycle.response_complete
 
     def shutdown(self) -> None:
+        limits = self.door.limits
+        if self.cycle is None and not self._upgraded:
+            # Its first request may be on the way; the answer closes the connection.
+            self._stop_at = self.loop.time() + min(limits.stop_s, FIRST_REQUEST_S)
+            return
         super().shutdown()
-        self._stop_at = self.loop.time() + self.door.limits.stop_s
+        self._stop_at = self.loop.time() + limits.stop_s
 
     def end(self, status: int, detail: str) -> None:
         """Respond to an incomplete request if possible, and close the connection."""

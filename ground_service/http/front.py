@@ -53,7 +53,8 @@ class Front:
                 if key.fileobj is self._listener:
                     self._accept()
                 elif key.fileobj is self._channel:
-                    if events & selectors.EVENT_READ and not self._server_lives():
+                    if events & selectors.EVENT_READ and not self._server_listens():
+                        self._finish()
                         return
                     if events & selectors.EVENT_WRITE:
                         self._hand_over()
@@ -63,7 +64,18 @@ class Front:
             while self._waiting and next(iter(self._waiting.values())) < until:
                 self._pass_on(next(iter(self._waiting)))
 
-    def _server_lives(self) -> bool:
+    def _finish(self) -> None:
+        """Stop listening and pass on what was accepted, if the server stops; a server that has ended takes nothing."""
+        self._accept(HANDED_LIMIT)
+        self._listener.close()
+        for client in list(self._waiting):
+            self._pass_on(client)
+        self._channel.settimeout(SILENT_S)
+        with contextlib.suppress(OSError):
+            for client in self._handed:
+                socket.send_fds(self._channel, [b"c"], [client.fileno()])
+
+    def _server_listens(self) -> bool:
         try:
             return bool(self._channel.recv(1))
         except BlockingIOError:
@@ -71,8 +83,8 @@ class Front:
         except OSError:
             return False
 
-    def _accept(self) -> None:
-        for _ in range(ACCEPTED_AT_ONCE):
+    def _accept(self, limit: int = ACCEPTED_AT_ONCE) -> None:
+        for _ in range(limit):
             try:
                 client, _ = self._listener.accept()
             except BlockingIOError:

@@ -9,7 +9,7 @@ import time
 from collections import OrderedDict
 from typing import Any, Protocol
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders, State
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -228,6 +228,22 @@ def _token(scope: Scope) -> str:
         token = headers.get("sec-websocket-protocol", "")
     token = token or headers.get("cookie", "")
     return hashlib.sha256(token.encode()).hexdigest() if token else ""
+
+
+class LastRequests:
+    """Closes connections after their next answer while the process drains, so that clients connect to another one."""
+
+    def __init__(self, app: ASGIApp, state: State) -> None:
+        self._app = app
+        self._state = state
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def closing(message: Message) -> None:
+            if message["type"] == "http.response.start" and self._state.draining:
+                MutableHeaders(scope=message)["Connection"] = "close"
+            await send(message)
+
+        await self._app(scope, receive, closing if scope["type"] == "http" else send)
 
 
 class HeadersAndTags:

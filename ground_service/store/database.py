@@ -15,6 +15,7 @@ import logging
 import os
 import re
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -49,6 +50,14 @@ log = logging.getLogger(__name__)
 BUSY_TIMEOUT_MS = 30_000
 
 _REVISION = re.compile(r"^(revision|down_revision) = (.+)$", re.MULTILINE)
+
+WORKS_WITH = "_works_with_"
+
+LOCK_WAIT_MS = 500
+LOCK_TRIES = 120
+LOCK_PAUSE_S = 0.5
+"""A migration waits this long for a lock, shorter than the deadlock detection of PostgreSQL, so that it gives way to
+requests; it is then tried again."""
 
 REVISIONS_BEFORE_1_0 = tuple(f"{number:04d}" for number in range(1, 12))
 """Schema revisions before version 1.0, which have no migrations."""
@@ -222,6 +231,9 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
         if found in REVISIONS_BEFORE_1_0:
             raise DatabaseTooOld(database.label, head, str(found))
         if found is not None and found not in known:
+            if oldest_program(found) in known:
+                log.info("database %s: schema revision %s of a newer version", database.label, found)
+                return database
             raise DatabaseTooNew(database.label, head, found)
         if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
             raise DatabaseNotMigrated(database.label, head, found or "none")
@@ -233,19 +245,34 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
 
 
 def schema_revisions(database: Database) -> tuple[str | None, str, tuple[str, ...]]:
-    """Return the revision of the database (None: empty), the newest one known here, and all known here, newest first.
+    """Return the revision of the database (None: empty), the newest one known here, and all known, newest first."""
+    known = known_revisions()
+    with database.reading() as connection:
+        found = None
+        if inspect(connection).has_table("alembic_version"):
+            found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+    return found, known[0], known
 
-    The revisions are read from the names in the scripts: the import of Alembic takes longer than many commands.
+
+def known_revisions() -> tuple[str, ...]:
+    """Return the revisions of this version, newest first.
+
+    They are read from the names in the scripts: the import of Alembic takes longer than many commands.
     """
     previous = dict(map(_script_revision, sorted((migrations_folder() / "versions").glob("*.py"))))
     known = [next(one for one in previous if one not in previous.values())]
     while (earlier := previous[known[-1]]) is not None:
         known.append(earlier)
-    with database.reading() as connection:
-        found = None
-        if inspect(connection).has_table("alembic_version"):
-            found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
-    return found, known[0], tuple(known)
+    return tuple(known)
+
+
+def oldest_program(revision: str) -> str:
+    """Return the revision of the oldest version of the program that works with a schema of this revision.
+
+    A revision that only expands the schema is named so, for example `1.2_works_with_1.0`.
+    """
+    name, _, oldest = revision.partition(WORKS_WITH)
+    return oldest or name
 
 
 def _script_revision(path: Path) -> tuple[str, str | None]:
@@ -321,12 +348,25 @@ def _refused(message: str) -> InvalidInput:
 
 
 def _migrate(database: Database, direction: str, revision: str) -> None:
+    for left in reversed(range(LOCK_TRIES)):
+        try:
+            _migrate_once(database, direction, revision)
+            return
+        except DatabaseBusy as error:
+            if left == 0:
+                raise
+            log.info("the migration is tried again: %s", error)
+            time.sleep(LOCK_PAUSE_S)
+
+
+def _migrate_once(database: Database, direction: str, revision: str) -> None:
     from alembic import command
 
     config = migration_config()
     with database.writing() as connection:
         if database.dialect == "postgresql":
             connection.execute(text("SELECT pg_advisory_xact_lock(7601)"))
+            connection.execute(text(f"SET LOCAL lock_timeout = {LOCK_WAIT_MS}"))
         config.attributes["connection"] = connection
         getattr(command, direction)(config, revision)
 

@@ -14,11 +14,12 @@ import hashlib
 import sqlite3
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from sqlalchemy import Connection, LargeBinary, Table, text
+from sqlalchemy import Connection, LargeBinary, MetaData, Table, bindparam, text
 
 from ground_service.store import models
 
@@ -135,6 +136,31 @@ def stray_rows(connection: Connection, table: Table) -> Iterator[StrayRow]:
     )
     for (row_key,) in gone:
         yield StrayRow(table.name, str(row_key), "expected a row, found only its digest: removed")
+
+
+@contextmanager
+def changed_columns(connection: Connection, name: str) -> Iterator[None]:
+    """Keep the digests of a table valid while a migration changes its columns; rows that did not match stay so."""
+    strays = [one.key for one in stray_rows(connection, _as_stored(connection, name))]
+    yield
+    table = _as_stored(connection, name)
+    key, digest = _expressions(connection, table)
+    excepted = f"AND {key} NOT IN :strays" if strays else ""
+    statement = text(
+        f'UPDATE row_digests SET sha256 = (SELECT {digest} FROM "{name}" AS r WHERE {key} = row_key) '
+        f"WHERE table_name = :name AND row_key IN "
+        f'(SELECT {key} FROM "{name}" AS r WHERE true {excepted})'
+    )
+    given: dict[str, object] = {"name": name}
+    if strays:
+        statement = statement.bindparams(bindparam("strays", expanding=True))
+        given["strays"] = strays
+    connection.execute(statement, given)
+
+
+def _as_stored(connection: Connection, name: str) -> Table:
+    """Return a table with the columns that it has now in the database."""
+    return Table(name, MetaData(), autoload_with=connection)
 
 
 def unknown_digests(connection: Connection) -> Iterator[StrayRow]:

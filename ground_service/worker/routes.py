@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
+from ground_service.errors import Draining
 from ground_service.http.common import GroundOf
 from ground_service.jobs.service import list_jobs
 from ground_service.worker.model import Health
@@ -18,8 +19,10 @@ async def healthz() -> Health:
 
 
 @operations.get("/readyz")
-def readyz(ground: GroundOf) -> Health:
-    """The service can be used: its database answers and takes what is written, and so does the archive of files."""
+def readyz(request: Request, ground: GroundOf) -> Health:
+    """Report that the service can be used: its database and archive can be read and written, and it is not draining."""
+    if request.app.state.draining:
+        raise Draining
     list_jobs(ground, limit=1)
     ground.database.require_writable()
     ground.files.require_writable()

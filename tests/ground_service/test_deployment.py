@@ -104,10 +104,10 @@ def test_a_service_is_in_the_networks_that_it_needs_and_no_others() -> None:
     }
     assert members == {
         "edge": {"proxy"},
-        "front": {"proxy", "api"},
-        "data": {"db", "migrate", "api", "worker", "scheduler", "backup"},
-        "queue": {"broker", "api", "worker", "scheduler"},
-        "egress": {"api", "worker"},
+        "front": {"proxy", "api", "api2"},
+        "data": {"db", "migrate", "api", "api2", "worker", "scheduler", "backup"},
+        "queue": {"broker", "api", "api2", "worker", "scheduler"},
+        "egress": {"api", "api2", "worker"},
     }
     inner = {name for name, options in COMPOSE["networks"].items() if (options or {}).get("internal")}
     assert inner == {"front", "data", "queue"}
@@ -121,7 +121,7 @@ def test_the_api_believes_the_proxy_and_nobody_else() -> None:
 
 def test_prometheus_in_the_inner_network_may_name_the_api() -> None:
     hosts = SERVICES["api"]["environment"]["LINNA_ALLOWED_HOSTS"]
-    assert default_of(hosts).split(",") == ["localhost", "api"]
+    assert default_of(hosts).split(",") == ["localhost", "api", "api2"]
     command = SERVICES["api"]["command"]
     target = f"api:{command[command.index('--port') + 1]}"
     assert f"`{target}`" in (ROOT / "docs/deployment.md").read_text()
@@ -149,9 +149,9 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
     assert holders == {
         "database_superuser_password": {"db"},
         "database_owner_password": {"db", "migrate"},
-        "database_password": {"db", "migrate", "api", "worker", "scheduler"},
+        "database_password": {"db", "migrate", "api", "api2", "worker", "scheduler"},
         "database_backup_password": {"db", "backup"},
-        "broker_password": {"broker", "api", "worker", "scheduler"},
+        "broker_password": {"broker", "api", "api2", "worker", "scheduler"},
         "admin_token": {"migrate"},
         "tls_certificate": {"proxy"},
         "tls_key": {"proxy"},
@@ -275,6 +275,19 @@ def test_nothing_stays_of_a_base_backup_that_fails(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 1 and list((wal / "base").iterdir()) == []
+
+
+def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() -> None:
+    proxy = (ROOT / "deploy/nginx.conf").read_text()
+    upstream = re.findall(r"^ +server (\w+):8042 ", proxy, re.MULTILINE)
+    assert upstream == ["api", "api2"] and set(upstream) <= set(SERVICES["proxy"]["depends_on"])
+    (idle_s,) = (
+        int(one) for one in re.findall(r"keepalive 32;.*?keepalive_timeout (\d+)s;", proxy, re.DOTALL)
+    )
+    for name in upstream:
+        drain_s = int(SERVICES[name]["environment"]["LINNA_DRAIN_S"])
+        # Then 20 s for requests in progress.
+        assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
 
 
 def test_there_is_a_second_worker_and_a_second_scheduler() -> None:

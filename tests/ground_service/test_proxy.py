@@ -70,7 +70,8 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     for old, new in (
         (" /tmp/", f" {folder}/"),
         ("worker_processes 2;", "worker_processes 1;" + ("user root;" if os.geteuid() == 0 else "")),
-        ("server api:8042;", f"server 127.0.0.1:{upstream};"),
+        ("server api:8042 ", f"server 127.0.0.1:{upstream} "),
+        ("server api2:8042 ", f"server 127.0.0.1:{upstream} "),
         ("listen 8443 ssl;", f"listen 127.0.0.1:{port} ssl;"),
         ("/run/secrets/", f"{secrets}/"),
         ("error_log /dev/stderr", f"error_log {folder}/error.log"),
