@@ -67,6 +67,7 @@ def upgrade() -> None:
     op.create_index("ix_passes_remark", "passes", ["remark"])
     op.create_table("remarks", sa.Column("id", sa.Integer(), primary_key=True), sa.Column("text", sa.Text()))
 '''
+UPLOAD_EVERY = 4
 READS = ("/passes", "/jobs", "/ingests", "/spacecraft", "/session")
 
 
@@ -196,7 +197,8 @@ def is_ready(port: int) -> bool:
 class Load:
     """Clients that read and upload without repeating anything."""
 
-    def __init__(self, url: str, token: str, certificate: Path, clients: int) -> None:
+    def __init__(self, url: str, token: str, certificate: Path, clients: int, pause_s: float) -> None:
+        self._pause_s = pause_s
         self.answers: Counter[int] = Counter()
         self.errors: list[str] = []
         self.jobs: list[str] = []
@@ -230,14 +232,14 @@ class Load:
     def _ask(self, number: int, keep: bool) -> None:
         client = self._client()
         for turn in itertools.count(number):
-            if self._over.wait(0.02):
+            if self._over.wait(self._pause_s):
                 break
             if not keep:
                 client.close()
                 client = self._client()
             began = time.monotonic()
             try:
-                if turn % 4:
+                if turn % UPLOAD_EVERY:
                     answer = client.get(READS[turn % len(READS)])
                 else:
                     with self._lock:
@@ -257,7 +259,7 @@ class Load:
         client.close()
 
 
-def roll(folder: Path, drain_s: float, clients: int) -> dict[str, Any]:
+def roll(folder: Path, drain_s: float, clients: int, pause_s: float = 0.02) -> dict[str, Any]:
     """Upgrade a deployment under load; return the figures."""
     new = next_version(folder)
     rolling = Rolling(folder, drain_s)
@@ -265,15 +267,15 @@ def roll(folder: Path, drain_s: float, clients: int) -> dict[str, Any]:
         with open_ground(rolling.home, database_url=rolling.service_url) as ground:
             token = add_user(ground, "ann", "operator")
         ready_s = list(rolling.ready_s)
-        with Load(rolling.url, token, folder / "secrets/tls_certificate", clients) as load:
-            wait_until(lambda: len(load.jobs) >= 10, "first uploads")
+        with Load(rolling.url, token, folder / "secrets/tls_certificate", clients, pause_s) as load:
+            wait_until(lambda: len(load.jobs) >= 4, "first uploads")
             before = sum(load.answers.values())
             rolling.upgrade_schema(new)
             for name in ("api 1", "api 2"):
                 ready_s.append(rolling.replace(name, new))
             rolling.replace("worker", new)
             known = len(load.jobs)
-            wait_until(lambda: len(load.jobs) >= known + 10, "uploads after the upgrade")
+            wait_until(lambda: len(load.jobs) >= known + 4, "uploads after the upgrade")
             during = sum(load.answers.values()) - before
         session = Session(rolling.apis, token)
         states, attempts = ends_of(session, load.jobs)
