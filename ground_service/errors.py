@@ -10,6 +10,7 @@ GroundError
 │   ├── DatabaseNotMigrated      older than this program and not migrated automatically
 │   ├── StorageFull              no space left for the archive
 │   ├── StorageReadOnly          the archive cannot be written
+│   ├── ObjectsUnavailable       the object store cannot be reached
 │   ├── AuditBroken              the audit chain cannot be continued
 │   └── FileDamaged              the content of a stored file has changed
 ├── NotFound                 no such pass, ingest, report, job, ...
@@ -127,6 +128,13 @@ class Draining(StoreError):
         super().__init__("the process is being stopped; use another one")
 
 
+class ObjectsUnavailable(StoreError):
+    """The object store cannot be reached or refuses a request; the same request may succeed later."""
+
+    def __init__(self, bucket: str, reason: str) -> None:
+        super().__init__(f"object store, bucket {bucket}: cannot be used: {reason}")
+
+
 class Stopping(GroundError):
     """The service is being stopped in the middle of the work, which goes on when it runs again."""
 
@@ -134,7 +142,7 @@ class Stopping(GroundError):
         super().__init__("the service is being stopped; the work goes on when it runs again")
 
 
-PASSING = (DatabaseUnavailable, DatabaseBusy, StorageFull, StorageReadOnly, Stopping)
+PASSING = (DatabaseUnavailable, DatabaseBusy, StorageFull, StorageReadOnly, ObjectsUnavailable, Stopping)
 """What is no fault of the work that meets it: the same work, later, may well succeed."""
 
 
@@ -145,7 +153,7 @@ class AuditBroken(StoreError):
 class FileDamaged(StoreError):
     """A stored file no longer has the octets it was stored with."""
 
-    def __init__(self, path: Path, expected: str, found: str) -> None:
+    def __init__(self, path: Path | str, expected: str, found: str) -> None:
         super().__init__(f"{path}: expected octets with SHA-256 {expected}, found {found}")
 
 

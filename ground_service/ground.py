@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
-from ground_service.store.files import UNPACKING, FileArchive, make_durable_folder, remove_leftovers
+from ground_service.store.files import UNPACKING, FileArchive, files_of, make_durable_folder, remove_leftovers
+from ground_service.store.objects import ObjectStore, objects_of
 from ground_service.store.roles import check_role
 from ground_service.store.wakeups import Waker, is_redis
 from lunar.datafolder import DataFolder, default_orientation, find_data
@@ -37,6 +38,7 @@ class Ground:
     home: Path
     data: DataFolder
     runner: Path | None = None
+    objects: ObjectStore | None = None
     stopping: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
 
     def check_stopping(self) -> None:
@@ -72,6 +74,7 @@ def open_ground(
     *,
     database_url: str | None = None,
     runner: Path | None = None,
+    objects: ObjectStore | None = None,
 ) -> Ground:
     """Return the ground service under `home`; its SQLite database is created or upgraded.
 
@@ -85,6 +88,8 @@ def open_ground(
         Database URL; None: ``home/linna.db``.
     runner
         Exchange folder of the runner that executes payload builds; None: a local sandbox.
+    objects
+        Object store that has the files; None: folders under `home`.
     """
     home = home.expanduser().absolute()
     try:
@@ -94,10 +99,12 @@ def open_ground(
         raise storage_error(error, home) from None
     database = prepare_database(database_url or f"sqlite:///{home / 'linna.db'}")
     keep_private(home / "linna.db", 0o600)
-    files = FileArchive(home / "files")
+    files = files_of(home, objects)
+    if objects is not None:
+        make_durable_folder(files.root)
     files.remove_leftovers()
     remove_leftovers(home, UNPACKING)
-    return Ground(database, files, home, data if data is not None else DataFolder(), runner)
+    return Ground(database, files, home, data if data is not None else DataFolder(), runner, objects)
 
 
 def keep_private(path: Path, mode: int) -> None:
@@ -122,7 +129,13 @@ def ground_from_settings(settings: Settings) -> Ground:
     """
     data = find_data(settings.data) if settings.data is not None else DataFolder()
     url = settings.resolved_database_url()
-    ground = open_ground(settings.home, data, database_url=url, runner=settings.runner_exchange)
+    ground = open_ground(
+        settings.home,
+        data,
+        database_url=url,
+        runner=settings.runner_exchange,
+        objects=objects_of(settings),
+    )
     try:
         if not settings.allow_database_owner:
             check_role(ground.database)

@@ -17,6 +17,9 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from ground_service import tracing
 from ground_service.errors import SettingsError
 
+URLS = ("database_url", "migration_database_url", "broker_url")
+SECRETS = ("oidc_client_secret", "objects_access_key", "objects_secret_key")
+
 
 def default_home() -> Path:
     """Where the archive lives when ``LINNA_HOME`` is not set: the user's own data folder."""
@@ -71,6 +74,24 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="Address that the HTTP server binds to")
     port: int = Field(default=8042, ge=0, le=65535, description="Port of the HTTP server")
+    objects: str | None = Field(
+        default=None,
+        pattern=r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._/-]*)?$",
+        description="Bucket of an object store (S3) for all files, such as s3://linna/operations; the folders under "
+        "LINNA_HOME are then caches; needs the extra `objects`; default: folders under LINNA_HOME",
+    )
+    objects_endpoint: str | None = Field(
+        default=None, pattern=r"^https?://", description="URL of the object store; default: that of AWS"
+    )
+    objects_region: str | None = Field(default=None, description="Region of the object store")
+    objects_access_key: SecretStr | None = Field(
+        default=None,
+        description="Access key of the object store; default: what the AWS libraries find, such as a role of the host",
+    )
+    objects_secret_key: SecretStr | None = Field(default=None, description="Secret key of the object store")
+    objects_cache_gib: float = Field(
+        default=20.0, ge=0.0, description="Size that the cache of an object store is trimmed to, GiB"
+    )
     oidc_issuer: str | None = Field(
         default=None,
         description="Issuer of an OpenID provider for sign-in, such as https://login.example.org/realms/ops; needs the "
@@ -230,9 +251,9 @@ class Settings(BaseSettings):
 def load_settings(**given: object) -> Settings:
     """Return the settings of the environment, overridden by the arguments that are not None.
 
-    ``LINNA_DATABASE_URL_FILE``, ``LINNA_MIGRATION_DATABASE_URL_FILE``, ``LINNA_BROKER_URL_FILE`` and
-    ``LINNA_OIDC_CLIENT_SECRET_FILE`` name files that contain the secret instead; ``LINNA_DATABASE_PASSWORD_FILE`` and
-    the like name files with the password alone, for a URL that has a user and no password.
+    For each setting of `URLS` and `SECRETS`, a variable such as ``LINNA_DATABASE_URL_FILE`` names a file that contains
+    the value instead; ``LINNA_DATABASE_PASSWORD_FILE`` and the like name files with the password alone, for a URL that
+    has a user and no password.
 
     Raises
     ------
@@ -240,11 +261,11 @@ def load_settings(**given: object) -> Settings:
         If a value is invalid; the message names the setting.
     """
     values = {name: value for name, value in given.items() if value is not None}
-    for name in ("database_url", "migration_database_url", "broker_url", "oidc_client_secret"):
+    for name in (*URLS, *SECRETS):
         path = os.environ.get(f"LINNA_{name.upper()}_FILE")
         if path and name not in values:
             values[name] = _secret(name, path)
-    for name in ("database_url", "migration_database_url", "broker_url"):
+    for name in URLS:
         password = os.environ.get(f"LINNA_{name.removesuffix('_url').upper()}_PASSWORD_FILE")
         url = values.get(name) or os.environ.get(f"LINNA_{name.upper()}")
         if password and url:

@@ -52,10 +52,16 @@ def _home(path: Path | None) -> Archive:
     from ground_service.client.local import local_client
     from ground_service.ground import open_ground
     from ground_service.settings import load_settings
+    from ground_service.store.objects import objects_of
     from linna.data import data_folder
 
     settings = load_settings(home=path)
-    ground = open_ground(settings.home, data_folder(), database_url=settings.resolved_database_url())
+    ground = open_ground(
+        settings.home,
+        data_folder(),
+        database_url=settings.resolved_database_url(),
+        objects=objects_of(settings),
+    )
     return Archive(local_client(ground, "notebook"), str(settings.home))
 
 

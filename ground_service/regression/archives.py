@@ -290,7 +290,7 @@ def _stored(files: FileArchive, archive: PassArchive) -> dict[str, StoredFile]:
 def _restore(files: FileArchive, folder: Path, stored: Mapping[str, StoredFile]) -> None:
     """Store files again that were removed with another archive meanwhile."""
     for name, file in stored.items():
-        if not file.path.exists():
+        if files.octets(file.sha256) is None:
             files.put_file(folder / name)
 
 
@@ -397,7 +397,7 @@ def _remove_files(ground: Ground, removed: Sequence[ArchiveRecord]) -> None:
             _log.warning("no files of archives are removed: kept archive %s: %s", record.digest, error)
             return
         for sha256 in unused:
-            files.path(sha256).unlink(missing_ok=True)
+            files.remove(sha256)
 
 
 @contextmanager
@@ -420,7 +420,8 @@ def _scratch_of(ground: Ground) -> Path:
 
 def store_of(ground: Ground) -> FileArchive:
     """The files of archives and replays, apart from those of the ground's own archive."""
-    return FileArchive(ground.home / "regression" / "files")
+    objects = None if ground.objects is None else ground.objects.under("regression")
+    return FileArchive(ground.home / "regression" / "files", objects)
 
 
 def _held(files: FileArchive, record: ArchiveRecord) -> set[str]:

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import io
 import json
 import shutil
+import stat
 import tempfile
 import tomllib
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,7 @@ from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_by_runner, run_in_sandbox
 from ground_service.sandbox.host import SandboxRefused, check_private, tail
 from ground_service.store.files import make_durable_folder, replace_durably
+from ground_service.store.stored_files import register_file
 from ground_service.text import require_line
 
 SCHEMA_VERSION = 1
@@ -51,6 +55,7 @@ _FLIGHT_CODE = (
     "lunar",
     "tmtc",
 )
+_PLAIN, _PROGRAM = 0o644, 0o755
 _SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
 
 
@@ -208,29 +213,18 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
     BuildNotChecked
         Its parameters cannot be checked here.
     """
-    folder = ground.home / "regression" / "builds" / build.digest
+    folder = _folder_of(ground, build.digest)
     if not folder.exists():
         check_parameters(build, runner=ground.runner, private=(ground.home,))
+    text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
     try:
-        if not folder.exists():
-            make_durable_folder(folder.parent)
-            # a unique name: another process may register the same build at the same time
-            partial = Path(tempfile.mkdtemp(prefix=f".{build.digest[:16]}.", dir=folder.parent))
-            text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
-            (partial / BUILD_FILE).write_bytes(text)
-            for name, _ in build.files:
-                (partial / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(build.folder / name, partial / name)
-            partial.chmod(0o755)
-            try:
-                replace_durably(partial, folder)
-            except OSError:
-                shutil.rmtree(partial, ignore_errors=True)
-                if not folder.exists():  # otherwise the other process was first, with the same files
-                    raise
+        packed = _packed(text, {name: build.folder / name for name, _ in build.files})
     except OSError as error:
-        raise storage_error(error, folder) from None
+        raise storage_error(error, build.folder) from None
+    stored = ground.files.put_octets(packed)
+    _unpack(packed, folder)
     with ground.database.writing() as connection:
+        register_file(connection, stored, "build", f"{build.digest}.zip", utc_now_ns())
         entry = model.Build(
             digest=build.digest,
             name=build.name,
@@ -243,8 +237,48 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
             registered_by=actor,
             registered=UtcTime(utc_now_ns()),
         )
-        store.add_build(connection, entry)
+        store.add_build(connection, entry, stored.sha256)
     return load_build(folder)
+
+
+def _folder_of(ground: Ground, digest: str) -> Path:
+    """Return the folder of a build on this machine: a copy of what the file archive has."""
+    return ground.home / "regression" / "builds" / digest
+
+
+def _packed(text: bytes, files: Mapping[str, Path]) -> bytes:
+    """Return a zip file with the build file and the files of a build; the same files give the same octets."""
+    octets = io.BytesIO()
+    with zipfile.ZipFile(octets, "w") as packed:
+        packed.writestr(zipfile.ZipInfo(BUILD_FILE), text, zipfile.ZIP_DEFLATED)
+        for name, path in sorted(files.items()):
+            entry = zipfile.ZipInfo(name)
+            entry.external_attr = (_PROGRAM if path.stat().st_mode & stat.S_IXUSR else _PLAIN) << 16
+            packed.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
+    return octets.getvalue()
+
+
+def _unpack(packed: bytes, folder: Path) -> None:
+    """Write the files of a build into its folder, unless it is there already."""
+    if folder.exists():
+        return
+    try:
+        make_durable_folder(folder.parent)
+        # a unique name: another process may write the same build at the same time
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:16]}.", dir=folder.parent))
+        try:
+            with zipfile.ZipFile(io.BytesIO(packed)) as files:
+                for entry in files.infolist():
+                    path = Path(files.extract(entry, partial))
+                    path.chmod(_PROGRAM if entry.external_attr >> 16 == _PROGRAM else _PLAIN)
+            partial.chmod(0o755)
+            replace_durably(partial, folder)
+        except OSError:
+            shutil.rmtree(partial, ignore_errors=True)
+            if not folder.exists():  # otherwise the other process was first, with the same files
+                raise
+    except OSError as error:
+        raise storage_error(error, folder) from None
 
 
 def check_parameters(build: Build, *, runner: Path | None = None, private: Sequence[Path] = ()) -> None:
@@ -310,7 +344,12 @@ def registered_build(ground: Ground, digest: str) -> Build:
         whole = store.find_build(connection, digest)
     if whole is None or len(digest) < 8:
         raise NotFound("build", digest)
-    build = load_build(ground.home / "regression" / "builds" / whole)
+    folder = _folder_of(ground, whole)
+    if not folder.exists():  # registered on another machine, or before the service was restored
+        with ground.database.reading() as connection:
+            sha256 = store.file_of_build(connection, whole)
+        _unpack(ground.files.get(sha256), folder)
+    build = load_build(folder)
     if build.digest != whole:
         raise InvalidInput(
             f"build {whole[:12]}",

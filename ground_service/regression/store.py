@@ -24,10 +24,15 @@ BUILDS, ARCHIVES = repository.BUILDS, repository.REGRESSION_ARCHIVES
 REPLAYS, REGRESSIONS = repository.REPLAYS, repository.REGRESSIONS
 
 
-def add_build(connection: Connection, build: Build) -> None:
-    """Add a build; adding it again changes nothing."""
-    values = build.model_dump(exclude={"registered"})
+def add_build(connection: Connection, build: Build, file_sha256: str) -> None:
+    """Add a build with the zip file of its files; adding it again changes nothing."""
+    values = build.model_dump(exclude={"registered"}) | {"file_sha256": file_sha256}
     repository.add_new(connection, BUILDS, **values, created_utc_ns=build.registered.utc_ns)
+
+
+def file_of_build(connection: Connection, digest: str) -> str:
+    """Return the SHA-256 of the zip file with the files of a build."""
+    return str(repository.get(connection, BUILDS, digest, "build")["file_sha256"])
 
 
 def get_build(connection: Connection, digest: str) -> Build:

@@ -2,6 +2,8 @@
 
 A stored file survives a power failure: its content, its name and every new folder are synchronised to the disk before
 `FileArchive.put` returns.
+
+With an object store, a file is stored when the object store has it; the folder then is a cache of this machine.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import FileDamaged, NotFound, StoreError, storage_error
+from ground_service.store.objects import ObjectStore
 
 BLOCK_OCTETS = 1 << 20
 
@@ -35,6 +38,12 @@ UNPACKING = ".unpacking-"
 
 UNFINISHED_AGE_S = 86_400.0
 """Age from which an unfinished file of another host is a leftover."""
+
+TRIM_S = 600.0
+"""Shortest time between two trims of a cache by one process."""
+
+CACHED_S = 3600.0
+"""Time after its last use for which a file stays in the cache of an object store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +57,106 @@ class StoredFile:
 
 @dataclass(frozen=True, slots=True)
 class FileArchive:
-    """Files under `root`, named by content; a file appears whole or not at all."""
+    """Files under `root`, named by content; a file appears whole or not at all.
+
+    Attributes
+    ----------
+    objects
+        Object store that has the files, which `root` caches; None: `root` has the files.
+    """
 
     root: Path
+    objects: ObjectStore | None = None
+
+    def place(self, sha256: str) -> Path:
+        """Return where the file of this content lies on this machine, or would lie."""
+        return self.root / sha256[:2] / sha256
 
     def path(self, sha256: str) -> Path:
-        """Where the file of this content lies, or would lie."""
-        return self.root / sha256[:2] / sha256
+        """Return the file of this content, fetched from the object store if it is not here; it may be missing."""
+        place = self.place(sha256)
+        if self.objects is not None:
+            try:
+                os.utime(place)  # used now
+            except FileNotFoundError:
+                self._fetch(self.objects, sha256)
+            except OSError as error:
+                raise storage_error(error, place) from None
+        return place
+
+    def octets(self, sha256: str) -> int | None:
+        """Return the size of a stored file; None if it is not stored."""
+        if self.objects is not None:
+            return self.objects.octets(sha256)
+        place = self.place(sha256)
+        return place.stat().st_size if place.is_file() else None
+
+    def blocks(self, sha256: str) -> Iterator[bytes]:
+        """Yield the octets of a file as they are stored, unchecked and without filling the cache."""
+        return read_blocks(self.place(sha256)) if self.objects is None else self.objects.read(sha256)
+
+    def names(self) -> Iterator[tuple[str, bool]]:
+        """Yield the name of each file that is stored, and whether it lies where a file of this name belongs."""
+        if self.objects is not None:
+            for key in self.objects.names():
+                name = key.rpartition("/")[2]
+                yield name, key == f"{name[:2]}/{name}"
+            return
+        for path in sorted(self.root.rglob("*")):
+            if path.is_file() and not path.name.startswith("."):
+                yield path.name, path == self.place(path.name)
+
+    def remove(self, sha256: str) -> None:
+        """Remove a file, if it is stored."""
+        if self.objects is not None:
+            self.objects.remove(sha256)
+        self.place(sha256).unlink(missing_ok=True)
+
+    def trim(self, now_s: float | None = None) -> int:
+        """Trim the cache of an object store: remove the files that were not used for longest; return their number.
+
+        Files used within `CACHED_S` remain, and files that the object store does not have.
+        """
+        if self.objects is None:
+            return 0
+        limit_octets = self.objects.cache_octets
+        now_s = time.time() if now_s is None else now_s
+        found = []
+        for path in self.root.rglob("*"):
+            with contextlib.suppress(FileNotFoundError):
+                if path.is_file() and not path.name.startswith("."):
+                    found.append((path.stat().st_mtime, path.stat().st_size, path))
+        total = sum(octets for _, octets, _ in found)
+        removed = 0
+        for used_s, octets, path in sorted(found):
+            if total <= limit_octets or now_s - used_s < CACHED_S:
+                break
+            if self.objects.octets(path.name) == octets:
+                path.unlink(missing_ok=True)
+                total -= octets
+                removed += 1
+        return removed
+
+    def _fetch(self, objects: ObjectStore, sha256: str) -> None:
+        incoming = IncomingFile(self)
+        try:
+            for block in objects.read(sha256):
+                incoming.append(block)
+            incoming.keep(fetched=sha256)
+            self.trim_at_times()
+        except NotFound:
+            return
+        finally:
+            incoming.discard()
+
+    def trim_at_times(self) -> None:
+        """Trim the cache, at most once in `TRIM_S`."""
+        now = time.monotonic()
+        if now - _trimmed.setdefault(self.root, now) < TRIM_S:
+            return
+        _trimmed[self.root] = now
+        with contextlib.suppress(OSError, StoreError):
+            self.trim()
 
     def incoming(self) -> IncomingFile:
         """Return a new file, which can be appended to and then kept."""
@@ -77,9 +179,11 @@ class FileArchive:
 
         Raises
         ------
-        StorageFull, StorageReadOnly
+        StorageFull, StorageReadOnly, ObjectsUnavailable
             If it could not.
         """
+        if self.objects is not None:
+            self.objects.require_reachable()
         try:
             make_durable_folder(self.root)
             with tempfile.TemporaryFile(dir=self.root, prefix=unfinished_prefix(INCOMING)) as stream:
@@ -140,6 +244,15 @@ class FileArchive:
             raise storage_error(error, path) from None
 
 
+_trimmed: dict[Path, float] = {}
+"""When this process trimmed each cache, by the monotonic clock."""
+
+
+def files_of(home: Path, objects: ObjectStore | None = None) -> FileArchive:
+    """Return the file archive of a service, in an object store or under its home folder."""
+    return FileArchive(home / "files", None if objects is None else objects.under("files"))
+
+
 class IncomingFile:
     """File that is being added to the archive: it is appended to, then kept or discarded.
 
@@ -167,8 +280,19 @@ class IncomingFile:
             self._digest.update(block)
             self._octets += len(block)
 
-    def keep(self) -> StoredFile:
-        """Make the file part of the archive, durably; storing the same octets again changes nothing."""
+    def keep(self, *, fetched: str | None = None) -> StoredFile:
+        """Make the file part of the archive, durably; storing the same octets again changes nothing.
+
+        Parameters
+        ----------
+        fetched
+            SHA-256 of the object that the octets were read from; None: they are new.
+
+        Raises
+        ------
+        FileDamaged
+            If the octets are not those of the object.
+        """
         with self._lock:
             try:
                 stream = self._stream or self._open()
@@ -177,7 +301,13 @@ class IncomingFile:
                 os.fsync(stream.fileno())
                 stream.close()
                 sha256 = self._digest.hexdigest()
-                target = self._archive.path(sha256)
+                objects = self._archive.objects
+                if fetched is not None and fetched != sha256:
+                    raise FileDamaged(f"object {fetched}", fetched, sha256)
+                if objects is not None and fetched is None:
+                    with self._temporary.open("rb") as written:
+                        objects.put(sha256, written, self._octets)
+                target = self._archive.place(sha256)
                 if not target.exists():
                     target.parent.mkdir(exist_ok=True)
                     self._temporary.chmod(0o400)
@@ -186,6 +316,8 @@ class IncomingFile:
                 # also if another process stored it, because its synchronisation may still be pending
                 sync_folder(target.parent)
                 sync_folder(self._archive.root)
+                if objects is not None and fetched is None:
+                    self._archive.trim_at_times()
                 return StoredFile(sha256, self._octets, target)
             except OSError as error:
                 raise storage_error(error, self._archive.root) from None

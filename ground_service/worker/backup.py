@@ -73,7 +73,7 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
             copy.engine.dispose()
         octets = 0
         for sha256 in names:
-            octets += _copy_file(ground.files.path(sha256), FileArchive(partial / FILES), sha256)
+            octets += _copy_file(ground.files, FileArchive(partial / FILES), sha256)
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "made_utc": format_utc(now_utc_ns),
@@ -122,7 +122,7 @@ def restore(folder: Path, ground: Ground) -> dict[str, Any]:
             for sha256 in names:
                 _check_file(FileArchive(folder / FILES), sha256)
             for sha256 in names:
-                _copy_file(FileArchive(folder / FILES).path(sha256), ground.files, sha256)
+                _copy_file(FileArchive(folder / FILES), ground.files, sha256)
             _copy_rows(connection, ground.database)
     except OSError as error:
         raise storage_error(error, ground.home) from None
@@ -196,12 +196,12 @@ def _check_file(files: FileArchive, sha256: str) -> None:
         raise FileDamaged(path, sha256, digest.hexdigest())
 
 
-def _copy_file(source: Path, files: FileArchive, sha256: str) -> int:
-    """Copy a file into an archive and verify its hash; return its number of octets."""
-    if not source.is_file():
-        raise NotFound("file", f"{sha256} in {source.parent.parent}")
-    stored: StoredFile = files.put_file(source)
+def _copy_file(source: FileArchive, files: FileArchive, sha256: str) -> int:
+    """Copy a file from one archive into another and verify its hash; return its number of octets."""
+    if source.octets(sha256) is None:
+        raise NotFound("file", f"{sha256} in {source.root}")
+    stored: StoredFile = files.put(source.blocks(sha256))
     if stored.sha256 != sha256:
-        stored.path.unlink(missing_ok=True)
-        raise FileDamaged(source, sha256, stored.sha256)
+        files.remove(stored.sha256)
+        raise FileDamaged(source.place(sha256), sha256, stored.sha256)
     return stored.octets

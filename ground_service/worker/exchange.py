@@ -33,7 +33,7 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import decode_all_again
 from ground_service.store import audit, rows
 from ground_service.store.database import Database, schema_revisions
-from ground_service.store.files import FileArchive, read_blocks, replace_durably
+from ground_service.store.files import FileArchive, replace_durably
 from ground_service.worker import exchange_store as store
 from lunar.timescales import format_utc
 
@@ -176,12 +176,12 @@ def _write_files(
         count, octets = count + 1, octets + int(size)
         if not with_files:
             continue
-        path = files.path(str(sha256))
-        if not path.is_file():
+        path = files.place(str(sha256))
+        if files.octets(str(sha256)) is None:
             raise FileDamaged(path, str(sha256), "no file")
         digest = hashlib.sha256()
         with archive.open(_entry(f"files/{sha256}"), "w", force_zip64=True) as stream:
-            for block in read_blocks(path):
+            for block in files.blocks(str(sha256)):
                 digest.update(block)
                 stream.write(block)
         if digest.hexdigest() != sha256:
@@ -230,7 +230,7 @@ def import_database(ground: Ground, path: Path, *, say: Say | None = None) -> Im
         for name in names:
             if manifest.files.included:
                 _check_file(path, archive, name)
-            elif not ground.files.path(name).is_file():
+            elif ground.files.octets(name) is None:
                 raise InvalidInput(
                     str(path),
                     f"file {name[:16]}…",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +26,7 @@ from ground_service.ingest.parameters import decode_declared
 from ground_service.ingest.service import Place, ingest_stored
 from ground_service.ingest.store import store_batch
 from ground_service.store import audit, row_digests
-from ground_service.store.files import FileArchive, StoredFile, read_blocks
+from ground_service.store.files import FileArchive, StoredFile
 from ground_service.store.vehicles import FLOWN, all_vehicles, vehicle_id
 from ground_service.worker import integrity_store as store
 from tmtc.dictionary import DICTIONARY
@@ -171,28 +171,28 @@ def _check_files(connection: Connection, files: FileArchive, found: _Findings) -
     for sha256, octets in store.files(connection):
         known.add(sha256)
         found.count("octets of files", octets)
-        path = files.path(sha256)
-        if not path.is_file():
+        size = files.octets(sha256)
+        if size is None:
             found.damage("files", sha256, "expected the file, found nothing")
-        elif path.stat().st_size != octets:
-            found.damage("files", sha256, f"expected {octets} octets, found {path.stat().st_size}")
-        elif _sha256(path) != sha256:
+        elif size != octets:
+            found.damage("files", sha256, f"expected {octets} octets, found {size}")
+        elif _sha256(files.blocks(sha256)) != sha256:
             found.damage("files", sha256, "expected octets with this SHA-256, found other octets")
         else:
             good.add(sha256)
-    for path in sorted(files.root.rglob("*")):
-        if not path.is_file() or path.name.startswith(".") or path.name in known:
+    for name, in_place in files.names():
+        if name in known:
             continue
-        if path == files.path(path.name) and _sha256(path) == path.name:
+        if in_place and _sha256(files.blocks(name)) == name:
             found.skip("files without a row, left by interrupted uploads")
         else:
-            found.damage("files", path.name[:80], "expected no such file in the archive, found one")
+            found.damage("files", name[:80], "expected no such file in the archive, found one")
     return good
 
 
-def _sha256(path: Path) -> str:
+def _sha256(blocks: Iterable[bytes]) -> str:
     digest = hashlib.sha256()
-    for block in read_blocks(path):
+    for block in blocks:
         digest.update(block)
     return digest.hexdigest()
 

@@ -108,6 +108,7 @@ def open_service(arguments: argparse.Namespace) -> Ground:
 def open_ground_only(arguments: argparse.Namespace) -> Ground:
     """Return the opened service of this machine, which does not handle events."""
     from ground_service.ground import open_ground
+    from ground_service.store.objects import objects_of
     from linna.data import data_folder
 
     settings = settings_of(arguments)
@@ -116,4 +117,5 @@ def open_ground_only(arguments: argparse.Namespace) -> Ground:
         data_folder(),
         database_url=settings.resolved_database_url(),
         runner=settings.runner_exchange,
+        objects=objects_of(settings),
     )

@@ -191,14 +191,15 @@ def run_restore(arguments: argparse.Namespace) -> int:
 def run_export(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
     from ground_service.store.database import open_database
-    from ground_service.store.files import FileArchive
+    from ground_service.store.files import files_of
+    from ground_service.store.objects import objects_of
     from ground_service.worker.exchange import export_database
 
     settings = settings_of(arguments)
     database = open_database(settings.resolved_database_url())
     manifest = export_database(
         database,
-        FileArchive(settings.home.expanduser().absolute() / "files"),
+        files_of(settings.home.expanduser().absolute(), objects_of(settings)),
         arguments.file,
         now_utc_ns=utc_now_ns(),
         with_files=not arguments.no_files,

@@ -55,20 +55,6 @@ def upgrade() -> None:
         sqlite_with_rowid=False,
     )
     op.create_table(
-        "builds",
-        sa.Column("digest", sa.String(length=64), nullable=False),
-        sa.Column("name", sa.Text(), nullable=False),
-        sa.Column("version", sa.Text(), nullable=False),
-        sa.Column("description", sa.Text(), nullable=False),
-        sa.Column("kind", sa.String(length=16), nullable=False),
-        sa.Column("files", sa.JSON(), nullable=False),
-        sa.Column("flight_code", sa.String(length=64), nullable=True),
-        sa.Column("provenance", sa.JSON(), nullable=False),
-        sa.Column("registered_by", sa.String(length=64), nullable=False),
-        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
-        sa.PrimaryKeyConstraint("digest", name=op.f("pk_builds")),
-    )
-    op.create_table(
         "detections",
         sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
         sa.Column("dictionary_version", sa.SmallInteger(), autoincrement=False, nullable=False),
@@ -122,6 +108,22 @@ def upgrade() -> None:
         sa.Column("octets", sa.BigInteger(), nullable=False),
         sa.Column("received_utc_ns", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("sha256", name=op.f("pk_files")),
+    )
+    op.create_table(
+        "builds",
+        sa.Column("digest", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("version", sa.Text(), nullable=False),
+        sa.Column("description", sa.Text(), nullable=False),
+        sa.Column("kind", sa.String(length=16), nullable=False),
+        sa.Column("files", sa.JSON(), nullable=False),
+        sa.Column("flight_code", sa.String(length=64), nullable=True),
+        sa.Column("provenance", sa.JSON(), nullable=False),
+        sa.Column("registered_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("file_sha256", sa.String(length=64), nullable=False),
+        sa.ForeignKeyConstraint(["file_sha256"], ["files.sha256"], name=op.f("fk_builds_file_sha256_files")),
+        sa.PrimaryKeyConstraint("digest", name=op.f("pk_builds")),
     )
     op.create_table(
         "filter_states",
@@ -1021,12 +1023,12 @@ def downgrade() -> None:
     op.drop_table("housekeeping")
     op.drop_table("frame_outcomes")
     op.drop_table("filter_states")
+    op.drop_table("builds")
     op.drop_table("files")
     op.drop_table("event_positions")
     op.drop_table("event_log")
     op.drop_table("events")
     op.drop_table("detections")
-    op.drop_table("builds")
     op.drop_table("row_digests")
     op.drop_table("audit_head")
     op.drop_table("audit")

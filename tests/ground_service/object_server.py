@@ -1,0 +1,69 @@
+"""Object store for tests: a local server with the S3 interface, which can be stopped and started with its objects."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pydantic import SecretStr
+
+from ground_service.settings import Settings
+from ground_service.store.objects import ObjectStore, objects_of
+
+
+class ObjectServer:
+    """Server with one bucket on a private port; its objects are in the memory of this process."""
+
+    def __init__(self, port: int, bucket: str) -> None:
+        self.port, self.bucket = port, bucket
+        self._server: Any = None
+        self.start()
+        self.store()._client().create_bucket(Bucket=bucket)
+
+    def start(self) -> None:
+        from moto.server import ThreadedMotoServer
+
+        logging.getLogger("werkzeug").setLevel(logging.ERROR)
+        self._server = ThreadedMotoServer(ip_address="127.0.0.1", port=self.port)
+        self._server.start()
+        self.port = self._server.get_host_and_port()[1]
+
+    def stop(self) -> None:
+        if self._server is not None:
+            self._server.stop()
+        self._server = None
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of a service that uses this store."""
+        return {
+            "objects": f"s3://{self.bucket}/operations",
+            "objects_endpoint": f"http://127.0.0.1:{self.port}",
+            "objects_region": "us-east-1",
+            "objects_access_key": SecretStr("key"),
+            "objects_secret_key": SecretStr("secret"),
+        }
+
+    def environment(self) -> dict[str, str]:
+        """Return the same as variables of the environment."""
+        return {
+            f"LINNA_{name.upper()}": value.get_secret_value() if isinstance(value, SecretStr) else value
+            for name, value in self.settings().items()
+        }
+
+    def store(self) -> ObjectStore:
+        """Return the store as a service sees it."""
+        found = objects_of(Settings(**self.settings()))
+        assert found is not None
+        return found
+
+
+@contextmanager
+def running_objects(bucket: str) -> Iterator[ObjectServer]:
+    """Yield an object store with an empty bucket."""
+    server = ObjectServer(0, bucket)
+    try:
+        yield server
+    finally:
+        server.stop()

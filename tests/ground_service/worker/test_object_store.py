@@ -1,0 +1,285 @@
+"""The whole path with an object store: hosts that share no folder, loss of the store, integrity, backup."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.app import create_app
+from ground_service.errors import ObjectsUnavailable
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.jobs.service import enter_job
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.archive_zip import zip_folder
+from ground_service.regression.archives import keep_archive, let_go, store_of
+from ground_service.regression.builds import build_of, registered_build
+from ground_service.regression.jobs import missing_replays, prepared
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.database import prepare_database
+from ground_service.worker.backup import backup, restore
+from ground_service.worker.follow_up import follow_in_process
+from ground_service.worker.integrity import verify
+from ground_service.worker.jobs import run_job
+from tests.ground_service.object_server import ObjectServer, running_objects
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+OWN = {"Origin": "http://testserver"}
+
+
+@pytest.fixture
+def server() -> Iterator[ObjectServer]:
+    with running_objects(f"path-{uuid.uuid4().hex[:8]}") as running:
+        yield running
+
+
+@pytest.fixture
+def opened(server: ObjectServer, tmp_path: Path) -> Iterator[Callable[..., Ground]]:
+    """A function that opens the service on a host with its own folder; by default with a database there."""
+    made: list[Ground] = []
+
+    def make(host: str, database_url: str | None = None, folder: str = "") -> Ground:
+        objects = server.store().under(folder) if folder else server.store()
+        made.append(open_ground(tmp_path / host, database_url=database_url, objects=objects))
+        follow_in_process(made[-1])
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@contextmanager
+def worker(home: Path, environment: dict[str, str]) -> Iterator[None]:
+    """A worker on a host with this folder, while the context lasts."""
+    home.mkdir(exist_ok=True)
+    with (home.parent / f"{home.name}.log").open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "linna", "worker", "--concurrency", "1"],
+            env={**os.environ, **environment, "LINNA_HOME": str(home), "LINNA_DATA": ""},
+            stdout=log,
+            stderr=log,
+        )
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(60)
+
+
+def job_of(ground: Ground, key: str) -> dict[str, Any]:
+    with ground.database.reading() as connection:
+        return repository.get(connection, repository.JOBS, key, "job")
+
+
+def result_of(ground: Ground, key: str, seconds: float = 180.0) -> dict[str, Any]:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        row = job_of(ground, key)
+        if row["state"] in ("done", "failed"):
+            assert row["state"] == "done", row
+            return dict(row["result"])
+        time.sleep(0.2)
+    raise AssertionError(f"job {key} did not end: {job_of(ground, key)}")
+
+
+def test_upload_report_and_regression_on_hosts_without_a_common_folder(
+    server: ObjectServer,
+    new_postgres_database: Callable[[], str],
+    redis_url: str,
+    make_flyable: Callable[..., Any],
+    make_build: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    url = new_postgres_database()
+    prepare_database(url, upgrade=True).engine.dispose()
+    common = {"database_url": url, "broker_url": redis_url}
+    environment = {
+        **{f"LINNA_{name.upper()}": value for name, value in common.items()},
+        **server.environment(),
+        "LINNA_ALLOW_DATABASE_OWNER": "true",
+    }
+    settings = Settings(home=tmp_path / "a", allow_database_owner=True, **common, **server.settings())
+    flown = {f"synthetic pass {seed}": make_flyable(frames=10, seed=seed) for seed in (71, 72)}
+    with TestClient(create_app(settings), headers=OWN) as client:
+        ground = client.app.state.ground
+        packed = zip_folder(next(iter(flown.values())).folder)
+        answer = client.post("/api/v1/archives", params={"name": "pass.zip"}, content=packed.read_bytes())
+        packed.unlink()
+        assert answer.status_code == 202, answer.text
+        with worker(tmp_path / "b", environment):
+            pass_id = result_of(ground, answer.json()["id"])["pass_id"]
+        answer = client.post(f"/api/v1/passes/{pass_id}/reports")
+        assert answer.status_code == 202, answer.text
+        with worker(tmp_path / "c", environment):
+            report = result_of(ground, answer.json()["id"])["report_id"]
+            page = client.get(f"/api/v1/reports/{report}", headers={"Accept": "text/html"})
+            assert page.status_code == 200 and b"<html" in page.content[:500]
+            archives = [keep_archive(ground, one.folder).digest for one in flown.values()]
+            packets = {name: one.packets for name, one in flown.items()}
+            builds = [
+                build_of(ground, str(make_build(name, packets, network_ms=cost))).digest
+                for name, cost in (("old", 10.0), ("new", 10.1))
+            ]
+            arguments = prepared(ground, builds[1], builds[0], archives)
+            submit = client.app.state.dispatcher.submit
+            replays = [submit("replay", one) for one in missing_replays(ground, arguments)]
+            verdict = submit("regression", arguments)
+            assert [result_of(ground, one)["outcome"] for one in replays] == ["ok"] * 4
+            assert result_of(ground, verdict)["verdict"] == "pass"
+        assert client.get(f"/regressions/{verdict}").status_code == 200
+        assert verify(ground).verdict == "intact"
+    homes = {name: {p.name for p in (tmp_path / name / "files").rglob("*") if p.is_file()} for name in "abc"}
+    assert homes["b"] and homes["c"] and homes["b"] != homes["c"] != homes["a"]
+
+
+def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
+    server: ObjectServer, synthetic_pass: Any, tmp_path: Path
+) -> None:
+    octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
+    settings = Settings(home=tmp_path / "home", **server.settings())
+    with TestClient(create_app(settings, inline_jobs=True), headers=OWN) as client:
+
+        def upload() -> Any:
+            return client.post("/api/v1/telemetry", params={"name": "a.cadu"}, content=octets)
+
+        assert client.get("/readyz").status_code == 200
+        server.stop()
+        refused = upload()
+        assert refused.status_code == 503, refused.text
+        assert "object store" in refused.json()["detail"] and server.bucket not in refused.text
+        assert client.get("/readyz").status_code == 503
+        with client.app.state.ground.database.reading() as connection:
+            assert repository.page(connection, repository.INGESTS).total == 0
+        server.start()
+        assert upload().status_code == 202
+        assert verify(client.app.state.ground, deep=True).verdict == "intact"
+
+
+def test_a_job_without_the_store_waits_and_loses_nothing(
+    server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any, tmp_path: Path
+) -> None:
+    """The store goes away between the acknowledgement and the work, on a host that has no copy."""
+    first = opened("first")
+    url = f"sqlite:///{tmp_path / 'first' / 'linna.db'}"
+    packed = zip_folder(synthetic_pass.folder)
+    stored = first.files.put_file(packed)
+    packed.unlink()
+    job = enter_job(first, "archive", {"sha256": stored.sha256, "name": "pass.zip"})
+    second = opened("second", url)
+    server.stop()
+    with pytest.raises(ObjectsUnavailable):
+        run_job(second, job)
+    assert job_of(first, job)["state"] == "queued"
+    server.start()
+    assert run_job(second, job).state == "done"
+    assert verify(first, deep=True).verdict == "intact"
+
+
+def test_an_import_that_loses_the_store_half_way_is_repeated(
+    server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ground = opened("home")
+    put, calls = type(server.store()).put, []
+
+    def failing(self: Any, sha256: str, stream: Any, octets: int) -> None:
+        calls.append(sha256)
+        if len(calls) == 3:
+            server.stop()
+        put(self, sha256, stream, octets)
+
+    monkeypatch.setattr(type(server.store()), "put", failing)
+    with pytest.raises(ObjectsUnavailable):
+        import_archive(ground, synthetic_pass.folder)
+    server.start()
+    assert len(calls) == 3
+    import_archive(ground, synthetic_pass.folder)
+    assert verify(ground, deep=True).verdict == "intact"
+
+
+def test_integrity_check_reads_the_store_and_not_the_cache(
+    server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any
+) -> None:
+    ground = opened("home")
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    store = server.store().under("files")
+    with ground.database.reading() as connection:
+        (sha256,) = (row["sha256"] for row in repository.page(connection, repository.FILES).rows)
+    octets = ground.files.get(sha256)
+    assert verify(ground, deep=True).verdict == "intact"
+
+    def found(body: bytes | None) -> list[str]:
+        if body is None:
+            store.remove(sha256)
+        else:
+            store._client().put_object(Bucket=store.bucket, Key=store.key(sha256), Body=body)
+        return [str(one) for one in verify(ground).damaged]
+
+    assert "expected octets with this SHA-256" in found(octets[:-1] + b"?")[0]
+    assert f"found {len(octets) - 1}" in found(octets[:-1])[0]
+    assert "expected the file, found nothing" in found(None)[0]
+    assert found(octets) == []
+    store._client().put_object(Bucket=store.bucket, Key=f"{store.prefix}zz/foreign", Body=b"x")
+    assert "expected no such file in the archive" in found(octets)[0]
+
+
+def test_a_backup_of_an_object_store_is_restored_into_another(
+    opened: Callable[..., Ground], synthetic_pass: Any, make_build: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Also the way to move a service from folders into an object store."""
+    ground = opened("home")
+    pass_id = import_archive(ground, synthetic_pass.folder)
+    build = build_of(ground, str(make_build("one", {"a": [b"packet"]})))
+    for path in (tmp_path / "home" / "files").rglob("*"):
+        if path.is_file():
+            path.unlink()  # the backup reads the store
+    backup(ground, tmp_path / "backup", now_utc_ns=10**18)
+    assert not [path for path in (tmp_path / "home" / "files").rglob("*") if path.is_file()]
+    other = opened("other", folder="other")
+    restore(tmp_path / "backup", other)
+    assert verify(other, deep=True).verdict == "intact"
+    assert registered_build(other, build.digest).files == build.files
+    assert pass_id > 0
+
+
+def test_a_build_keeps_its_programs_on_another_host(
+    opened: Callable[..., Ground], make_build: Callable[..., Path], tmp_path: Path
+) -> None:
+    file = make_build("runs", {"a": [b"packet"]})
+    (file.parent / "fly.py").chmod(0o755)
+    first = opened("first")
+    build = build_of(first, str(file))
+    second = opened("second", f"sqlite:///{tmp_path / 'first' / 'linna.db'}")
+    there = registered_build(second, build.digest)
+    assert there.folder.is_relative_to(tmp_path / "second") and there.digest == build.digest
+    assert os.access(there.folder / "fly.py", os.X_OK)
+    assert not (there.folder / "costs.json").stat().st_mode & 0o111
+
+
+def test_files_of_an_archive_that_is_let_go_leave_the_store(
+    opened: Callable[..., Ground], make_flyable: Callable[..., Any]
+) -> None:
+    ground = opened("home")
+    archive = keep_archive(ground, make_flyable(frames=4, seed=81).folder)
+    kept = keep_archive(ground, make_flyable(frames=4, seed=82).folder, pinned=True)
+    files = store_of(ground)
+    before = set(files.names())
+    assert let_go(ground, unused_for_ns=-1) == [archive.digest]
+    after = set(files.names())
+    held = {entry["sha256"] for entry in kept.manifest["files"].values()}
+    assert held <= {name for name, _ in after} < {name for name, _ in before}
