@@ -31,8 +31,17 @@ def add_build(connection: Connection, build: Build, file_sha256: str) -> None:
 
 
 def file_of_build(connection: Connection, digest: str) -> str:
-    """Return the SHA-256 of the zip file with the files of a build."""
-    return str(repository.get(connection, BUILDS, digest, "build")["file_sha256"])
+    """Return the SHA-256 of the zip file with the files of a build.
+
+    Raises
+    ------
+    NotFound
+        An earlier version registered the build, without this file.
+    """
+    sha256 = repository.get(connection, BUILDS, digest, "build")["file_sha256"]
+    if sha256 is None:
+        raise NotFound("files of build", digest)
+    return str(sha256)
 
 
 def get_build(connection: Connection, digest: str) -> Build:

@@ -1010,11 +1010,12 @@ BUILDS = Table(
     column("provenance", JSON),
     column("registered_by", String(64)),
     column("created_utc_ns", BigInteger),
-    column("file_sha256", ForeignKey("files.sha256")),
+    optional("file_sha256", ForeignKey("files.sha256")),
 )
 """A payload build under test; `digest` is the hash of everything that decides what it does.
 
-`file_sha256` is a zip file with the build file and all files of the build.
+`file_sha256` is a zip file with the build file and all files of the build; NULL for builds of earlier versions, which are
+only in the folder of the service.
 """
 
 

@@ -121,7 +121,7 @@ def upgrade() -> None:
         sa.Column("provenance", sa.JSON(), nullable=False),
         sa.Column("registered_by", sa.String(length=64), nullable=False),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
-        sa.Column("file_sha256", sa.String(length=64), nullable=False),
+        sa.Column("file_sha256", sa.String(length=64), nullable=True),
         sa.ForeignKeyConstraint(["file_sha256"], ["files.sha256"], name=op.f("fk_builds_file_sha256_files")),
         sa.PrimaryKeyConstraint("digest", name=op.f("pk_builds")),
     )
