@@ -1014,8 +1014,8 @@ BUILDS = Table(
 )
 """A payload build under test; `digest` is the hash of everything that decides what it does.
 
-`file_sha256` is a zip file with the build file and all files of the build; NULL for builds of earlier versions, which are
-only in the folder of the service.
+`file_sha256` is a zip file with the build file and all files of the build; NULL for builds of earlier versions, which
+are only in the folder of the service.
 """
 
 
