@@ -21,7 +21,7 @@ SEED   ?= 1
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 
-.PHONY: demo test check openmct docs pictures links sbom licences package bench bench-planning mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures links sbom licences package release bench bench-planning mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -65,6 +65,18 @@ sbom: $(VENV)/.dev
 # Licences of everything that is shipped; fails if one is GPL or AGPL.
 licences: $(VENV)/.dev
 	$(BIN)/python deploy/licences.py $(SHIPPED)
+
+# Wheel, source distribution, bill of materials, licences, checksums and their signature, in a new folder. LINNA_RELEASE_KEY
+# names the private key, outside of the repository; `python deploy/release.py key FILE` makes one.
+release: $(VENV)/.dev
+	@test -n "$(LINNA_RELEASE_KEY)" || { echo "LINNA_RELEASE_KEY: expected the file of the private key, found none" >&2; exit 2; }
+	rm -rf dist/release
+	mkdir -p dist/release build
+	SOURCE_DATE_EPOCH="$$(git log -1 --format=%ct)" $(BIN)/python -m build --outdir dist/release
+	cat $(SHIPPED) | grep -v '^#' | sort -u > build/shipped.txt
+	$(BIN)/python -m cyclonedx_py requirements build/shipped.txt --pyproject pyproject.toml --of JSON -o dist/release/linna.cdx.json
+	$(BIN)/python deploy/licences.py $(SHIPPED) > dist/release/licences.txt
+	$(BIN)/python deploy/release.py sign dist/release --key "$(LINNA_RELEASE_KEY)"
 
 # Wheel and source distribution.
 package: $(VENV)/.dev

@@ -1,0 +1,139 @@
+"""Signature of a release: what was changed after it was signed is refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+_SPEC = importlib.util.spec_from_file_location("release", ROOT / "deploy" / "release.py")
+assert _SPEC is not None and _SPEC.loader is not None
+release = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(release)
+
+WHEEL = "linna-0.1.0-py3-none-any.whl"
+FILES = {
+    WHEEL: b"wheel",
+    "linna-0.1.0.tar.gz": b"sdist",
+    "linna.cdx.json": b"{}",
+    "licences.txt": b"numpy\tBSD",
+}
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> Path:
+    path = tmp_path / "release.key"
+    assert release.main(["key", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def signed(tmp_path: Path, key: Path) -> Path:
+    folder = tmp_path / "release"
+    folder.mkdir()
+    for name, octets in FILES.items():
+        (folder / name).write_bytes(octets)
+    assert release.main(["sign", str(folder), "--key", str(key)]) == 0
+    return folder
+
+
+def verified(folder: Path, key: Path) -> int:
+    return int(release.main(["verify", str(folder), "--public-key", f"{key}.pub"]))
+
+
+def test_a_release_as_it_was_signed_is_accepted(signed: Path, key: Path) -> None:
+    assert verified(signed, key) == 0
+    lines = (signed / "SHA256SUMS").read_text().splitlines()
+    assert [line[66:] for line in lines] == sorted(FILES)
+
+
+@pytest.mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
+def test_one_changed_bit_of_any_file_is_refused(signed: Path, key: Path, name: str, capsys) -> None:
+    octets = bytearray((signed / name).read_bytes())
+    octets[len(octets) // 2] ^= 1
+    (signed / name).write_bytes(octets)
+    assert verified(signed, key) == 1
+    assert "REFUSED" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
+def test_a_missing_file_is_refused(signed: Path, key: Path, name: str, capsys) -> None:
+    (signed / name).unlink()
+    assert verified(signed, key) == 1
+    assert name in capsys.readouterr().err
+
+
+def test_an_added_file_and_a_link_are_refused(signed: Path, key: Path, capsys) -> None:
+    (signed / "extra.whl").write_bytes(b"x")
+    assert verified(signed, key) == 1
+    assert "not listed" in capsys.readouterr().err
+    (signed / "extra.whl").unlink()
+    (signed / WHEEL).rename(signed.parent / WHEEL)
+    (signed / WHEEL).symlink_to(signed.parent / WHEEL)
+    assert verified(signed, key) == 1
+
+
+def test_a_release_signed_with_another_key_is_refused(signed: Path, key: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.key"
+    release.make_key(other)
+    (signed / WHEEL).write_bytes(b"changed and signed again")
+    release.sign(signed, other)
+    assert verified(signed, other) == 0
+    assert verified(signed, key) == 1
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_incomplete_release_is_not_signed(signed: Path, key: Path, name: str, capsys) -> None:
+    (signed / name).unlink()
+    assert release.main(["sign", str(signed), "--key", str(key)]) == 2
+    assert "expected one" in capsys.readouterr().err
+
+
+def test_the_private_key_is_private_and_outside_of_the_repository(signed: Path, key: Path, capsys) -> None:
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert release.main(["key", str(key)]) == 2
+    assert "expected a new file" in capsys.readouterr().err
+    inside = ROOT / "release.key"
+    assert release.main(["key", str(inside)]) == 2 and not inside.exists()
+    assert release.main(["sign", str(signed), "--key", str(inside)]) == 2
+    assert "outside of the repository" in capsys.readouterr().err
+    key.chmod(0o640)
+    assert release.main(["sign", str(signed), "--key", str(key)]) == 2
+    assert "chmod 600" in capsys.readouterr().err
+
+
+def test_the_documented_commands_verify_a_release_without_this_program(signed: Path, key: Path) -> None:
+    page = (ROOT / "docs" / "deployment.md").read_text()
+    commands = re.findall(r"^    ((?:openssl pkeyutl|sha256sum) .*)$", page, re.MULTILINE)
+    assert len(commands) == 2
+    shutil.copy(f"{key}.pub", signed.parent / "linna-release.pub")
+
+    def run() -> list[int]:
+        return [
+            subprocess.run(command, shell=True, cwd=signed, capture_output=True, check=False).returncode
+            for command in commands
+        ]
+
+    assert run() == [0, 0]
+    (signed / WHEEL).write_bytes(b"changed")
+    assert run() == [0, 1]
+    (signed / "SHA256SUMS").write_bytes((signed / "SHA256SUMS").read_bytes() + b"\n")
+    assert run()[0] == 1
+
+
+def test_make_release_builds_lists_and_signs() -> None:
+    rules = (ROOT / "Makefile").read_text()
+    rule = rules[rules.index("\nrelease:") :].split("\n\n")[0]
+    for word in (
+        "-m build",
+        "cyclonedx_py",
+        "deploy/licences.py",
+        "deploy/release.py sign",
+        "LINNA_RELEASE_KEY",
+    ):
+        assert word in rule, word
