@@ -43,7 +43,14 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.performance.model import MonthlyReport, Performance
-from ground_service.planning.model import Imported, Plan, SearchResult, Window
+from ground_service.planning.model import (
+    CraterDensity,
+    Imported,
+    Plan,
+    PlanForecast,
+    SearchResult,
+    Window,
+)
 from ground_service.planning.request_model import RequestPlan, StandingRequest
 from ground_service.regression.model import Build, KeptArchive, Pruned, Regression, RegressionSummary
 from ground_service.timekeeping.model import Correlation, TimeReport
@@ -580,6 +587,30 @@ class Client(Connection):
     def search_windows(self, constraints: Body) -> SearchResult:
         """Search candidate windows over a reference ephemeris."""
         return self._post(SearchResult, "/windows/search", constraints)
+
+    def get_forecast(
+        self,
+        spacecraft_id: int,
+        start: str,
+        stop: str,
+        *,
+        instance: str = "flight",
+        ephemeris_id: int | None = None,
+    ) -> PlanForecast:
+        """Return conditions, resources and conflicts of the plan of a spacecraft between two times."""
+        return self._get(
+            PlanForecast,
+            "/plan/forecast",
+            spacecraft_id=spacecraft_id,
+            start=start,
+            stop=stop,
+            instance=instance,
+            ephemeris_id=ephemeris_id,
+        )
+
+    def get_crater_density(self, spacecraft_id: int) -> CraterDensity:
+        """Return the crater density of the catalogue of the mission description in force."""
+        return self._get(CraterDensity, "/plan/crater-density", spacecraft_id=spacecraft_id)
 
     def list_windows(self, *, state: str | None = None) -> Listing[Window]:
         """List planned windows, newest first."""

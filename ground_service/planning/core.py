@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -113,16 +113,27 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
+class RejectedSpan:
+    """A span in which the constraints hold, but that is no candidate."""
+
+    start_utc_ns: int
+    stop_utc_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class SearchResult:
     """Candidates in order of time, the contacts that were counted with, and why spans were left out."""
 
     candidates: tuple[Candidate, ...]
     contacts: tuple[Contact, ...]
-    refused: dict[str, int] = field(default_factory=dict)
+    rejected: tuple[RejectedSpan, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Geometry:
+class Conditions:
+    """Position (n, 3) and conditions (n,) at the sub-satellite point; `sunlit` is the share of the Sun's disc."""
+
     position_mcmf_m: FloatArray
     latitude_rad: FloatArray
     longitude_rad: FloatArray
@@ -168,22 +179,22 @@ class Planner:
         )
         contacts = self.contacts(start_utc_ns, stop_utc_ns)
         battery = self._battery(start_utc_ns, stop_utc_ns, step_s)
-        refused: dict[str, int] = {}
+        rejected = []
         candidates = []
         for begin, end in spans:
             for first, last in _cut(begin, end, constraints.maximum_duration_s):
                 if last - first < constraints.minimum_duration_s * NS:
-                    refused["too short"] = refused.get("too short", 0) + 1
+                    rejected.append(RejectedSpan(first, last, "too short"))
                     continue
                 candidate = self._candidate(
                     constraints, first, last, cadence_s, contacts, battery, commitments
                 )
                 reason = self._refusal(candidate, constraints)
                 if reason:
-                    refused[reason] = refused.get(reason, 0) + 1
+                    rejected.append(RejectedSpan(first, last, reason))
                 else:
                     candidates.append(candidate)
-        return SearchResult(tuple(candidates), contacts, refused)
+        return SearchResult(tuple(candidates), contacts, tuple(rejected))
 
     def spans(
         self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0
@@ -201,7 +212,7 @@ class Planner:
 
     def sunlit(self, utc_ns: IntArray) -> FloatArray:
         """Return the share (n,) of the Sun that the spacecraft sees."""
-        return self._geometry(utc_ns).sunlit
+        return self.conditions(utc_ns).sunlit
 
     def downlink_octets(
         self, start_utc_ns: int, steps: int, step_s: float, outages: Mapping[str, Sequence[tuple[int, int]]]
@@ -241,7 +252,8 @@ class Planner:
         found = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
         return tuple(Contact(one.station, one.start_utc_ns, one.stop_utc_ns) for one in found)
 
-    def _geometry(self, utc_ns: IntArray) -> _Geometry:
+    def conditions(self, utc_ns: IntArray) -> Conditions:
+        """Return the conditions below the spacecraft at epochs (n,)."""
         position, _ = self.ephemeris.at(utc_ns)
         tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
         rotation = self.orientation.mcmf_from_icrf(tdb_s)
@@ -250,11 +262,11 @@ class Planner:
         latitude, longitude, altitude = spherical_from_mcmf(place)
         elevation, _ = sun_elevation_azimuth(latitude, longitude, np.einsum("nij,nj->ni", rotation, sun))
         lit = sunlit_fraction(position, sun, np.asarray(earth_position_icrf_m(tdb_s)))
-        return _Geometry(place, latitude, longitude, altitude, elevation, lit)
+        return Conditions(place, latitude, longitude, altitude, elevation, lit)
 
     def _holds(self, utc_ns: IntArray, constraints: Constraints) -> BoolArray:
         """Whether the constraints hold at epochs (n,); the dear one, the craters, only where the others do."""
-        at = self._geometry(utc_ns)
+        at = self.conditions(utc_ns)
         held = np.ones(len(utc_ns), dtype=np.bool_)
         for value, limits in (
             (at.altitude_m, constraints.altitude_m),
@@ -289,7 +301,7 @@ class Planner:
     def _battery(self, start_utc_ns: int, stop_utc_ns: int, step_s: float) -> tuple[IntArray, FloatArray]:
         """Epochs (n,) and the charge (n,) in Wh of a battery that was full at the start, without observations."""
         epochs = np.arange(start_utc_ns, stop_utc_ns + 1, round(step_s * NS), dtype=np.int64)
-        gain = (self._geometry(epochs).sunlit * self.resources.generation_w - self.resources.idle_w) * (
+        gain = (self.conditions(epochs).sunlit * self.resources.generation_w - self.resources.idle_w) * (
             step_s / 3600.0
         )
         charge = np.empty(len(epochs))
@@ -311,7 +323,7 @@ class Planner:
     ) -> Candidate:
         frames = frames_between(start, stop, cadence_s)
         epochs = np.linspace(start, stop, min(max(frames, 2), 200)).astype(np.int64)
-        at = self._geometry(epochs)
+        at = self.conditions(epochs)
         craters = self._craters(at.position_mcmf_m, constraints) if constraints.craters_per_frame else None
         per_frame = float(craters.mean()) if craters is not None else self.resources.detections_per_frame
         octets = data_octets(frames, per_frame, self.resources.estimators)

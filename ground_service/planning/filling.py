@@ -105,6 +105,34 @@ def violation(grid: ResourceGrid, chosen: Sequence[Option]) -> str | None:
     return _battery_violation(grid, change) or _storage_violation(grid, arrivals)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ResourceCurves:
+    """Resources at the end of each step (n,) of a grid, with the windows of a plan; `sent_octets` within each step."""
+
+    battery_wh: FloatArray
+    stored_octets: FloatArray
+    sent_octets: FloatArray
+
+
+def curves(grid: ResourceGrid, chosen: Sequence[Option]) -> ResourceCurves:
+    """Return battery, storage and downlink with a set of windows, whether or not it keeps the limits."""
+    change = grid.gain_wh.copy()
+    arrivals = np.zeros(len(change))
+    for option in chosen:
+        change -= grid.energy_wh(option)
+        arrivals[grid.arrival(option)] += option.octets
+    battery, stored, sent = np.empty(len(change)), np.empty(len(change)), np.empty(len(change))
+    charge, held = grid.battery_wh, 0.0
+    for i, (gain, arrived, can) in enumerate(
+        zip(change.tolist(), arrivals.tolist(), grid.downlink_octets.tolist(), strict=True)
+    ):
+        charge = min(max(charge + gain, 0.0), grid.battery_wh)
+        sent[i] = min(held, can)
+        held += arrived - sent[i]
+        battery[i], stored[i] = charge, held
+    return ResourceCurves(battery, stored, sent)
+
+
 def take_in_order(
     grid: ResourceGrid,
     options: Sequence[Option],

@@ -218,6 +218,14 @@ class Contact(Entity):
     stop: UtcTime
 
 
+class RejectedSpan(Entity):
+    """A span that fulfils the constraints but is no candidate, and why."""
+
+    start: UtcTime
+    stop: UtcTime
+    reason: str = Field(examples=["too short"])
+
+
 class SearchResult(Entity):
     """Candidate windows in order of time."""
 
@@ -225,7 +233,51 @@ class SearchResult(Entity):
     data: list[str]
     candidates: list[Candidate]
     contacts: list[Contact]
-    refused: dict[str, int] = Field(description="Number of rejected intervals, by reason")
+    rejected: list[RejectedSpan] = Field(description="Spans that were left out, in order of time")
+
+
+class WindowConflict(Entity):
+    """What stands in the way of a planned window."""
+
+    window_id: int
+    reasons: list[str]
+
+
+class PlanForecast(Entity):
+    """Conditions and resources of the plan of a spacecraft on a grid of time, in columns of equal length.
+
+    The columns are empty if no reference ephemeris covers the interval; `reason` states it.
+    """
+
+    spacecraft_id: int
+    instance: str
+    ephemeris_id: int | None
+    reason: str | None = Field(description="Why there are no values, or only for a part of the interval")
+    data: list[str]
+    step_s: float
+    time_s: list[float] = Field(description="UTC, POSIX seconds at the middle of each step")
+    latitude_deg: list[float]
+    longitude_deg: list[float]
+    altitude_km: list[float]
+    sun_elevation_deg: list[float] = Field(description="At the sub-satellite point")
+    sunlit: list[float] = Field(description="Share of the Sun's disc that the spacecraft sees")
+    battery_share: list[float] = Field(description="Charge at the end of the step, share of the capacity")
+    battery_floor: float = Field(description="Minimum share of the mission description or of the planner")
+    stored_octets: list[int] = Field(description="Data on board at the end of the step")
+    storage_octets: int = Field(description="Capacity of the storage")
+    sent_octets: list[int] = Field(description="Data downlinked in the step")
+    downlink_octets: list[int] = Field(description="Data that contacts can take in the step")
+    conflicts: list[WindowConflict] = Field(description="Conflicts of the plan, drafts included")
+
+
+class CraterDensity(Entity):
+    """Craters per 10,000 km2 in cells of the map; rows from south to north, cells from 180 W to 180 E."""
+
+    source: str | None = Field(description="Name of the catalogue")
+    reason: str | None = Field(description="Why there is no density")
+    cell_deg: float
+    diameter_km: Span
+    rows: list[list[float]]
 
 
 class WindowIn(Given):

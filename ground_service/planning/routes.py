@@ -14,6 +14,7 @@ from ground_service.http.common import (
     API_PREFIX,
     IF_MATCH_HEADER,
     GroundOf,
+    Instance,
     OnceKey,
     PagingOf,
     PassId,
@@ -21,10 +22,13 @@ from ground_service.http.common import (
 from ground_service.http.model import PageOf
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
-from ground_service.planning import exchange, service
+from ground_service.http.times import GivenTime
+from ground_service.planning import exchange, forecast, service
 from ground_service.planning.model import (
+    CraterDensity,
     Imported,
     Plan,
+    PlanForecast,
     SearchResult,
     Window,
     WindowChange,
@@ -134,6 +138,35 @@ def uplink_window(ground: GroundOf, caller: Operator, window_id: PassId) -> Page
 def export_plan(ground: GroundOf, _: Viewer) -> Plan:
     """Export all windows that have not failed, for import into another service."""
     return exchange.export_plan(ground)
+
+
+@planning.get("/plan/forecast", responses=problems(404))
+def get_forecast(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
+    start: Annotated[GivenTime, Query(examples=["2029-08-07T00:00:00Z"])],
+    stop: Annotated[GivenTime, Query(examples=["2029-08-08T00:00:00Z"], description="At most 8 days later")],
+    instance: Instance = "flight",
+    ephemeris_id: Annotated[int | None, Query(ge=1, le=2**31 - 1)] = None,
+) -> PlanForecast:
+    """Return Sun elevation, ground track, battery, storage and downlink of the plan, and its conflicts."""
+    return forecast.get_forecast(
+        ground,
+        spacecraft_id=spacecraft_id,
+        instance=instance,
+        start_utc_ns=start.utc_ns,
+        stop_utc_ns=stop.utc_ns,
+        ephemeris_id=ephemeris_id,
+    )
+
+
+@planning.get("/plan/crater-density")
+def get_crater_density(
+    ground: GroundOf, _: Viewer, spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])]
+) -> CraterDensity:
+    """Return the density of craters of 5 to 30 km in the catalogue of the mission description."""
+    return forecast.crater_density(ground, spacecraft_id)
 
 
 @planning.post("/plan", status_code=201, responses=problems(404, 409))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Mission
+from ground_service.missions.places import stations_of
 from ground_service.planning import model, store
 from ground_service.planning.core import (
     Candidate,
@@ -98,7 +99,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     start = None if given.start is None else given.start.utc_ns
     stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
-        reference = _ephemeris_for(connection, given.ephemeris_id, start, stop)
+        reference = ephemeris_for(connection, given.ephemeris_id, start, stop)
         mission = missions.mission_in_force(connection, given.spacecraft_id)
         if (
             mission is not None
@@ -140,7 +141,12 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
             Contact(station=one.station, start=UtcTime(one.start_utc_ns), stop=UtcTime(one.stop_utc_ns))
             for one in found.contacts
         ],
-        refused=found.refused,
+        rejected=[
+            model.RejectedSpan(
+                start=UtcTime(one.start_utc_ns), stop=UtcTime(one.stop_utc_ns), reason=one.reason
+            )
+            for one in found.rejected
+        ],
     )
 
 
@@ -460,6 +466,27 @@ def planner_of(
     )
 
 
+def resources_of(mission: Mission) -> Resources:
+    """Return the resources that a mission description states, with defaults for the others."""
+    stated, default = mission.resources, asdict(Resources())
+    rates = [
+        one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None
+    ]
+    given: dict[str, Any] = {
+        "storage_octets": None if stated.storage_mib is None else round(stated.storage_mib * (1 << 20)),
+        "downlink_bit_s": min(rates, default=None)
+        if stated.downlink_kbit_s is None
+        else stated.downlink_kbit_s * 1e3,
+        "battery_wh": stated.battery_wh,
+        "generation_w": stated.generation_w,
+        "idle_w": stated.idle_w,
+        "observing_w": stated.observing_w,
+    }
+    values = default | {name: value for name, value in given.items() if value is not None}
+    values["stations"] = stations_of(mission.link) or Resources().stations
+    return Resources(**values)
+
+
 def _prediction(
     ground: Ground, connection: Connection, entry: WindowEntry, commitments: Sequence[Commitment]
 ) -> Candidate | None:
@@ -521,7 +548,7 @@ def _span_conflicts(
     return span_conflicts(mine, predecessor, spans)
 
 
-def _ephemeris_for(
+def ephemeris_for(
     connection: Connection, ephemeris_id: int | None, start: int | None, stop: int | None
 ) -> Ephemeris:
     if ephemeris_id is not None:
@@ -569,11 +596,12 @@ def _check_entry(entry: WindowEntry) -> None:
 def _catalogue(ground: Ground, sha256: str | None) -> CraterCatalogue | None:
     if sha256 is not None:
         return load_catalogue(ground.files.path(sha256))
-    return _public_catalogue(ground.data)
+    return public_catalogue(ground.data)
 
 
 @functools.lru_cache(maxsize=2)
-def _public_catalogue(data: DataFolder) -> CraterCatalogue | None:
+def public_catalogue(data: DataFolder) -> CraterCatalogue | None:
+    """Return the crater catalogue among the public data."""
     path = data.catalogue_composite or data.catalogue_lu
     return load_catalogue(path) if path is not None else None
 

@@ -11,7 +11,7 @@ import functools
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from ground_service.http.times import UtcTime
 from ground_service.links import service as links
 from ground_service.missions import store as missions
 from ground_service.missions.model import Mission
-from ground_service.missions.places import outages_of, stations_of
+from ground_service.missions.places import outages_of
 from ground_service.planning import request_store as store
 from ground_service.planning import service as planning
 from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between
@@ -320,7 +320,7 @@ def _candidates(ground: Ground, situation: _Situation, start: int, end: int) -> 
     """Return the spans that fulfil the constraints, day by day, each in the preferred ephemeris that covers it."""
     terms = situation.request.terms
     constraints = terms.constraints(daylight=situation.mission.camera.fov_deg is not None)
-    resources = _resources(situation.mission)
+    resources = planning.resources_of(situation.mission)
     found: list[tuple[int, int]] = []
     for day in range(start // DAY_NS, -(-end // DAY_NS)):
         begin, stop = day * DAY_NS, (day + 1) * DAY_NS
@@ -365,7 +365,7 @@ def _chosen(
     end: int,
 ) -> tuple[list[Option], dict[Option, str]]:
     """Return the windows to plan, and the reasons of the other candidates."""
-    request, resources = situation.request, _resources(situation.mission)
+    request, resources = situation.request, planning.resources_of(situation.mission)
     rejected: dict[Option, str] = {}
     options = []
     passes = _uplinks(ground, situation, now, end)
@@ -442,7 +442,7 @@ def _stored(
 ) -> int:
     """Enter the chosen windows and the plan in one transaction, unless another process did; return their number."""
     request = situation.request
-    resources = _resources(situation.mission)
+    resources = planning.resources_of(situation.mission)
     with ground.database.writing() as connection:
         lock_spacecraft(connection, request.vehicle_id)
         if not store.claim_plan(connection, request):
@@ -496,27 +496,6 @@ def _candidate(option: Option, window_id: int | None, reason: str | None) -> Pla
         window_id=window_id,
         reason=reason,
     )
-
-
-def _resources(mission: Mission) -> Resources:
-    """Return the resources that a mission description states, with defaults for the others."""
-    stated, default = mission.resources, asdict(Resources())
-    rates = [
-        one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None
-    ]
-    given: dict[str, Any] = {
-        "storage_octets": None if stated.storage_mib is None else round(stated.storage_mib * (1 << 20)),
-        "downlink_bit_s": min(rates, default=None)
-        if stated.downlink_kbit_s is None
-        else stated.downlink_kbit_s * 1e3,
-        "battery_wh": stated.battery_wh,
-        "generation_w": stated.generation_w,
-        "idle_w": stated.idle_w,
-        "observing_w": stated.observing_w,
-    }
-    values = default | {name: value for name, value in given.items() if value is not None}
-    values["stations"] = stations_of(mission.link) or Resources().stations
-    return Resources(**values)
 
 
 def _is_automatic(mission: Mission | None) -> bool:

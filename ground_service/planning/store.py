@@ -198,6 +198,24 @@ def commitments(
     return [Commitment(*row) for row in connection.execute(query)]
 
 
+def windows_between(
+    connection: Connection, spacecraft_id: int, instance: str, start_utc_ns: int, stop_utc_ns: int
+) -> list[Window]:
+    """Return the windows of a spacecraft, except failed ones, that overlap an interval, in order of time."""
+    query = (
+        _joined()
+        .where(
+            VEHICLES.c.ccsds_id == spacecraft_id,
+            VEHICLES.c.instance == instance,
+            WINDOWS.c.state != "failed",
+            WINDOWS.c.stop_utc_ns > start_utc_ns,
+            WINDOWS.c.start_utc_ns < stop_utc_ns,
+        )
+        .order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
+    )
+    return _windows(connection, query, Window)
+
+
 def add_pass(connection: Connection, window: WindowRecord, mission_id: int | None, now_utc_ns: int) -> int:
     """Add the pass of the telemetry of a window; return its id."""
     return int(

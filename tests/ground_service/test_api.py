@@ -320,6 +320,8 @@ MATRIX = [
     ("GET", "/spacecraft/76/time-reports", "viewer"),
     ("GET", "/spacecraft/76/uplink", "viewer"),
     ("POST", "/windows/search", "viewer"),
+    ("GET", "/plan/forecast", "viewer"),
+    ("GET", "/plan/crater-density", "viewer"),
     ("GET", "/displays", "viewer"),
     ("GET", "/displays/mine", "viewer"),
     ("PUT", "/displays/mine", "operator"),

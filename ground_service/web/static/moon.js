@@ -44,6 +44,29 @@ export function moonMap(place, { albedo = true } = {}) {
   return map;
 }
 
+// The terrain of a mission description: the picture of the Moon is of the Moon only.
+export function terrain({ evidence }) {
+  const world = evidence?.world;
+  if (!world) return { albedo: false, text: "Terrain: not stated in the mission description." };
+  if (world === "real-terrain" || world === "photographs") return { albedo: true, text: "Terrain: the Moon; the background is its albedo." };
+  const seed = evidence.seed === null || evidence.seed === undefined ? "" : `, seed ${evidence.seed}`;
+  return { albedo: false, text: `Terrain: ${world.replaceAll("-", " ").replaceAll("_", " ")}${seed}, which is not the Moon's: no picture of it is shown.` };
+}
+
+// Density of craters: the denser a cell, the more opaque. Returns the layer and the greatest density.
+export function densityLayer(map, { rows, cell_deg: cell }, css) {
+  const most = Math.max(...rows.flat(), 0);
+  const layer = L.layerGroup().addTo(map);
+  rows.forEach((row, north) =>
+    row.forEach((value, east) => {
+      if (!value) return;
+      const [south, west] = [north * cell - 90, east * cell - 180];
+      L.rectangle([[south, west], [south + cell, west + cell]], { stroke: false, fillColor: css, fillOpacity: 0.55 * Math.sqrt(value / most), interactive: false }).addTo(layer);
+    }),
+  );
+  return { layer, most };
+}
+
 const wrapped = (longitude) => ((((longitude + 180) % 360) + 360) % 360) - 180;
 
 // A track in parts, so that no line crosses the whole map at the 180 degree meridian or bridges a missing value.

@@ -1,7 +1,7 @@
 import { bind } from "./address.js";
 import { finished, get, request, send } from "./api.js";
 import { chart, columns, solutionStyle } from "./charts.js";
-import { craterRims, layerItem, moonMap, track } from "./moon.js";
+import { craterRims, layerItem, moonMap, terrain, track } from "./moon.js";
 import { drawParameters } from "./parameters.js";
 import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, parameterOptions, seconds, show, stateMark, table, timeText, trouble, unitText } from "./page.js";
 
@@ -166,25 +166,19 @@ function showCompleteness(found) {
   );
 }
 
-// The terrain that was flown over, by the mission description: the picture of the Moon is of the Moon only.
 async function terrainOf(pass) {
   if (!pass.mission_revision) return { albedo: false, text: "Terrain: not stated, since no mission description was in force." };
-  const { evidence } = (await get(`missions/${pass.mission_revision.slice(0, 16)}`)).document;
-  const world = evidence?.world;
-  if (!world) return { albedo: false, text: "Terrain: not stated in the mission description." };
-  if (world === "real-terrain" || world === "photographs") return { albedo: true, text: "Terrain: the Moon; the background is its albedo." };
-  const seed = evidence.seed === null || evidence.seed === undefined ? "" : `, seed ${evidence.seed}`;
-  return { albedo: false, text: `Terrain: ${words(world.replaceAll("-", " "))}${seed}, which is not the Moon's: no picture of it is shown.` };
+  return terrain((await get(`missions/${pass.mission_revision.slice(0, 16)}`)).document);
 }
 
 const CRATERS_SHOWN = 1000;
 
 async function showTerrain(pass) {
-  const [terrain, craters] = await Promise.all([terrainOf(pass), get(`passes/${passId}/craters`, { limit: CRATERS_SHOWN })]);
-  const map = moonMap(byId("map"), terrain);
+  const [flown, craters] = await Promise.all([terrainOf(pass), get(`passes/${passId}/craters`, { limit: CRATERS_SHOWN })]);
+  const map = moonMap(byId("map"), flown);
   craterRims(map, craters.items);
   const shown = craters.total > craters.items.length ? `the ${figure(craters.items.length)} largest of ${figure(craters.total)}` : figure(craters.total);
-  byId("terrain").textContent = `${terrain.text} ${craters.total ? `Circles: ${shown} craters of the catalogue of the pass.` : "The pass has no crater catalogue."}`;
+  byId("terrain").textContent = `${flown.text} ${craters.total ? `Circles: ${shown} craters of the catalogue of the pass.` : "The pass has no crater catalogue."}`;
   return map;
 }
 

@@ -1,6 +1,7 @@
 import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
 import { acting, byId, element, figure, isoText, lengthText, mayOperate, missionNow, notice, seconds, session, show, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
 
 const ROW_PX = 34;
@@ -8,6 +9,7 @@ const HEAD_PX = 24;
 const DAY_S = 86400;
 let windows = [];
 let candidates = [];
+let rejected = []; // spans of the search
 let contacts = []; // of the search
 let linked = []; // of the links
 let ephemerides = [];
@@ -67,7 +69,7 @@ function drawTimeline() {
   const width = Math.max(240, place.clientWidth);
   if (!viewChosen && String(whole()) !== String(view)) {
     view = whole();
-    if (contactsOf) soonContacts();
+    if (contactsOf) soonConditions();
   }
   const scale = width / (view[1] - view[0]);
   const x = (time) => (time - view[0]) * scale;
@@ -79,7 +81,8 @@ function drawTimeline() {
     { name: "windows", top: HEAD_PX + ROW_PX, height: rows * ROW_PX },
     { name: "contacts", top: HEAD_PX + ROW_PX + rows * ROW_PX, height: ROW_PX },
   ];
-  const height = sections[2].top + ROW_PX;
+  const lanesTop = sections[2].top + ROW_PX;
+  const height = lanesTop + lanesHeight();
   const drawn = svg("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "timeline of windows" });
   const step = tickStep(view[1] - view[0]);
   for (let time = Math.ceil(view[0] / step) * step; time < view[1]; time += step) {
@@ -95,11 +98,15 @@ function drawTimeline() {
     text.textContent = name;
     drawn.append(text);
   }
+  drawLanes(drawn, x, width, lanesTop);
   for (const one of linked) {
     drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop ?? one.start)), sections[2].top + 6, `contact ${one.state}`, `link ${one.link}, ${one.station}, ${one.state}, ${timeText(one.start)} to ${timeText(one.stop)}`));
   }
   for (const one of contacts) {
     drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[2].top + 6, "contact", `${one.station} ${timeText(one.start)} to ${timeText(one.stop)}`));
+  }
+  for (const one of rejected) {
+    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].top + 4, "candidate rejected", `rejected ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}: ${one.reason}`));
   }
   for (const one of candidates) {
     const made = bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].top + 4, "candidate", `candidate ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}${mayOperate() ? ": plan it" : ""}`);
@@ -107,7 +114,26 @@ function drawTimeline() {
     drawn.append(made);
   }
   ordered.forEach((row, index) => drawn.append(windowBar(row, x, sections[1].top + 4 + lane[index] * ROW_PX, scale)));
+  drawn.addEventListener("pointermove", (event) => readAt(view[0] + (event.clientX - drawn.getBoundingClientRect().left) / scale));
+  const cursor = svg("line", { y1: HEAD_PX - 6, y2: height, class: "cursor" });
+  drawn.append(cursor);
   show(place, drawn);
+  readAt(view[0] + readShare * (view[1] - view[0]));
+  drawTrack(windows.map((row) => ({ id: row.id, ...selectable(row) })), chosen);
+}
+
+// The values of the forecast at the pointer, or at the time of the slider.
+let readShare = 0.5; // of the view
+function readAt(time) {
+  readShare = Math.min(Math.max((time - view[0]) / (view[1] - view[0]), 0), 1);
+  const readTime = view[0] + readShare * (view[1] - view[0]);
+  byId("at").value = Math.round(1000 * readShare);
+  const words = valuesAt(readTime) ?? `${timeText(isoText(readTime))}: no forecast`;
+  byId("at").setAttribute("aria-valuetext", words);
+  byId("values").textContent = words;
+  const cursor = byId("timeline").querySelector(".cursor");
+  const x = readShare * Math.max(240, byId("timeline").clientWidth);
+  for (const end of ["x1", "x2"]) cursor?.setAttribute(end, x);
 }
 
 function bar(left, right, top, kind, label) {
@@ -129,9 +155,12 @@ function pressable(made, deed) {
   });
 }
 
+// Steps of the start and of the stop by key.
+const KEYS = { ArrowLeft: [-1, -1], ArrowRight: [1, 1], ArrowUp: [0, 1], ArrowDown: [0, -1], "[": [-1, 0], "]": [1, 0] };
+
 function windowBar(row, x, top, scale) {
   const { start, stop } = selectable(row);
-  const made = bar(x(start), x(stop), top, `window ${row.state}${chosen === row.id ? " chosen" : ""}`, `${row.name}, ${row.state}, ${timeText(row.start)} to ${timeText(row.stop)}`);
+  const made = bar(x(start), x(stop), top, `window ${row.state}${chosen === row.id ? " chosen" : ""}${conflictsOf(row.id).length ? " conflict" : ""}`, `${row.name}, ${row.state}, ${timeText(row.start)} to ${timeText(row.stop)}${conflictsOf(row.id).map((reason) => `; conflict: ${reason}`).join("")}`);
   const text = svg("text", { x: x(start) + 5, y: top + 17, class: "name" });
   text.textContent = row.name;
   made.append(text);
@@ -139,11 +168,11 @@ function windowBar(row, x, top, scale) {
   pressable(made, () => choose(row.id));
   if (row.state !== "draft" || !mayOperate()) return made;
   made.addEventListener("keydown", (event) => {
-    const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (!by) return;
+    const [first, last] = KEYS[event.key] ?? [0, 0];
+    if (!(first || last) || event.altKey || event.ctrlKey || event.metaKey) return;
     event.preventDefault();
-    const shift = by * (event.shiftKey ? 10 : 60);
-    acting(() => move(row, start + shift, stop + shift))();
+    const by = event.shiftKey ? 10 : 60;
+    acting(() => move(row, start + by * first, stop + by * last))();
   });
   made.addEventListener("pointerdown", (down) => drag(down, row, made, start, stop, scale));
   return made;
@@ -153,6 +182,7 @@ function windowBar(row, x, top, scale) {
 function drag(down, row, made, start, stop, scale) {
   const box = made.querySelector("rect").getBoundingClientRect();
   const end = box.width > 24 && down.clientX < box.left + 8 ? "start" : box.width > 24 && down.clientX > box.right - 8 ? "stop" : "both";
+  const left = Number(made.querySelector("rect").getAttribute("x"));
   let shift = 0;
   dragging = true;
   made.setPointerCapture(down.pointerId);
@@ -162,7 +192,9 @@ function drag(down, row, made, start, stop, scale) {
     if (end !== "both") {
       const rect = made.querySelector("rect");
       const by = event.clientX - down.clientX;
-      if (end === "stop") rect.setAttribute("width", Math.max(3, box.width + by));
+      const rest = Math.max(3, box.width + (end === "stop" ? by : -by));
+      rect.setAttribute("width", rest);
+      if (end === "start") rect.setAttribute("x", left + box.width - rest);
     }
   };
   made.addEventListener("pointermove", moved);
@@ -179,9 +211,17 @@ function drag(down, row, made, start, stop, scale) {
   made.addEventListener("pointercancel", letGo);
 }
 
+// Reasons why a change of a window was refused, until the next one.
+let refusal = null;
+
 async function move(row, start, stop) {
+  refusal = null;
   try {
     await send("PATCH", `windows/${row.id}`, { start: isoText(start), stop: isoText(stop) });
+  } catch (error) {
+    const reasons = (error.document?.errors ?? []).map((one) => one.detail).filter(Boolean);
+    refusal = { id: row.id, what: `${timeText(isoText(start))} to ${timeText(isoText(stop))}`, reasons: reasons.length ? reasons : [error.message] };
+    throw error;
   } finally {
     chosen = row.id;
     await load();
@@ -228,8 +268,21 @@ function showChosen() {
     "selected",
     element("h3", {}, row.name),
     element("dl", { class: "facts" }, facts.map(([name, value]) => element("div", {}, element("dt", {}, name), element("dd", {}, value)))),
+    refusal?.id === row.id ? reasonList(`Not changed to ${refusal.what}:`, refusal.reasons) : null,
+    conflictsOf(row.id).length ? reasonList("Conflicts of the plan:", conflictsOf(row.id)) : null,
+    row.state === "draft" ? timesForm(row) : null,
     element("p", { class: "actions" }, deeds),
   );
+}
+
+const reasonList = (heading, reasons) => element("div", { class: "conflicts" }, element("strong", {}, heading), element("ul", { class: "reasons" }, reasons.map((reason) => element("li", {}, reason))));
+
+// Start and stop of a draft, typed.
+function timesForm(row) {
+  const field = (name, value) => element("input", { name, required: true, value: `${value.slice(0, 19)}Z`, pattern: "\\d{4}-\\d\\d-\\d\\dT\\d\\d:\\d\\d:\\d\\d(\\.\\d+)?Z", title: "UTC, such as 2029-08-07T06:00:00Z" });
+  const [start, stop] = [field("start", row.start), field("stop", row.stop)];
+  const change = acting(() => move(row, seconds(start.value), seconds(stop.value)));
+  return element("form", { class: "row", "data-needs": "operator", onsubmit: change }, element("label", {}, "Start, UTC ", start), element("label", {}, "Stop, UTC ", stop), element("button", {}, "Change"));
 }
 
 async function uplink(row) {
@@ -271,12 +324,11 @@ async function search() {
     needs_contact: byId("contact").checked,
   });
   candidates = found.candidates;
-  contacts = found.contacts;
+  ({ contacts, rejected } = found);
   showAll();
-  const refused = Object.entries(found.refused).map(([reason, count]) => `${count} ${reason.replaceAll("_", " ")}`).join(", ");
   show(
     "candidates",
-    element("p", { class: "hint" }, `${candidates.length} candidates${refused ? `; left out: ${refused}` : ""}. Data: ${found.data.join(", ") || "built in"}.`),
+    element("p", { class: "hint" }, `${candidates.length} candidates, ${rejected.length} spans rejected. Data: ${found.data.join(", ") || "built in"}.`),
     table(
       "Candidates",
       [
@@ -293,6 +345,26 @@ async function search() {
       candidates,
       "No span fulfils all constraints.",
     ),
+  );
+  show(
+    "rejected",
+    rejected.length
+      ? element(
+          "details",
+          {},
+          element("summary", {}, `${rejected.length} rejected spans with their reasons`),
+          table(
+            "Rejected spans",
+            [
+              ["Start", (row) => timeText(row.start)],
+              ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"],
+              ["Reason", (row) => row.reason],
+            ],
+            rejected,
+            "None.",
+          ),
+        )
+      : null,
   );
 }
 
@@ -324,23 +396,33 @@ const zoom = (factor, shift = 0) => () => {
   viewChosen = true;
   state({ view: view.map(isoText).join("~") });
   drawTimeline();
-  soonContacts();
+  soonConditions();
 };
 
 function showAll() {
   viewChosen = false;
   state({ view: null });
   drawTimeline();
-  soonContacts();
+  soonConditions();
 }
 
 // Contacts of the links in the shown time; they are predicted for at most a month.
 const CONTACTS_S = 31 * DAY_S;
 let contactsPending = null;
 let contactsOf = false; // contacts of a view have been asked for
-function soonContacts() {
+function soonConditions() {
   clearTimeout(contactsPending);
-  contactsPending = setTimeout(() => loadContacts().catch(trouble), 300);
+  contactsPending = setTimeout(() => Promise.all([loadContacts(), loadConditions()]).catch(trouble), 300);
+}
+
+let conditionsOf = 0; // number of the last request: answers of former ones are not drawn
+async function loadConditions() {
+  conditionsOf += 1;
+  const mine = conditionsOf;
+  await loadForecast(view, spacecraftChosen(), Number(byId("ephemeris").value) || null);
+  if (mine !== conditionsOf) return;
+  drawTimeline();
+  if (!byId("selected").contains(document.activeElement)) showChosen();
 }
 
 async function loadContacts() {
@@ -405,7 +487,10 @@ async function loadSpacecraft() {
 // A camera needs daylight: the search applies it unless other limits are stated.
 async function showDaylight(missions) {
   const mission = missions.find((one) => one.spacecraft_id === spacecraftChosen().spacecraft_id);
-  const camera = mission && (await get(`missions/${mission.revision.slice(0, 16)}`)).document.camera;
+  const described = mission && (await get(`missions/${mission.revision.slice(0, 16)}`)).document;
+  await showMap(spacecraftChosen(), described);
+  drawTimeline();
+  const camera = described?.camera;
   const needed = camera?.fov_deg !== null && camera?.fov_deg !== undefined;
   byId("sun-min").placeholder = needed ? "0" : "";
   byId("sun-max").placeholder = needed ? "90" : "";
@@ -427,22 +512,25 @@ async function start() {
   show("ephemeris", element("option", { value: "" }, "the newest"), ephemerides.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
   bind("spacecraft", ...FIELDS);
   showSpan();
+  show("bands", bandLegend());
+  byId("at").addEventListener("input", () => readAt(view[0] + ((view[1] - view[0]) * byId("at").valueAsNumber) / 1000));
   byId("ephemeris").addEventListener("change", () => {
     showSpan();
     showAll();
   });
+  byId("spacecraft").addEventListener("change", soonConditions);
   byId("spacecraft").addEventListener("change", acting(() => Promise.all([showDaylight(missions), loadRequests(spacecraftChosen())])));
   const [from, to] = (stated("view") ?? "").split("~").map((text) => Date.parse(text) / 1000);
   if (from < to) [view, viewChosen] = [[from, to], true];
   await Promise.all([load(), showDaylight(missions), loadRequests(spacecraftChosen())]);
   const asked = stated("window") ?? location.hash.match(/^#window-(\d+)$/)?.[1];
   if (asked) choose(Number(asked));
-  await loadContacts();
+  await Promise.all([loadContacts(), loadConditions()]);
 }
 
 let pending = null;
 watch(() => {
   clearTimeout(pending);
-  pending = setTimeout(() => Promise.all([load(), loadRequests(spacecraftChosen())]).catch(trouble), 400);
+  pending = setTimeout(() => Promise.all([load(), loadRequests(spacecraftChosen())]).then(loadConditions).catch(trouble), 400);
 });
 start().catch((error) => error.status === 401 || trouble(error));

@@ -95,7 +95,7 @@ def test_long_spans_are_cut_and_short_ones_left_out() -> None:
     assert everything.candidates[0].stop_utc_ns == everything.candidates[1].start_utc_ns
     none = search(plan, minimum_duration_s=86_400.0)
     assert none.candidates == ()
-    assert none.refused["too short"] > 0
+    assert {one.reason for one in none.rejected} == {"too short"}
 
 
 def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> None:
@@ -137,7 +137,9 @@ def test_terrain_is_asked_of_the_map() -> None:
 
 def test_the_battery_falls_with_the_load() -> None:
     weak = planner(circle(), battery_wh=4.0, generation_w=13.0)
-    assert search(weak, minimum_battery=0.5).refused["battery too low"] > 0
+    rejected = search(weak, minimum_battery=0.5).rejected
+    assert "battery too low" in {one.reason for one in rejected}
+    assert all(one.start_utc_ns < one.stop_utc_ns for one in rejected)
     strong = search(planner(circle(), generation_w=1000.0), maximum_duration_s=3600.0, sunlit=True)
     assert all(candidate.battery_minimum > 0.85 for candidate in strong.candidates)
     assert strong.candidates[0].energy_wh == pytest.approx(

@@ -12,12 +12,16 @@ from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
+from ground_service.planning.model import WindowEntry
+from ground_service.planning.service import add_window
 from ground_service.regression.pass_archives import NO_INPUTS
+from lunar.timescales import parse_utc
 from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, wait_until
 from tests.ground_service.web.test_in_browser import PATHS, answered, camera_fault, receive, settled
 from tmtc.downlink import encode_cadus
 
 WIDTHS = (1280, 820, 390)
+ORBITS = parse_utc("2030-01-01T00:00:00Z")
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -289,3 +293,109 @@ def test_a_live_view_takes_matches_from_the_payload(page, console, live_frames):
     unmatched = page.evaluate(ring, [122, 121])
     assert matched[1] > 150 and matched[0] < 200 and matched[2] < 200, matched  # green
     assert unmatched[2] > 150, unmatched  # blue
+
+
+@pytest.fixture
+def planner(browser, tmp_path, console, serve, day_of_orbits):
+    """The planner of a spacecraft with an ephemeris of six hours, a small battery and two drafts."""
+    home = tmp_path / "home"
+    with open_ground(home) as ground:
+        text = (
+            'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n'
+            "[resources]\nbattery_wh = 100.0\ngeneration_w = 0.0\nidle_w = 6.0\nobserving_w = 60.0\n"
+        )
+        add_mission(ground, text.encode(), actor="ann")
+        stored = ground.files.put_file(day_of_orbits)
+        add_ephemeris(ground, stored, name="orbits", precedence=0, actor="ann")
+        for name, minute in (("first", 60), ("second", 90)):
+            start = ORBITS + minute * 60 * 10**9
+            add_window(ground, WindowEntry(name, start, start + 1200 * 10**9, 15.0, 76), actor="ann")
+    running = serve(home, home / "serve.log", console.port)
+    page = browser.new_page(base_url=running.url, viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(PATIENCE_S * 1e3)
+    page.add_init_script(COUNT_REQUESTS)
+    page.goto("/planner")
+    expect(page.locator("#timeline .curve")).to_have_count(3)
+    answered(page)
+    yield page
+    page.close()
+    running.stop()
+
+
+def times(page, key):
+    """Start and stop of a window in minutes after the start of the ephemeris."""
+    found = page.request.get(f"/api/v1/windows/{key}").json()
+    return tuple((parse_utc(found[end]) - ORBITS) / 60e9 for end in ("start", "stop"))
+
+
+def test_the_planner_shows_sun_and_resources_of_the_plan(planner):
+    page = planner
+    span = {"spacecraft_id": 76, "start": "2030-01-01T00:30:00Z", "stop": "2030-01-01T02:30:00Z"}
+    found = page.request.get("/api/v1/plan/forecast", params=span).json()
+    page.goto(f"/planner?view={span['start']}~{span['stop']}")
+    expect(page.locator("#timeline .curve")).to_have_count(3)
+    day = sum(one >= 0 for one in found["sun_elevation_deg"]) / len(found["time_s"])
+    label = page.locator("#timeline .sun").get_attribute("aria-label")
+    night = re.search(r"night (\d+) %", label)
+    assert int(night[1] if night else 0) == pytest.approx(100 * (1 - day), abs=0.51), label
+    battery = page.locator("#timeline .curve.battery").get_attribute("aria-label")
+    least, most = (100 * limit(found["battery_share"]) for limit in (min, max))
+    assert battery == f"battery: {least:.3g} to {most:.3g} %, at least 30"
+    slider = page.get_by_label("Time", exact=True)
+    slider.press("Home")
+    expect(page.locator("#values")).to_contain_text("2030-01-01 00:30:00: Sun elevation")
+    slider.press("ArrowRight")
+    expect(page.locator("#values")).to_contain_text("2030-01-01 00:30:07")
+    expect(page.locator("#bands li")).to_have_count(5)
+    expect(page.locator("#map canvas")).to_be_visible()
+    expect(page.locator("#map-text")).to_contain_text("No crater density: ")
+
+
+def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(planner):
+    page = planner
+    bar = page.locator('#timeline [data-window="1"]')
+    bar.press("ArrowRight")
+    wait_until(lambda: times(page, 1) == (61.0, 81.0), "not moved")
+    for key, expected in (
+        ("ArrowDown", (61.0, 80.0)),
+        ("]", (62.0, 80.0)),
+        ("Shift+ArrowUp", (62.0, 80.0 + 1 / 6)),
+    ):
+        answered(page)
+        bar.press(key)
+        wait_until(lambda expected=expected: times(page, 1) == pytest.approx(expected), key)
+    answered(page)
+    page.locator("#selected").get_by_label("Stop, UTC").fill("2030-01-01T01:15:00Z")
+    page.locator("#selected").get_by_role("button", name="Change").click()
+    wait_until(lambda: times(page, 1) == (62.0, 75.0), "not changed by the form")
+    answered(page)
+    box = bar.locator("rect").bounding_box()
+    page.mouse.move(box["x"] + 3, box["y"] + 5)  # the start
+    page.mouse.down()
+    page.mouse.move(box["x"] + 3 - box["width"] / 2, box["y"] + 5, steps=4)
+    shown = bar.locator("rect").bounding_box()
+    assert shown["width"] == pytest.approx(1.5 * box["width"], rel=0.02)
+    page.mouse.up()
+    wait_until(lambda: times(page, 1)[0] < 60.0, "not resized with the pointer")
+    start, stop = times(page, 1)
+    assert stop == 75.0 and start == pytest.approx(62.0 - 13.0 / 2, abs=0.3)
+
+
+def test_conflicts_and_refused_changes_are_explained_on_the_planner(planner):
+    page = planner
+    for _ in range(11):  # into the time of the second
+        page.locator('#timeline [data-window="1"]').press("ArrowRight")
+        answered(page)
+    expect(page.locator('#timeline [data-window="1"]')).to_have_class(re.compile("conflict"))
+    expect(page.locator("#selected .conflicts")).to_contain_text("window 2 (second, draft) covers part")
+    path = "/api/v1/windows/2"
+    assert page.request.patch(path, data={"state": "approved"}).ok
+    page.locator('#timeline [data-window="1"]').press("ArrowRight")
+    expect(page.locator("#selected .conflicts").first).to_contain_text(
+        "window 2 (approved) covers part of the same time"
+    )
+    expect(page.locator("#selected .conflicts").first).to_contain_text("Not changed to 2030-01-01 01:12:00")
+    page.locator("#search").get_by_role("button", name="Search").click()
+    page.locator("#rejected summary").click()
+    expect(page.locator("#rejected tbody tr").first).to_contain_text("too short")
+    expect(page.locator("#timeline .rejected").first).to_be_attached()

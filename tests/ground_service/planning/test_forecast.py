@@ -1,0 +1,172 @@
+"""Forecast of a plan: conditions, resources and conflicts over time; density of craters."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground
+from ground_service.missions.catalogues import add_catalogue
+from ground_service.missions.service import add_mission
+from ground_service.planning import forecast, service
+from ground_service.planning.filling import NS, Option, ResourceGrid, curves
+from ground_service.planning.model import WindowEntry
+from lunar.catalogue import CraterCatalogue, save_catalogue
+from lunar.timescales import parse_utc
+
+START = parse_utc("2029-08-07T06:00:00Z")
+MISSION = """name = "small"
+[spacecraft]
+id = 76
+[camera]
+fov_deg = 120.0
+[resources]
+battery_wh = 20.0
+generation_w = 0.0
+idle_w = 6.0
+observing_w = 60.0
+minimum_battery = 0.5
+storage_mib = 1.0
+downlink_kbit_s = 8.0
+{catalogue}"""
+
+
+def test_curves_fill_and_empty_battery_and_storage() -> None:
+    grid = ResourceGrid(
+        start_utc_ns=0,
+        step_s=3600.0,
+        gain_wh=np.array([1.0, -2.0, -2.0, 5.0]),
+        downlink_octets=np.array([0.0, 30.0, 30.0, 100.0]),
+        battery_wh=10.0,
+        floor_wh=0.0,
+        observing_w=3.0,
+        storage_octets=1000.0,
+    )
+    found = curves(
+        grid, [Option(3600 * NS, 2 * 3600 * NS, 50)]
+    )  # in the second hour; its data are there at its end
+    assert found.battery_wh.tolist() == [10.0, 5.0, 3.0, 8.0]  # full; -2 - 3; -2; +5
+    assert found.stored_octets.tolist() == [0.0, 0.0, 50.0, 0.0]
+    assert found.sent_octets.tolist() == [0.0, 0.0, 0.0, 50.0]
+    empty = curves(grid, [Option(3600 * NS, 3 * 3600 * NS, 0), Option(3600 * NS, 3 * 3600 * NS, 0)])
+    assert empty.battery_wh.tolist() == [10.0, 2.0, 0.0, 5.0]  # not below empty
+
+
+@pytest.fixture
+def planned(ground: Ground, synthetic_pass: Any) -> Ground:
+    """A service with an ephemeris of half an hour and a mission of small resources."""
+    add_mission(ground, MISSION.format(catalogue="").encode(), actor="ann")
+    stored = ground.files.put_file(synthetic_pass.folder / "reference.oem")
+    add_ephemeris(ground, stored, name="reference", precedence=0, actor="ann")
+    return ground
+
+
+def enter(ground: Ground, start_s: float, stop_s: float) -> int:
+    start, stop = (START + round(one * NS) for one in (start_s, stop_s))
+    return service.add_window(ground, WindowEntry("w", start, stop, 15.0, 76), actor="ann").id
+
+
+def shown(ground: Ground, start_s: float = 0.0, stop_s: float = 600.0) -> Any:
+    start, stop = (START + round(one * NS) for one in (start_s, stop_s))
+    return forecast.get_forecast(
+        ground, spacecraft_id=76, instance="flight", start_utc_ns=start, stop_utc_ns=stop
+    )
+
+
+def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the_mission(
+    planned: Ground,
+) -> None:
+    found = shown(planned)
+    assert found.step_s == 60.0 and len(found.time_s) == 10
+    assert found.time_s[0] == START / NS + 30.0
+    for name in (
+        "latitude_deg",
+        "sunlit",
+        "battery_share",
+        "stored_octets",
+        "sent_octets",
+        "downlink_octets",
+    ):
+        assert len(getattr(found, name)) == 10
+    assert found.altitude_km == pytest.approx([30.0] * 10, abs=0.1)
+    assert found.battery_floor == 0.5 and found.storage_octets == 1 << 20
+    # 6 W of 20 Wh from where the ephemeris begins, ten minutes before.
+    hours = (10 + np.arange(1, 11)) / 60.0
+    assert found.battery_share == pytest.approx((1.0 - 6.0 * hours / 20.0).tolist(), abs=2e-3)
+    assert found.conflicts == [] and found.reason is None
+
+
+def test_conflicts_of_drafts_are_explained(planned: Ground) -> None:
+    first, second = enter(planned, 0, 60), enter(planned, 30, 120)
+    both = {one.window_id: one.reasons for one in shown(planned).conflicts}
+    assert both == {
+        first: [f"window {second} (w, draft) covers part of the same time"],
+        second: [f"window {first} (w, draft) covers part of the same time"],
+    }
+    long = enter(planned, 120, 600)  # 9 Wh with the first, and 2 Wh of idle load: 9 of 20 Wh are left
+    reasons = {one.window_id: one.reasons for one in shown(planned).conflicts}[long]
+    assert len(reasons) == 1 and reasons[0].startswith("the battery would fall to 4")
+    assert reasons[0].endswith(" %, expected 50 % or more")
+
+
+def test_windows_lower_the_battery_and_fill_the_storage(planned: Ground) -> None:
+    before = shown(planned)
+    octets = service.get_window(planned, enter(planned, 60, 180)).data_octets
+    after = shown(planned)
+    drop = np.array(before.battery_share) - np.array(after.battery_share)
+    assert drop.tolist() == pytest.approx([0.0, 0.05] + [0.1] * 8, abs=2e-3)  # 60 W for two minutes of 20 Wh
+    assert after.stored_octets[2] == 0 and after.stored_octets[3] == octets
+    assert sum(after.sent_octets) <= octets
+
+
+def test_an_interval_without_an_ephemeris_states_the_reason(planned: Ground) -> None:
+    later = shown(planned, 86_400.0, 90_000.0)
+    assert later.time_s == [] and later.reason == "no reference ephemeris covers the interval"
+    partly = shown(planned, 0.0, 86_400.0)
+    assert 0 < len(partly.time_s) < 86_400 / 60 and "ephemeris reference covers" in (partly.reason or "")
+
+
+@pytest.mark.parametrize("stop_s", [0.0, -5.0, 8.1 * 86_400])
+def test_an_empty_or_too_long_interval_is_an_error(planned: Ground, stop_s: float) -> None:
+    with pytest.raises(InvalidInput, match="at most 8 days"):
+        shown(planned, 0.0, stop_s)
+
+
+def test_craters_are_counted_by_area(ground: Ground, tmp_path: Path) -> None:
+    degrees = np.array([[1.0, 1.0, 6.0], [5.0, 9.0, 8.0], [85.0, -5.0, 7.0], [5.0, 5.0, 60.0]])
+    ids, radians = np.arange(4), np.radians(degrees[:, :2])
+    catalogue = CraterCatalogue(
+        ids=ids,
+        latitude_rad=radians[:, 0],
+        longitude_rad=radians[:, 1],
+        diameter_m=1e3 * degrees[:, 2],
+        rim_height_m=np.zeros(4),
+        depth_m=np.full(4, np.nan),
+        complete=np.ones(4, dtype=np.bool_),
+        source="four",
+    )
+    save_catalogue(catalogue, tmp_path / "four.csv")
+    stored = ground.files.put_file(tmp_path / "four.csv")
+    add_catalogue(ground, stored, "four.csv")
+    text = MISSION.format(catalogue=f'[catalogue]\nsource = "four"\nsha256 = "{stored.sha256}"\n')
+    add_mission(ground, text.encode(), actor="ann")
+    found = forecast.crater_density(ground, 76)
+    assert found.source == "four" and found.reason is None
+    rows = np.array(found.rows)
+    assert rows.shape == (18, 36) and np.count_nonzero(rows) == 2
+    cell_km2 = 1737.4**2 * math.radians(10.0) * math.sin(math.radians(10.0))
+    assert rows[9, 18] == pytest.approx(2 / cell_km2 * 1e4, abs=0.01)  # the crater of 60 km does not count
+    assert rows[17, 17] > rows[9, 18] / 2  # one crater in a smaller cell
+
+
+def test_a_density_without_a_catalogue_states_the_reason(planned: Ground) -> None:
+    found = forecast.crater_density(planned, 76)
+    assert found.rows == [] and "catalogue" in (found.reason or "")
+    unknown = forecast.crater_density(planned, 5).reason
+    assert unknown == "no mission description is in force, and there is no public catalogue"
