@@ -1,0 +1,200 @@
+"""Load of many users during a downlink: python -m benchmarks.load [--seconds 600] [--users 50] [--rate 500].
+
+PostgreSQL, Redis, one API process and two workers. Every second, `rate` packets are uploaded; each user makes one read
+every two seconds. After each minute the same packets come as those of another instance of the spacecraft, so that all
+are new. Latencies count from the moment at which a read is due, so that a held-up read is not hidden. The memory of
+every process is read every ten seconds; `mib_per_h` is the slope of a straight line after the first quarter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import json
+import os
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from benchmarks._ground_service import READS
+from benchmarks.campaigns._deployment import Deployment, descendants
+from benchmarks.ground import START, STEP_NS, mixed_downlink
+from ground_service.access.service import add_user
+from ground_service.ground import open_ground
+from lunar.timescales import format_utc
+
+ROUND_S = 60
+EACH_USER_S = 2.0
+MEMORY_S = 10.0
+WARM_UP_S = 5.0
+
+
+def resident_mib(pid: int) -> float:
+    """Return the proportional resident memory of a process and its descendants, MiB."""
+    octets = 0
+    for one in (pid, *descendants(pid)):
+        try:
+            text = Path(f"/proc/{one}/smaps_rollup").read_text()
+        except OSError:
+            continue
+        octets += int(next(line for line in text.splitlines() if line.startswith("Pss:")).split()[1]) << 10
+    return octets / 2**20
+
+
+def processor_s(pid: int) -> float:
+    """Return the processor time of a process and its descendants so far, s."""
+    ticks = 0
+    for one in (pid, *descendants(pid)):
+        try:
+            fields = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+class Run:
+    """One run of the load."""
+
+    def __init__(self, service: Deployment, token: str, users: int, rate: int) -> None:
+        self._service, self._users, self._rate = service, users, rate
+        self._headers = {"Authorization": f"Bearer {token}"}
+        self.times: list[float] = []
+        self.by_path: dict[str, list[float]] = {path: [] for path in READS}
+        self.errors: Counter[str] = Counter()
+        self.memory: dict[str, list[tuple[float, float]]] = {name: [] for name in service.parts}
+        self.uploads = 0
+        self.last_job: str | None = None
+        whole = mixed_downlink(rate * ROUND_S)
+        cuts = np.linspace(0, len(whole), ROUND_S + 1).astype(int)
+        self._pieces = [whole[a:b] for a, b in itertools.pairwise(cuts)]
+
+    async def go(self, seconds: float) -> None:
+        """Run the load."""
+        limits = httpx.Limits(max_connections=self._users + 4, max_keepalive_connections=self._users + 4)
+        async with httpx.AsyncClient(
+            base_url=f"{self._service.api}/api/v1", timeout=60.0, limits=limits, headers=self._headers
+        ) as client:
+            for path in READS:
+                await client.get(path)
+            begin = time.perf_counter() + WARM_UP_S
+            users = [self._user(client, begin, number, seconds) for number in range(self._users)]
+            await asyncio.gather(self._upload(client, begin, seconds), self._watch(begin, seconds), *users)
+
+    async def _user(self, client: httpx.AsyncClient, begin: float, number: int, seconds: float) -> None:
+        turn = 0
+        while (due := begin + EACH_USER_S * (turn + number / self._users)) < begin + seconds:
+            await asyncio.sleep(max(due - time.perf_counter(), 0.0))
+            path = READS[(turn + number) % len(READS)]
+            try:
+                answer = await client.get(path)
+                if answer.status_code != 200:
+                    self.errors[f"{answer.status_code} {path}"] += 1
+            except httpx.HTTPError as error:
+                self.errors[f"{type(error).__name__} {path}"] += 1
+            took = time.perf_counter() - due
+            self.times.append(took)
+            self.by_path[path].append(took)
+            turn += 1
+
+    async def _upload(self, client: httpx.AsyncClient, begin: float, seconds: float) -> None:
+        for second in range(int(seconds)):
+            await asyncio.sleep(max(begin + second - time.perf_counter(), 0.0))
+            path = f"/telemetry?spacecraft_id=76&instance=round-{second // ROUND_S}"
+            if second < ROUND_S:
+                path = "/telemetry?spacecraft_id=76"
+            answer = await client.post(path, content=self._pieces[second % ROUND_S])
+            if answer.status_code != 202:
+                self.errors[f"{answer.status_code} POST /telemetry"] += 1
+                continue
+            self.uploads += 1
+            self.last_job = answer.json()["job_id"]
+
+    async def _watch(self, begin: float, seconds: float) -> None:
+        while (now := time.perf_counter()) < begin + seconds:
+            for name, part in self._service.parts.items():
+                self.memory[name].append((now - begin, resident_mib(part.pid)))
+            await asyncio.sleep(MEMORY_S)
+
+
+def memory_figures(samples: list[tuple[float, float]]) -> dict[str, float]:
+    """Return the first and last memory of a process, its maximum, and its growth after the first quarter."""
+    at, mib = np.array(samples).T
+    late = at > at[-1] / 4
+    slope = float(np.polyfit(at[late], mib[late], 1)[0]) * 3600.0 if late.sum() > 2 else float("nan")
+    return {
+        "first_mib": round(float(mib[0]), 1),
+        "last_mib": round(float(mib[-1]), 1),
+        "max_mib": round(float(mib.max()), 1),
+        "mib_per_h": round(slope, 1),
+    }
+
+
+def measure(folder: Path, seconds: float, users: int, rate: int) -> dict[str, Any]:
+    """Run the load on a new deployment; return the figures."""
+    service = Deployment(folder, 1)
+    try:
+        with open_ground(service.home, database_url=service.url) as ground:
+            token = add_user(ground, "ann", "operator")
+        # One user: the limit of requests a second of a caller is off in this deployment.
+        run = Run(service, token, users, rate)
+        stop = format_utc(START + rate * ROUND_S * STEP_NS // 4)
+        definition = {"name": "all", "start": format_utc(START), "stop": stop, "spacecraft_id": 76}
+        with httpx.Client(base_url=f"{service.api}/api/v1", headers=run._headers, timeout=60.0) as client:
+            client.post("/telemetry?spacecraft_id=76", content=run._pieces[0]).raise_for_status()
+            client.post("/passes", json=definition).raise_for_status()
+            spent = {name: processor_s(part.pid) for name, part in service.parts.items()}
+            asyncio.run(run.go(seconds))
+            spent = {name: processor_s(service.parts[name].pid) - before for name, before in spent.items()}
+            load = os.getloadavg()
+            began = time.monotonic()
+            while client.get(f"/jobs/{run.last_job}").json()["state"] not in ("done", "failed"):
+                time.sleep(0.2)
+            behind_s = time.monotonic() - began
+            failed = client.get("/jobs?state=failed").json()
+    finally:
+        service.stop()
+    times = np.array(run.times) * 1e3
+    slowest = sorted(run.by_path, key=lambda path: -float(np.percentile(run.by_path[path] or [0.0], 95)))[:3]
+    return {
+        "seconds": seconds,
+        "users": users,
+        "packets_per_s": rate,
+        "uploads": run.uploads,
+        "reads": len(times),
+        "errors": dict(run.errors),
+        "failed_jobs": len(failed.get("items", [])),
+        "p50_ms": round(float(np.percentile(times, 50)), 1),
+        "p95_ms": round(float(np.percentile(times, 95)), 1),
+        "p99_ms": round(float(np.percentile(times, 99)), 1),
+        "slowest_p95_ms": {
+            path: round(float(np.percentile(run.by_path[path], 95)) * 1e3, 1) for path in slowest
+        },
+        "ingest_behind_at_end_s": round(behind_s, 1),
+        "cores_busy": {name: round(one / seconds, 3) for name, one in spent.items()},
+        "memory": {name: memory_figures(samples) for name, samples in run.memory.items()},
+        "load_average": [round(one, 1) for one in load],
+    }
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--users", type=int, default=50)
+    parser.add_argument("--rate", type=int, default=500, help="packets per second")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        figures = measure(Path(name), given.seconds, given.users, given.rate)
+    print(json.dumps({"load": figures}, indent=1))
+    return 1 if figures["errors"] or figures["failed_jobs"] else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

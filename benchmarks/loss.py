@@ -1,0 +1,199 @@
+"""Loss of one process under ingest load: python -m benchmarks.loss [--only NAME ...].
+
+Two API processes, two workers, a scheduler, Redis and a pair of PostgreSQL servers with automatic failover. Two clients
+upload pieces of a downlink. One part after another is killed (SIGKILL). A supervisor starts ended processes again after
+a second, as the restart policy of the compose file does, but not the lost host of the primary. No person acts. For each
+loss:
+
+- `uploads_s`: longest time without an acknowledged upload after the kill;
+- `jobs_s`: time from the kill until a job that was accepted after it is done;
+- `complete_s`: time until every process runs again, with a scheduler and, but for a lost host, a standby.
+
+At the end every acknowledged job must be done and no packet may be missing or doubled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import random
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.campaigns._clients import Session, cut_pieces
+from benchmarks.campaigns._deployment import Deployment, runs, wait_until
+from benchmarks.campaigns._failover import DatabaseCluster
+from benchmarks.campaigns.kill import contents, ends_of
+from benchmarks.ground import mixed_downlink
+from ground_service.access.service import add_user
+from ground_service.errors import GroundError
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.worker.scheduler import has_scheduler
+
+PARTS = ("api 1", "worker 1", "scheduler 1", "broker")
+SERVER, HOST = "database server", "database host"
+LIMIT_S = 60.0
+"""Requirement: recovery without a person."""
+
+PACKETS = 2_000
+PIECES = 60
+PAUSE_S = 1.0
+
+
+class Supervisor(threading.Thread):
+    """Starts ended processes again after about a second, until stopped."""
+
+    def __init__(self, service: Deployment) -> None:
+        super().__init__(daemon=True)
+        self._service = service
+        self.over = threading.Event()
+
+    def run(self) -> None:
+        while not self.over.wait(1.0):
+            for part in list(self._service.parts.values()):
+                part.revive()
+
+
+class Uploads:
+    """Clients that upload pieces and repeat what was not acknowledged, with the same key."""
+
+    def __init__(self, session: Session, stream: bytes) -> None:
+        self.acknowledged: list[tuple[float, float, str]] = []
+        self.over = threading.Event()
+        self._session = session
+        self._pieces = cut_pieces(stream, PIECES, random.Random(1), "piece")
+        self.threads = [
+            threading.Thread(target=self._run, args=(number,), daemon=True) for number in range(2)
+        ]
+
+    def _run(self, number: int) -> None:
+        for turn in itertools.count():
+            if self.over.wait(PAUSE_S):
+                return
+            piece = self._pieces[(2 * turn + number) % PIECES]
+            asked = time.monotonic()
+            key = f"{number} {turn}"
+            answer = self._session.ask("POST", "/telemetry?spacecraft_id=76", piece.octets, key)
+            if answer.status != 202:
+                raise SystemExit(f"POST /telemetry: {answer.status} {answer.body[:300]!r}")
+            self.acknowledged.append((asked, time.monotonic(), answer.json()["job_id"]))
+
+
+def loss_of(
+    name: str, service: Deployment, cluster: DatabaseCluster, uploads: Uploads, ground: Ground
+) -> dict[str, Any]:
+    """Kill a part and measure the recovery."""
+    session = Session(service.apis, uploads._session.token)
+    primary = cluster.primary()
+    if primary is None:
+        raise SystemExit(f"{name}: expected a primary before the kill, found none")
+    before = {part: service.parts[part].pid for part in service.parts}
+    killed = time.monotonic()
+    if name == SERVER:
+        cluster.members[primary].kill_server()
+    elif name == HOST:
+        cluster.members[primary].kill()
+    else:
+        service.parts[name].kill()
+
+    def first_after() -> tuple[float, float, str] | None:
+        return next((one for one in list(uploads.acknowledged) if one[0] > killed), None)
+
+    wait_until(lambda: first_after() is not None, f"upload after the loss of {name}")
+    accepted = first_after()
+    assert accepted is not None
+    wait_until(
+        lambda: session.get(f"/jobs/{accepted[2]}")["state"] == "done", f"job after the loss of {name}", 300.0
+    )
+    jobs_s = time.monotonic() - killed
+
+    def complete() -> bool:
+        if name in service.parts and service.parts[name].pid == before[name]:
+            return False
+        try:
+            scheduled = has_scheduler(ground)
+        except GroundError:
+            return False
+        redundant = cluster.primary() not in (None, primary) if name == HOST else cluster.is_redundant()
+        return scheduled and redundant and all(runs(part.pid) for part in service.parts.values())
+
+    wait_until(complete, f"complete service after the loss of {name}", 300.0)
+    complete_s = time.monotonic() - killed
+    times = [at for _, at, _ in list(uploads.acknowledged) if at > killed]
+    uploads_s = max(later - earlier for earlier, later in itertools.pairwise([killed, *times]))
+    if name == HOST:
+        cluster.members[primary].part.start()
+        wait_until(cluster.is_redundant, "standby on the former primary", 300.0)
+    return {
+        "lost": name,
+        "uploads_s": round(uploads_s, 1),
+        "jobs_s": round(jobs_s, 1),
+        "complete_s": round(complete_s, 1),
+    }
+
+
+def losses(folder: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    """Lose one part after another; return the figures."""
+    stream = mixed_downlink(PACKETS)
+    (folder / "whole.cadu").write_bytes(stream)
+    with open_ground(folder / "reference") as ground:
+        ingest_file(ground, folder / "whole.cadu")
+        expected, packets = contents(ground)
+    with DatabaseCluster(folder) as cluster:
+        service = Deployment(folder, 2, cluster=cluster, schedulers=1)
+        supervisor = Supervisor(service)
+        try:
+            with open_ground(service.home, database_url=service.url) as ground:
+                session = Session(service.apis, add_user(ground, "ann", "operator"))
+                uploads = Uploads(session, stream)
+                ready: Callable[[], bool] = lambda: has_scheduler(ground)  # noqa: E731
+                wait_until(ready, "scheduler")
+                supervisor.start()
+                for thread in uploads.threads:
+                    thread.start()
+                wait_until(lambda: len(uploads.acknowledged) >= 5, "first uploads")
+                rows = [loss_of(name, service, cluster, uploads, ground) for name in names]
+                wait_until(lambda: len(uploads.acknowledged) > 2 * PIECES, "all pieces", 300.0)
+                uploads.over.set()
+                for thread in uploads.threads:
+                    thread.join()
+                states, attempts = ends_of(session, [job for _, _, job in uploads.acknowledged])
+                found, stored = contents(ground)
+        finally:
+            supervisor.over.set()
+            service.stop()
+    return {
+        "losses": rows,
+        "acknowledged": len(uploads.acknowledged),
+        "jobs": dict(states),
+        "attempts": attempts,
+        "packets_lost": len(set(packets) - set(stored)),
+        "packets_doubled": len(stored) - len(set(stored)),
+        "archive_identical": found == expected,
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def main() -> int:
+    """Measure and print; 1 if something was lost or the recovery took longer than required."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    every = (*PARTS, SERVER, HOST)
+    parser.add_argument("--only", choices=every, nargs="+", default=every, help="parts to lose")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        figures = losses(Path(name), tuple(given.only))
+    print(json.dumps({"loss": figures}, indent=1))
+    slowest = max(max(row["uploads_s"], row["jobs_s"]) for row in figures["losses"])
+    kept = figures["archive_identical"] and set(figures["jobs"]) == {"done"}
+    return 0 if kept and slowest <= LIMIT_S else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
