@@ -84,9 +84,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             redis_url=broker if is_redis(broker) else None,
         )
         sockets = asyncio.create_task(app.state.sockets.run())
-        scheduler = Scheduler(
-            ground, app.state.dispatcher, app.state.follow_up.drain, settings.retention_days
-        )
+        scheduler = Scheduler(ground, app.state.dispatcher, app.state.follow_up.drain, settings.kept)
         scheduler.start()
         try:
             yield

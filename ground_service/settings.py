@@ -158,6 +158,16 @@ class Settings(BaseSettings):
     retention_days: int = Field(
         default=90, ge=1, description="Days for which the feed and finished jobs are kept"
     )
+    archive_days: int = Field(
+        default=0,
+        ge=0,
+        description="Days after their last use for which regression archives are kept; 0: for good",
+    )
+    archive_limit_mib: int = Field(
+        default=0,
+        ge=0,
+        description="Size of the kept regression archives in MiB, pinned ones included; 0: any",
+    )
     runner_exchange: Path | None = Field(
         default=None,
         description="Folder shared with a runner (`linna runner`) that runs payload builds; "
@@ -223,6 +233,15 @@ class Settings(BaseSettings):
             if role not in ("viewer", "operator", "admin") or not mark or not word:
                 raise ValueError(f"expected viewer=, operator= or admin= and a value, found {entry!r}")
         return value
+
+    @property
+    def kept(self) -> dict[str, int]:
+        """Arguments of the nightly job: for how long, or up to which size, data are kept."""
+        return {
+            "retention_days": self.retention_days,
+            "archive_days": self.archive_days,
+            "archive_limit_mib": self.archive_limit_mib,
+        }
 
     def resolved_database_url(self) -> str:
         """The SQLAlchemy URL in force."""

@@ -594,6 +594,8 @@ def _detector(
             reason = _refusal(inputs)
         missing["detector"] = missing["craters"] = reason
         return None, (), (), None
+    if "camera sizes" in inputs.refused:
+        remarks.append(inputs.refused["camera sizes"])
     track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
     viewing = inputs.viewing
     rotations = viewing.camera_from_mcmf(detections.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)

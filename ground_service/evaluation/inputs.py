@@ -25,7 +25,7 @@ from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground
-from ground_service.missions.frames import DeclaredFrames, camera_of, declared_frames
+from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
@@ -296,6 +296,8 @@ def _refused(declared: DeclaredFrames, camera: Camera) -> dict[str, str]:
             f"the mission description does not state the {' and '.join(words[name] for name in missing)} of the "
             "camera: a nadir camera without distortion is assumed for frames without attitude"
         )
+    if assumed := assumed_camera(camera):
+        refused["camera sizes"] = assumed
     return refused
 
 

@@ -15,7 +15,7 @@ from ground_service.errors import GroundError, InvalidInput
 from ground_service.evaluation.inputs import reference_of
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of
-from ground_service.missions.frames import camera_of, declared_frames
+from ground_service.missions.frames import assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Mission
 from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
@@ -56,6 +56,8 @@ def align_pass(ground: Ground, pass_id: int) -> dict[str, Any]:
         missing["correlation"] = "no time correlation: the on-board clock is taken as ideal"
     if not record.manifest.get("start_state"):
         missing["start_state"] = "no start state was uploaded"
+    if assumed := assumed_camera(mission.camera):
+        missing["camera"] = assumed
     sha256 = record.catalogue_sha256
     if sha256 is None and record.archive_digest is None and reference is not None:
         try:

@@ -18,6 +18,7 @@ from ground_service.evaluation.conditions import conditions_of
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.model import ChangedFigure, StoredReport
+from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.surface import surface_map
 from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
@@ -149,6 +150,7 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
     if previous is None:
         return None
     if not made:
+        align_pass(ground, pass_id)  # late data can be what its catalogue was missing
         from reports.render import to_json
 
         report = evaluate(ground, pass_id, created_utc=format_utc(previous.created_utc_ns))

@@ -69,6 +69,22 @@ def camera_of(camera: Camera) -> PinholeCamera:
     return BrownCamera(*sizes, *lens) if any(lens) else PinholeCamera(*sizes)
 
 
+def assumed_camera(camera: Camera) -> str:
+    """Return which sizes of the camera are assumed because they are not stated; empty without any."""
+    default = PinholeCamera()
+    assumed = {
+        "image width": (camera.width_px, f"{default.width_px} px"),
+        "image height": (camera.height_px, f"{default.height_px} px"),
+        "field of view": (camera.fov_deg, f"{math.degrees(default.fov_rad):g} deg"),
+    }
+    values = [f"{name} ({value})" for name, (stated, value) in assumed.items() if stated is None]
+    if not values:
+        return ""
+    return (
+        f"the mission description does not state sizes of the camera, which are assumed: {', '.join(values)}"
+    )
+
+
 def _reason(what: str, declared: str | None, key: str) -> str:
     if declared is None:
         return f"the mission description does not state the {what} ({key})"

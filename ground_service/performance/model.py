@@ -75,7 +75,7 @@ class Performance(Entity):
     """Performance of a spacecraft over many passes."""
 
     spacecraft_id: int
-    instance: str | None = Field(description="null: all instances, imported passes included")
+    instance: str | None = Field(description="null: all imported passes")
     window_days: float
     false_alarm_rate: float = Field(
         description="Probability that a constant level gives any change point", examples=[0.01]

@@ -29,7 +29,8 @@ def get_performance(
     _: Viewer,
     spacecraft_id: Spacecraft,
     instance: Annotated[
-        InstanceName | None, Query(description="Default: all, imported passes included")
+        InstanceName | None,
+        Query(description="Default: the flown one if it has passes, otherwise all imported passes"),
     ] = None,
     start: GivenTime | None = None,
     stop: GivenTime | None = None,

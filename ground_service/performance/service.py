@@ -68,7 +68,7 @@ def performance(
     Parameters
     ----------
     instance
-        Instance of the spacecraft; None: all, imported passes included.
+        Instance of the spacecraft; None: the flown one if it has passes, otherwise all imported passes.
     window_days
         Length of the rolling window of the requirements.
 
@@ -78,6 +78,8 @@ def performance(
         There are too many passes in the span.
     """
     with ground.database.reading() as connection:
+        if instance is None and spacecraft_id in store.spacecraft_with_passes(connection, FLOWN):
+            instance = FLOWN
         stored, total = store.reported_passes(connection, spacecraft_id, instance, start_utc_ns, stop_utc_ns)
     found = [(record, report, PassFigures.model_validate(report.summary)) for record, report in stored]
     passes = [_pass_performance(*one) for one in found]

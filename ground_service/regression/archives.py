@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound, StoreError, storage_error
 from ground_service.ground import Ground
@@ -362,16 +363,31 @@ def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
         store.pin_archive(connection, digest, pinned)
 
 
-def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
-    """Remove archives that are not pinned and were not used for so long; the identities of those removed.
+def let_go(
+    ground: Ground, *, unused_for_ns: int | None, limit_octets: int | None = None, actor: str = "service"
+) -> list[str]:
+    """Remove archives that are not pinned; return their identities. Each removal is recorded in the audit log.
 
     Files that another archive holds too stay.
+
+    Parameters
+    ----------
+    unused_for_ns
+        Remove those that were not used for so long; None: none for their age.
+    limit_octets
+        Remove those that were not used for the longest time until the others have this size; None: any size.
     """
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
-        old = store.remove_unused(connection, utc_now_ns() - unused_for_ns)
-    _remove_files(ground, old)
-    return sorted(record.digest for record in old)
+        now = utc_now_ns()
+        removed = [] if unused_for_ns is None else store.remove_unused(connection, now - unused_for_ns)
+        if limit_octets is not None:
+            removed += store.remove_above(connection, limit_octets)
+        for record in removed:
+            detail = {"pass": record.pass_id, "octets": record.octets, "kept_since": str(record.kept_since)}
+            audit(connection, actor, "remove regression archive", record.digest, detail)
+    _remove_files(ground, removed)
+    return sorted(record.digest for record in removed)
 
 
 def _remove_files(ground: Ground, removed: Sequence[ArchiveRecord]) -> None:

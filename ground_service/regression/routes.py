@@ -123,14 +123,14 @@ def change_kept_archive(ground: GroundOf, _: Operator, digest: Digest, given: Ar
 @regressions.delete("/regression-archives")
 def delete_kept_archives(
     ground: GroundOf,
-    _: Operator,
+    caller: Operator,
     unused_days: Annotated[
         float, Query(ge=0.0, le=36_500.0, description="Remove archives unused for this time")
     ],
 ) -> Pruned:
     """Delete kept archives that are not pinned and were not used for a time."""
     unused_for_ns = round(unused_days * 86_400e9)
-    return Pruned(removed=archive_service.let_go(ground, unused_for_ns=unused_for_ns))
+    return Pruned(removed=archive_service.let_go(ground, unused_for_ns=unused_for_ns, actor=caller.name))
 
 
 @regressions.post("/regressions", status_code=202, responses=problems(404))

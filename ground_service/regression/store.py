@@ -174,6 +174,20 @@ def remove_unused(connection: Connection, used_before_utc_ns: int) -> list[Archi
     return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
 
 
+def remove_above(connection: Connection, limit_octets: int) -> list[ArchiveRecord]:
+    """Delete archives that are not pinned, the longest unused first, down to a total size; return them."""
+    columns = (ARCHIVES.c.digest, ARCHIVES.c.octets, ARCHIVES.c.pinned)
+    kept = connection.execute(select(*columns).order_by(ARCHIVES.c.used_utc_ns, ARCHIVES.c.digest)).all()
+    excess = sum(octets for _, octets, _ in kept) - limit_octets
+    chosen = []
+    for digest, octets, pinned in kept:
+        if excess > 0 and not pinned:
+            chosen.append(digest)
+            excess -= octets
+    query = delete(ARCHIVES).where(ARCHIVES.c.pinned == 0, ARCHIVES.c.digest.in_(chosen))
+    return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
+
+
 def keep_replay(
     connection: Connection,
     archive: str,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding.service import note_timeouts
@@ -44,14 +44,20 @@ class Scheduler:
     ----------
     drain
         Function that handles events that other processes have left.
+    kept
+        Arguments of the nightly job: for how long what is kept (`upkeep.nightly`).
     """
 
     def __init__(
-        self, ground: Ground, dispatcher: Dispatcher, drain: Callable[[], object], retention_days: int
+        self,
+        ground: Ground,
+        dispatcher: Dispatcher,
+        drain: Callable[[], object],
+        kept: Mapping[str, int],
     ) -> None:
         self.owner = process_name()
         self._ground, self._dispatcher, self._drain = ground, dispatcher, drain
-        self._retention_days = retention_days
+        self._kept = dict(kept)
         self._catch_up_s = time.monotonic() + CATCH_UP_S
         self._plan: str | None = None
         self._night: str | None = None
@@ -133,8 +139,7 @@ class Scheduler:
         late = time.monotonic() < self._catch_up_s and now % DAY_NS > NIGHT_NS + LEASE_NS
         if now % DAY_NS < NIGHT_NS or identity == self._night or late:
             return
-        arguments = {"retention_days": self._retention_days}
-        self._dispatcher.submit("nightly", arguments, job_id=identity)
+        self._dispatcher.submit("nightly", self._kept, job_id=identity)
         self._night = identity
 
     def _release(self) -> None:

@@ -2,7 +2,8 @@
 
 The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
 (the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`, tokens of
-expired browser sessions at once.
+expired browser sessions at once. Regression archives go by their age since the last use and by their total size, if the
+settings say so; the audit log has a record of each.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
 from ground_service.performance.service import make_due_reports
-from ground_service.regression.archives import remove_unfinished
+from ground_service.regression.archives import let_go, remove_unfinished
 from ground_service.store import events
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
@@ -46,6 +47,9 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     The removal is first, so that a failure of the rest does not make the archive grow.
     """
     removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
+    removed["archives"] = remove_archives(
+        ground, int(arguments.get("archive_days", 0)), int(arguments.get("archive_limit_mib", 0))
+    )
     with ground.database.reading() as connection:
         vehicles = all_vehicles(connection)
     found: list[dict[str, Any]] = []
@@ -71,6 +75,16 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
         "monthly_reports_failed": failed,
         "removed": removed,
     }
+
+
+def remove_archives(ground: Ground, days: int, limit_mib: int) -> int:
+    """Remove the regression archives above an age or a total size, 0: none; return their number."""
+    removed = let_go(
+        ground,
+        unused_for_ns=days * DAY_NS if days else None,
+        limit_octets=limit_mib << 20 if limit_mib else None,
+    )
+    return len(removed)
 
 
 def broken_limits(ground: Ground, vehicle: int) -> list[dict[str, Any]]:

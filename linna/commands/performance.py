@@ -22,7 +22,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "show", help="show recall, drift and error by condition, changes of level, and requirements"
     )
     _spacecraft(show)
-    show.add_argument("--instance", metavar="NAME", help="instance (default: all, imported passes included)")
+    show.add_argument(
+        "--instance",
+        metavar="NAME",
+        help="instance (default: the flown one if it has passes, otherwise all imported passes)",
+    )
     show.add_argument("--start", metavar="UTC", help="only passes from this time")
     show.add_argument("--stop", metavar="UTC", help="only passes before this time")
     show.add_argument(

@@ -134,6 +134,10 @@ def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: Synth
     assert one.altitude_km == conditions["altitude_km"]
     assert one.recall == made.summary["detector"]["recall"] is not None
     assert performance(either, SPACECRAFT, instance="flight").passes == []
+    # Passes of an archive are not mixed with those of the flown spacecraft.
+    flight = add_pass(either, 0)
+    found = performance(either, SPACECRAFT)
+    assert (found.instance, [one.pass_id for one in found.passes]) == ("flight", [flight])
 
 
 def test_passes_are_grouped_and_changes_found(either: Ground) -> None:

@@ -10,10 +10,12 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
+from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.regression.archives import (
@@ -41,6 +43,8 @@ from ground_service.regression.service import (
     keep_regression,
     run_regression,
 )
+from ground_service.settings import Settings
+from ground_service.worker.upkeep import DAY_NS, remove_archives
 from tmtc.crc import append_crc
 from tmtc.dictionary import DICTIONARY
 
@@ -380,6 +384,41 @@ def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(
     assert [one.digest for one in kept_archives(ground)] == [second.digest]
     # Both hold the same gray image: it is still there for the one that stays.
     assert check_out(ground, second.digest, tmp_path / "out").frames == 30
+
+
+def test_archives_go_by_age_and_by_size_with_a_record(passes, ground: Ground) -> None:
+    first, second = (keep_archive(ground, one.folder) for one in passes)
+    octets = {one.digest: one.octets for one in kept_archives(ground)}
+    assert remove_archives(ground, 0, 0) == remove_archives(ground, 1, 1 << 20) == 0
+    assert let_go(ground, unused_for_ns=None, limit_octets=sum(octets.values())) == []
+    # The one that was used before the other goes first, and only as many as need to go.
+    assert let_go(ground, unused_for_ns=None, limit_octets=octets[second.digest], actor="ann") == [
+        first.digest
+    ]
+    pin_archive(ground, second.digest, True)
+    assert let_go(ground, unused_for_ns=None, limit_octets=0) == []
+    pin_archive(ground, second.digest, False)
+    assert let_go(ground, unused_for_ns=None, limit_octets=0) == [second.digest]
+    with local_client(ground, "ann") as client:
+        entries = list(client.list_audit())
+    removals = [one for one in entries if one.action == "remove regression archive"]
+    assert [(one.actor, one.target) for one in removals] == [
+        ("service", second.digest),
+        ("ann", first.digest),
+    ]
+    assert removals[1].detail["octets"] == octets[first.digest]
+
+
+def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINNA_ARCHIVE_DAYS", "400")
+    monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
+    kept = Settings(home=tmp_path).kept
+    assert kept == {"retention_days": 90, "archive_days": 400, "archive_limit_mib": 2000}
+    with pytest.MonkeyPatch.context() as patched:
+        called = MagicMock(return_value=[])
+        patched.setattr("ground_service.worker.upkeep.let_go", called)
+        assert remove_archives(MagicMock(), kept["archive_days"], kept["archive_limit_mib"]) == 0
+    assert called.call_args.kwargs == {"unused_for_ns": 400 * DAY_NS, "limit_octets": 2000 << 20}
 
 
 def test_a_registered_build_is_found_by_the_beginning_of_its_identity(

@@ -16,6 +16,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput, StateConflict, StorageFull
 from ground_service.evaluation import service as evaluation
+from ground_service.evaluation.store import newest_report
 from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, WindowChanged, publish
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
@@ -81,12 +82,18 @@ def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
     return make_pass(frames=FRAMES, seed=9)
 
 
-def prepared(ground: Ground, flown: SyntheticPass, rules: str = "") -> int:
+def deliver_reference(ground: Ground, flown: SyntheticPass) -> None:
+    add_ephemeris(ground, ground.files.put_file(flown.folder / "reference.oem"), name="reference")
+
+
+def prepared(
+    ground: Ground, flown: SyntheticPass, rules: str = "", *, mission: str = MISSION, reference: bool = True
+) -> int:
     """Enter what a ground knows before a pass; return an approved window."""
     held = add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
-    add_mission(ground, (MISSION.format(sha256=held.sha256) + rules).encode())
-    reference = ground.files.put_file(flown.folder / "reference.oem")
-    add_ephemeris(ground, reference, name="reference")
+    add_mission(ground, (mission.format(sha256=held.sha256) + rules).encode())
+    if reference:
+        deliver_reference(ground, flown)
     entry = WindowEntry("live", START, STOP, float(CADENCE_S), SPACECRAFT)
     window = add_window(ground, entry, actor="ann")
     change_window(ground, window.id, actor="bob", changes={}, decision="approved")
@@ -199,6 +206,44 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
     assert get_window(either, window_id).state == "processed"
     end_contact(either, vehicle, STOP + 2 * NS)
     assert len(recorded(either)) == 7
+
+
+def test_a_reference_that_arrives_after_the_report_completes_it(
+    either: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    window_id = prepared(either, flown, reference=False)
+    receive(either, flown.packets, tmp_path)
+    window = get_window(either, window_id)
+    assert window.state == "processed" and window.pass_id is not None
+    reasons = report_of(either, window.pass_id)["not_available"]
+    assert reasons["error"] == "no reference ephemeris covers this pass" and "detector" in reasons
+    deliver_reference(either, flown)
+    report = report_of(either, window.pass_id)
+    assert 0.6 < report["detector"]["micro"]["recall"] < 0.8
+    assert not {"detector", "reference", "error", "baselines"} & set(report["not_available"])
+    assert get_window(either, window_id).state == "processed"
+    with either.database.reading() as connection:
+        newest = newest_report(connection, window.pass_id, other_than="")
+    assert newest is not None and newest.previous_id is not None and newest.event_number is not None
+    assert {one[2] for one in recorded(either)} == {"done"}
+
+
+def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_means(
+    ground: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    before, _, rest = MISSION.partition("[camera]")
+    window_id = prepared(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
+    receive(ground, flown.packets, tmp_path)
+    window = get_window(ground, window_id)
+    assert window.state == "processed" and window.pass_id is not None
+    assert {one[2] for one in recorded(ground)} == {"done"}
+    report = report_of(ground, window.pass_id)
+    said = (
+        "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
+    )
+    assert [one for one in report["remarks"] if one.startswith(said)]
+    aligned = list_actions(ground)[0][-1]
+    assert aligned.result is not None and aligned.result["missing"]["camera"].startswith(said)
 
 
 def test_an_event_that_is_handled_again_acts_once(

@@ -86,7 +86,7 @@ def test_jobs_survive_a_broker_that_is_killed(
         start_broker()
         jobs.append(dispatcher.submit("plan", {}))  # the queue is not empty
         assert queued_jobs(settings) == jobs[-1:]
-        Scheduler(ground, dispatcher, lambda: None, 90).tick()
+        Scheduler(ground, dispatcher, lambda: None, {"retention_days": 90}).tick()
         assert sorted(queued_jobs(settings)) == sorted(jobs)
         environment = {
             **os.environ,

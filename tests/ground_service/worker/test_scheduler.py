@@ -46,7 +46,7 @@ class Recorder:
 
 def make(ground: Ground) -> tuple[Scheduler, Recorder]:
     recorder = Recorder()
-    return Scheduler(ground, recorder, lambda: None, 90), recorder
+    return Scheduler(ground, recorder, lambda: None, {"retention_days": 90}), recorder
 
 
 @pytest.fixture(autouse=True)
@@ -189,7 +189,7 @@ PROCESS = """
                 with open(sys.argv[3], "a") as lines:
                     lines.write(f"{one.owner} {lease['lease_utc_ns']}\\n")
 
-    one = scheduling.Scheduler(ground, Recorder(), lambda: None, 90)
+    one = scheduling.Scheduler(ground, Recorder(), lambda: None, {"retention_days": 90})
     one.run()
 """
 
