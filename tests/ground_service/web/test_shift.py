@@ -196,6 +196,11 @@ class Pictures:
         picture.quantize(128).save(self.folder / f"{name}.png", optimize=True)
 
 
+def dismiss_notices(page: Page) -> None:
+    """Remove the notices, which are not part of a picture."""
+    page.evaluate("document.querySelectorAll('#notices .notice').forEach((one) => one.remove())")
+
+
 @pytest.fixture
 def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
     """The operator's browser; the test fails if a script fails or the console shows an error."""
@@ -238,7 +243,8 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     expect(page.locator("#request-plan")).to_contain_text("the number of windows of its period is planned")
     page.locator("#timeline .window.draft").first.click()
     expect(page.locator("#selected")).to_contain_text("Sun elevation")
-    page.evaluate("document.querySelectorAll('#notices .notice').forEach((one) => one.remove())")
+    expect(page.locator("#timeline .curve")).to_have_count(3)
+    dismiss_notices(page)
     pictures.take(page, "planner")
 
     # Approve and release.
@@ -279,6 +285,9 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     page.get_by_role("link", name="synthetic pass").click()
     page.get_by_role("button", name="Make a report").click()
     expect(page.locator("#verdict .verdict")).not_to_be_empty()
+    expect(page.locator("#completeness tbody tr").first).to_be_visible()
+    dismiss_notices(page)
+    pictures.take(page, "pass")
     with page.expect_popup() as opened:
         page.get_by_role("link", name="Open report").click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
@@ -296,6 +305,12 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     expect(verdict).to_contain_text("broken")
     expect(verdict.locator(".reasons li").first).to_contain_text("exit")
     pictures.take(page, "regression")
+
+    # The state of everything at a glance.
+    page.goto("/")
+    expect(page.locator("#alarms tbody tr, #alarms .hint").first).to_be_visible()
+    expect(page.locator("#feed-light")).to_have_class("light on")
+    pictures.take(page, "overview")
 
     # Sign out: the next request needs a sign-in.
     page.locator("#caller").click()
