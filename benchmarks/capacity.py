@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from sqlalchemy import text
 
-from benchmarks.campaigns._deployment import PostgresServer
 from ground_service.evaluation.service import make_report
 from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
@@ -31,6 +30,7 @@ from ground_service.store.database import prepare_database
 from lunar.datafolder import find_data
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.scenario import load_scenario
+from studies.mission_run.parts import PostgresServer
 
 DAY_S = 86_400.0
 YEAR_DAYS = 365.25

@@ -27,7 +27,6 @@ from unittest.mock import patch
 import numpy as np
 from sqlalchemy import text
 
-from benchmarks.campaigns._deployment import PostgresServer
 from benchmarks.ground import mixed_downlink
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest import edge_store as edges
@@ -37,6 +36,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.ingest.stream import Link, reaches_of
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
+from studies.mission_run.parts import PostgresServer
 from tmtc.arrays import as_octets
 
 SPACECRAFT = 76

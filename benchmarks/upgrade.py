@@ -32,21 +32,13 @@ from typing import Any
 import httpx
 
 from benchmarks.campaigns._clients import Session, cut_pieces
-from benchmarks.campaigns._deployment import (
-    SERVICE_ROLE,
-    Deployment,
-    Part,
-    PostgresServer,
-    bare_environment,
-    free_port,
-    listens,
-    wait_until,
-)
+from benchmarks.campaigns._deployment import wait_until
 from benchmarks.campaigns.kill import ends_of
 from benchmarks.ground import mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from ground_service.store.database import known_revisions, schema_revisions
+from studies.mission_run.parts import Part, PostgresServer, bare_environment, free_port, listens
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "linna", "scenarios")
@@ -95,7 +87,7 @@ class Rolling:
         self._ports = {f"api {number}": free_port() for number in (1, 2)}
         self.apis = tuple(f"http://127.0.0.1:{port}" for port in self._ports.values())
         self.home = folder / "home"
-        self.service_url = self.database.url.replace("//linna@", f"//{SERVICE_ROLE}@")
+        self.service_url = self.database.prepare_service()
         broker, proxy = free_port(), free_port()
         self.url = f"https://127.0.0.1:{proxy}"
         self._settings = {
@@ -119,7 +111,6 @@ class Rolling:
             str(folder),
         ]
         try:
-            Deployment.prepare(self.database.url)
             self._start("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
             self.ready_s = [self.replace(name, ROOT) for name in self._ports]
             self.replace("worker", ROOT)

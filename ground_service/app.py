@@ -84,7 +84,13 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             redis_url=broker if is_redis(broker) else None,
         )
         sockets = asyncio.create_task(app.state.sockets.run())
-        scheduler = Scheduler(ground, app.state.dispatcher, app.state.follow_up.drain, settings.kept)
+        scheduler = Scheduler(
+            ground,
+            app.state.dispatcher,
+            app.state.follow_up.drain,
+            settings.kept,
+            plan_hourly=settings.plan_hourly,
+        )
         scheduler.start()
         try:
             yield

@@ -132,6 +132,11 @@ class Settings(BaseSettings):
         default=True,
         description="Operate the links of mission descriptions in `linna serve`; false where `linna link run` does",
     )
+    plan_hourly: bool = Field(
+        default=True,
+        description="Bring the plan up to date once an hour of mission time; false: only after events such as the end "
+        "of a contact, so that the plan of a simulated mission does not depend on the speed of the machine",
+    )
     traces: str | None = Field(
         default=None,
         pattern=r"^https?://",

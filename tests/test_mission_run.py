@@ -192,7 +192,7 @@ def test_a_spacecraft_whose_port_was_taken_starts_with_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faults: int, starts: int | None
 ) -> None:
     """Between the choice of a port and its use another process can take it."""
-    files = SpacecraftFiles(*(tmp_path / name for name in "scdol"), tmp_path / "exact")
+    files = SpacecraftFiles(*(tmp_path / name for name in "scdolej"))
     ours, theirs = socket.socketpair()
     started = []
 

@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import os
-import shutil
-import signal
-import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from sqlalchemy import text
-
-from ground_service.store.database import prepare_database
-from ground_service.store.roles import grant_service
+from studies.mission_run.parts import (
+    Part,
+    PostgresServer,
+    RedisServer,
+    bare_environment,
+    free_port,
+    listens,
+)
 
 if TYPE_CHECKING:
     from benchmarks.campaigns._failover import DatabaseCluster
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
@@ -39,123 +31,15 @@ def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> 
     raise SystemExit(f"{what}: not ready within {seconds:.0f} s")
 
 
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
 def connected(port: int) -> bool:
     """Whether somebody is connected to a port of this machine, by what the kernel says."""
     rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     return any(row[1].endswith(f":{port:04X}") and row[3] == "01" for row in rows)
 
 
-class Part:
-    """A process of the deployment that can be killed with all its children and started again."""
-
-    def __init__(self, command: list[str], log: Path, ready: Callable[[], bool], **options: Any) -> None:
-        self._command, self._log, self._ready, self._options = command, log, ready, options
-        self._process: subprocess.Popen[bytes] | None = None
-        self._ended = False
-
-    def start(self) -> None:
-        """Start it, again when it gives up at once (what it was killed with may not be gone yet)."""
-        until = time.monotonic() + 120.0
-        while time.monotonic() < until and not self._ended:
-            with self._log.open("ab") as log:
-                self._process = subprocess.Popen(
-                    self._command, stdout=log, stderr=log, start_new_session=True, **self._options
-                )
-            while time.monotonic() < until and self._process.poll() is None:
-                if self._ready():
-                    return
-                time.sleep(0.1)
-            time.sleep(0.5)
-        if self._ended:
-            return
-        raise SystemExit(f"{' '.join(self._command[:4])}: did not start; {self._log.read_text()[-500:]}")
-
-    def revive(self) -> None:
-        """Start it where it has ended by itself, as a supervisor would."""
-        if not self._ended and self._process is not None and self._process.poll() is not None:
-            self.start()
-
-    @property
-    def pid(self) -> int:
-        """Its process."""
-        assert self._process is not None
-        return self._process.pid
-
-    def kill_child(self, module: str) -> bool:
-        """Kill the child process that runs this module, which its parent restarts; return whether there was one."""
-        for pid in descendants(self.pid):
-            with contextlib.suppress(OSError):
-                if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
-                    os.kill(pid, signal.SIGKILL)
-                    return True
-        return False
-
-    def end(self) -> None:
-        """Kill it for good: it is not started again."""
-        self._ended = True
-        if self._process is not None:
-            self.kill()
-
-    def finish(self, seconds: float = 120.0) -> None:
-        """Ask it to end (SIGTERM), as a supervisor would, and wait until it has."""
-        assert self._process is not None
-        self._process.terminate()
-        self._process.wait(seconds)
-
-    def kill(self) -> None:
-        assert self._process is not None
-        if self._process.poll() is not None:
-            return  # its number may be somebody else's by now
-        family = [self._process.pid, *descendants(self._process.pid)]
-        for pid in family:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        self._process.wait()
-        until = time.monotonic() + 10.0
-        while any(runs(pid) for pid in family) and time.monotonic() < until:
-            time.sleep(0.05)
-
-
-def bare_environment(**settings: str) -> dict[str, str]:
-    """The environment with these settings of the service and none that it had before."""
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith("LINNA_") or name == "LINNA_DATA"
-    }
-    return {**kept, **settings}
-
-
 def service_environment(**settings: str) -> dict[str, str]:
     """Return the environment of a service whose role owns the database."""
     return bare_environment(LINNA_ALLOW_DATABASE_OWNER="true", **settings)
-
-
-def runs(pid: int) -> bool:
-    """Return whether a process exists and is not a zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
-
-
-def descendants(pid: int) -> list[int]:
-    """Processes below another, by what the kernel says."""
-    found: list[int] = []
-    for entry in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = entry.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[1]) == pid:
-            child = int(entry.parent.name)
-            found += [child, *descendants(child)]
-    return found
 
 
 class Laptop:
@@ -177,70 +61,6 @@ class Laptop:
             part.end()
 
 
-class PostgresServer:
-    """A PostgreSQL server on a private port, with an empty database and its files under `folder`."""
-
-    def __init__(self, folder: Path) -> None:
-        found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
-        if not found:
-            raise SystemExit("expected PostgreSQL on this machine, found none under /usr/lib/postgresql")
-        self._bin = found[-1].parent
-        user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
-        place = folder / "postgres"
-        place.mkdir()
-        if user:
-            folder.chmod(0o755)
-            shutil.chown(place, "postgres", "postgres")
-        self._port = free_port()
-        self.url = f"postgresql+psycopg://linna@127.0.0.1:{self._port}/linna"
-        data = place / "data"
-        subprocess.run(
-            [*user, str(self._bin / "initdb"), "-D", str(data), "-U", "linna", "-A", "trust", "--no-sync"],
-            check=True,
-            cwd=place,
-            stdout=subprocess.DEVNULL,
-        )
-        server = [
-            str(self._bin / "postgres"),
-            "-D",
-            str(data),
-            "-p",
-            str(self._port),
-            "-k",
-            str(place),
-            "-h",
-            "127.0.0.1",
-            "-c",
-            "fsync=off",
-        ]
-        self.part = Part([*user, *server], folder / "postgres.log", self._answers, cwd=place)
-        self.part.start()
-        create = [
-            str(self._bin / "createdb"),
-            "-h",
-            "127.0.0.1",
-            "-p",
-            str(self._port),
-            "-U",
-            "linna",
-            "linna",
-        ]
-        subprocess.run(create, check=True)
-
-    def __enter__(self) -> PostgresServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.part.end()
-
-    def _answers(self) -> bool:
-        ask = [str(self._bin / "pg_isready"), "-h", "127.0.0.1", "-p", str(self._port), "-q"]
-        return subprocess.run(ask, check=False).returncode == 0
-
-
-SERVICE_ROLE = "service"
-
-
 class Deployment:
     """Deployment of PostgreSQL, Redis, API processes and two workers, with a database role that owns nothing.
 
@@ -259,45 +79,28 @@ class Deployment:
         schedulers: int = 0,
         **settings: str,
     ) -> None:
-        if shutil.which("redis-server") is None:
-            raise SystemExit("expected redis-server on this machine, found none")
         self.parts: dict[str, Part] = {}
+        self._database: PostgresServer | None = None
         if cluster is None:
-            database = PostgresServer(folder)
-            self.parts["database"] = database.part
-            self.url = database.url.replace("//linna@", f"//{SERVICE_ROLE}@")
+            self._database = PostgresServer(folder)
+            self.parts["database"] = self._database.part
+            self.url = self._database.prepare_service()
         else:
             self.url = cluster.url
+            cluster.prepare()
         self.home = folder / "home"
-        broker = free_port()
+        broker = RedisServer(folder)
+        self.parts["broker"] = broker.part
         environment = bare_environment(
             LINNA_HOME=str(self.home),
             LINNA_DATABASE_URL=self.url,
-            LINNA_BROKER_URL=f"redis://127.0.0.1:{broker}/0",
+            LINNA_BROKER_URL=broker.url,
             LINNA_RATE_LIMIT_PER_S="0",
             **settings,
         )
         linna = [sys.executable, "-m", "linna"]
-        redis = [
-            "redis-server",
-            "--port",
-            str(broker),
-            "--bind",
-            "127.0.0.1",
-            "--dir",
-            str(folder),
-            "--save",
-            "",
-            "--appendonly",
-            "no",
-        ]
         addresses = []
         try:
-            if cluster is None:
-                self.prepare(database.url)
-            else:
-                cluster.prepare()
-            self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
             for number in range(1, apis + 1):
                 port = free_port()
                 addresses.append(f"http://127.0.0.1:{port}")
@@ -317,15 +120,6 @@ class Deployment:
         self.apis = tuple(addresses)
         self.api = self.apis[0]
 
-    @staticmethod
-    def prepare(owner_url: str) -> None:
-        """Create the schema as its owner, and the role of the service."""
-        database = prepare_database(owner_url, upgrade=True)
-        with database.writing() as connection:
-            connection.execute(text(f"CREATE ROLE {SERVICE_ROLE} LOGIN"))
-        grant_service(database, SERVICE_ROLE)
-        database.engine.dispose()
-
     def _add(self, name: str, part: Part) -> None:
         part.start()
         self.parts[name] = part
@@ -333,20 +127,20 @@ class Deployment:
     def stop(self) -> None:
         for part in self.parts.values():
             part.end()
+        if self._database is not None:
+            self._database.remove()
 
 
 class ManyApis:
     """Several API processes with one database and one broker, without workers: jobs are added but not run."""
 
     def __init__(self, folder: Path, url: str, count: int = 2, **settings: str) -> None:
-        if shutil.which("redis-server") is None:
-            raise SystemExit("expected redis-server on this machine, found none")
         self.url = url
         self.home = folder / "home"
-        self.parts: dict[str, Part] = {}
-        broker, ports = free_port(), [free_port() for _ in range(count)]
+        broker, ports = RedisServer(folder), [free_port() for _ in range(count)]
+        self.parts = {"broker": broker.part}
         self.ports = tuple(ports)
-        self.broker_url = f"redis://127.0.0.1:{broker}/0"
+        self.broker_url = broker.url
         environment = service_environment(
             **{
                 "LINNA_HOME": str(self.home),
@@ -356,21 +150,7 @@ class ManyApis:
             }
             | settings
         )
-        redis = [
-            "redis-server",
-            "--port",
-            str(broker),
-            "--bind",
-            "127.0.0.1",
-            "--dir",
-            str(folder),
-            "--save",
-            "",
-            "--appendonly",
-            "no",
-        ]
         try:
-            self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
             for number, port in enumerate(ports, start=1):
                 command = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
                 log = folder / f"api{number}.log"

@@ -12,9 +12,10 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-from benchmarks.campaigns._deployment import Part, free_port, listens, runs, wait_until
+from benchmarks.campaigns._deployment import wait_until
 from ground_service.store.database import prepare_database
 from ground_service.store.roles import grant_service
+from studies.mission_run.parts import Part, free_port, listens, runs
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PASSWORD = "rehearsal"

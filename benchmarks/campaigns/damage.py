@@ -42,7 +42,6 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import SQLAlchemyError
 
-from benchmarks.campaigns._deployment import PostgresServer
 from benchmarks.ground import START, mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.commanding.service import enter_command, release_command
@@ -56,6 +55,7 @@ from ground_service.store.models import METADATA
 from ground_service.store.rows import KEPT_BY_THE_PROGRAM
 from ground_service.worker.integrity import Verification, verify
 from lunar.timescales import parse_utc
+from studies.mission_run.parts import PostgresServer
 from tests.tmtc import foreign
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus

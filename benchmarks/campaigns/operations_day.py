@@ -34,15 +34,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.campaigns._deployment import (
-    Deployment,
-    Laptop,
-    connected,
-    free_port,
-    listens,
-    service_environment,
-    wait_until,
-)
+from benchmarks.campaigns._deployment import Deployment, Laptop, connected, service_environment, wait_until
 from ground_service.access.audit_log import list_entries
 from ground_service.access.service import add_user
 from ground_service.client import Client
@@ -52,6 +44,7 @@ from linna.cli import run
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.session.flying import SPACECRAFT_ID
 from payload_emulator.session.scenario import load_scenario
+from studies.mission_run.parts import free_port, listens
 
 NS = 1_000_000_000
 DAY_NS = 86_400 * NS

@@ -41,10 +41,11 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from benchmarks.campaigns._deployment import Laptop, PostgresServer, wait_until
+from benchmarks.campaigns._deployment import Laptop, wait_until
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from ground_service.store.database import prepare_database
+from studies.mission_run.parts import PostgresServer
 from tmtc.dictionary import DICTIONARY
 
 HEALTH_LIMIT_MS = 100.0

@@ -153,6 +153,22 @@ class Spool:
         return max(numbers, default=-1) + 1
 
 
+def spooled_octets(folder: Path) -> int:
+    """Return the octets in the folder of a spool, which another process may operate.
+
+    The current segment is looked at first: once cut, it is one of the others.
+    """
+    try:
+        current = (folder / "current").stat().st_size
+    except FileNotFoundError:
+        current = 0
+    total = current
+    for path in folder.glob("*.segment"):
+        with contextlib.suppress(FileNotFoundError):
+            total += path.stat().st_size
+    return total
+
+
 def _holds_a_unit(octets: bytes) -> bool:
     try:
         found = decode(octets)

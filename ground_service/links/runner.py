@@ -26,7 +26,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.links import core, service
 from ground_service.links.service import DeclaredLink
 from ground_service.links.store import ContactRow, TransmissionRow
-from ground_service.links.stream import ACKNOWLEDGEMENT, NOT_YET, Connector, address_of
+from ground_service.links.stream import ACKNOWLEDGEMENT, NOT_YET, TRANSMISSION, Connector, address_of
 from ground_service.store.files import make_durable_folder, replace_durably
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ INCOMING = "incoming"
 
 @dataclass(slots=True)
 class _Progress:
-    """Octets of the link in this process: received, and of these ingested; sent.
+    """Octets of the link in this process: received, and of these ingested.
 
     `heard_utc_ns` is the mission time of the newest reception, `empty_utc_ns` the one before the newest look at the
     connection that found nothing. Octets that wait unread are no silence, however late they are read.
@@ -58,7 +58,6 @@ class _Progress:
 
     received: int = 0
     ingested: int = 0
-    sent: int = 0
     heard_utc_ns: int | None = None
     empty_utc_ns: int | None = None
     cut_utc_ns: dict[str, int] = field(default_factory=dict)
@@ -97,24 +96,9 @@ class LinkRunner:
         return self._progress.ingested
 
     @property
-    def octets_sent(self) -> int:
-        """Octets of telecommands that were sent to the station since the start."""
-        return self._progress.sent
-
-    @property
     def commands_unsent(self) -> int:
         """Telecommands that could be sent now."""
         return service.unsent(self._ground, self.declared)
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether no contact is open that was silent for so long that it has to end."""
-        heard = self._progress.heard_utc_ns
-        return (
-            self._contact is None
-            or heard is None
-            or not core.is_silent(heard, mission_now_ns(), self._silence_s)
-        )
 
     @property
     def alive(self) -> bool:
@@ -182,9 +166,15 @@ class LinkRunner:
             self._show("waiting", "another process holds the spool of the link")
             self._stopping.wait(RETRY_S)
             return
-        self._progress.received = self._progress.ingested + self._spool.open()
+        left = self._spool.open()
+        self._progress.received = self._progress.ingested + left
         self._contact = service.find_open_contact(self._ground, self._name)
-        self._progress.heard_utc_ns = mission_now_ns() if self._contact is not None else None
+        if self._contact is not None:
+            # When octets in the spool were received is not known: now at the latest.
+            heard = None if left else service.last_heard_ns(self._ground, self._name)
+            self._progress.heard_utc_ns = (
+                max(self._contact.start_utc_ns, heard or 0) if heard else mission_now_ns()
+            )
         self._opened = True
         self._work.set()
 
@@ -259,6 +249,8 @@ class LinkRunner:
         if self._contact is None:
             self._contact = service.start_contact(self._ground, self.declared, now)
         self._progress.heard_utc_ns = now
+        # Only a later look can find a silence; mission time may have been set back since the last one.
+        self._progress.empty_utc_ns = None
 
     def _follow_contact(self) -> None:
         now, heard = mission_now_ns(), self._progress.heard_utc_ns
@@ -305,12 +297,23 @@ class LinkRunner:
             service.repeat_unconfirmed(self._ground, self.declared, self._contact)
             self._repeated_for = self._contact.id
         for one in service.take_transmissions(self._ground, self.declared, self._owner):
-            if not self._up.send(one.octets):
+            if not self._transmit(self._up, one):
                 return
-            self._progress.sent += len(one.octets)
             self._note_transmitted(one)
         if requested:
             service.note_sent_request(self._ground, self._name, self._owner, number)
+
+    def _transmit(self, up: Connector, transmission: TransmissionRow) -> bool:
+        """Send a transmission; return whether it is on the wire, or at a station that confirms it.
+
+        A transmission whose confirmation was not recorded is sent again with the same number, and a station sends no
+        number up twice.
+        """
+        if not self.declared.link.confirm:
+            return up.send(transmission.octets)
+        number = transmission.id << 8 | transmission.attempts
+        head = TRANSMISSION.pack(number, len(transmission.octets))
+        return up.send(head + transmission.octets) and up.confirmed(number)
 
     def _note_transmitted(self, transmission: TransmissionRow) -> None:
         contact = None if self._contact is None else self._contact.id

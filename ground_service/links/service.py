@@ -199,10 +199,42 @@ def change_state(ground: Ground, name: str, owner: str, state: str, reason: str 
         return changed
 
 
+def owners(ground: Ground) -> dict[str, str | None]:
+    """Return the process that has the lease of each declared link; None without any."""
+    now = utc_now_ns()
+    with ground.database.reading() as connection:
+        rows = {name: store.find_link(connection, name) for name in _declared(connection)}
+    return {
+        name: row.owner if row is not None and row.lease_utc_ns >= now else None for name, row in rows.items()
+    }
+
+
 def find_open_contact(ground: Ground, name: str) -> ContactRow | None:
     """Return the open contact of a link, which an earlier owner may have left."""
     with ground.database.reading() as connection:
         return store.open_contact(connection, name)
+
+
+def last_heard_ns(ground: Ground, name: str) -> int | None:
+    """Return the mission time of the newest ingested reception of a link; None if nothing was received."""
+    with ground.database.reading() as connection:
+        found = store.find_link(connection, name)
+    return None if found is None else found.heard_utc_ns
+
+
+def silent_contacts(ground: Ground) -> list[str]:
+    """Return the links with an open contact that was silent for so long that it has to end."""
+    now = mission_now_ns()
+    with ground.database.reading() as connection:
+        found = []
+        for name, declared in _declared(connection).items():
+            row, contact = store.find_link(connection, name), store.open_contact(connection, name)
+            if row is None or contact is None:
+                continue
+            heard = max(contact.start_utc_ns, row.heard_utc_ns or 0)
+            if core.is_silent(heard, now, declared.link.silence_s):
+                found.append(name)
+    return found
 
 
 def start_contact(ground: Ground, declared: DeclaredLink, utc_ns: int) -> ContactRow | None:

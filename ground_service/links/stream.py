@@ -18,7 +18,13 @@ NOT_YET = "not connected yet"
 DISCARDED_BLOCKS = 64
 """Limit for one call: a station that sends on the uplink without end must not stop the link."""
 
+CONFIRM_S = 4.0
 ACKNOWLEDGEMENT = struct.Struct(">Q")
+TRANSMISSION = struct.Struct(">QI")
+"""Header of telecommand octets for a station that confirms: number of the transmission, number of octets."""
+
+REFUSED = 0
+"""Answer of a station that cannot send the transmission now."""
 
 
 @dataclass(slots=True)
@@ -89,6 +95,22 @@ class Connector:
             return False
         self._wait_s = 0.0
         return True
+
+    def confirmed(self, number: int) -> bool:
+        """Return whether the station confirms a transmission, and not that it cannot send it now."""
+        answer, until = b"", time.monotonic() + CONFIRM_S
+        while len(answer) < ACKNOWLEDGEMENT.size:
+            left = until - time.monotonic()
+            octets = self.receive(left) if left > 0.0 else None
+            if octets is None:
+                if self.connected:
+                    self._lost("no confirmation of a transmission")
+                return False
+            answer += octets
+        (found,) = ACKNOWLEDGEMENT.unpack(answer[: ACKNOWLEDGEMENT.size])
+        if found not in (number, REFUSED) or len(answer) > ACKNOWLEDGEMENT.size:
+            self._lost(f"expected the confirmation of transmission {number}, found {answer[:16].hex()}")
+        return bool(found == number)
 
     def discard_input(self) -> bool:
         """Read what the other side sends without use; return whether the connection is still open."""

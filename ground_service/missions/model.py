@@ -370,6 +370,8 @@ class StationConnection(Section):
         "automatic": released telecommands are sent in the next contact. "manual": on request only.
     acknowledge
         The service returns the number of durably stored octets on the telemetry connection.
+    confirm
+        The station takes telecommands as numbered transmissions and confirms each; it sends no number up twice.
     silence_s
         A contact has ended when no telemetry was received for this time.
     """
@@ -384,6 +386,7 @@ class StationConnection(Section):
     send: Literal["automatic", "manual"] = "automatic"
     reconnect: bool = True
     acknowledge: bool = False
+    confirm: bool = False
     silence_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = 60.0
 
     @model_validator(mode="after")

@@ -46,6 +46,8 @@ class Scheduler:
         Function that handles events that other processes have left.
     kept
         Arguments of the nightly job: for how long what is kept (`upkeep.nightly`).
+    plan_hourly
+        Whether the job of the plan is entered once an hour of mission time.
     """
 
     def __init__(
@@ -54,10 +56,12 @@ class Scheduler:
         dispatcher: Dispatcher,
         drain: Callable[[], object],
         kept: Mapping[str, int],
+        *,
+        plan_hourly: bool = True,
     ) -> None:
         self.owner = process_name()
         self._ground, self._dispatcher, self._drain = ground, dispatcher, drain
-        self._kept = dict(kept)
+        self._kept, self._plan_hourly = dict(kept), plan_hourly
         self._catch_up_s = time.monotonic() + CATCH_UP_S
         self._plan: str | None = None
         self._night: str | None = None
@@ -102,7 +106,8 @@ class Scheduler:
         self._do("events of other processes", self._drain)
         self._do("failed actions", self._repeat_actions)
         self._do("overdue telecommands", self._note_timeouts)
-        self._do("plan", self._enter_plan)
+        if self._plan_hourly:
+            self._do("plan", self._enter_plan)
         self._do("nightly job", self._enter_night)
         return True
 

@@ -114,6 +114,12 @@ def _add_continuous(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="exact state of the simulation, written on save on the console; a start goes on from it",
     )
+    endless.add_argument(
+        "--journal",
+        type=Path,
+        metavar="FILE",
+        help="transmissions that stations have confirmed; a start from --snapshot repeats those after it",
+    )
     endless.add_argument("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
     endless.add_argument(
         "--craters", type=Path, metavar="FILE", help="crater catalogue with rim heights, on board from launch"
@@ -264,6 +270,7 @@ def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
         station_ports=_station_ports(arguments.station_port, scenario.link.stations),
         checkpoint_file=arguments.state,
         snapshot_file=arguments.snapshot,
+        journal_file=arguments.journal,
         clock_file=arguments.clock_file,
         keeps=arguments.keep_unacknowledged,
         ends_with_console=arguments.end_with_console,

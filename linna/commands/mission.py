@@ -44,6 +44,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     running.add_argument(
         "--folder", type=Path, metavar="DIR", help="folder of the run (default: run-SCENARIO)"
     )
+    running.add_argument(
+        "--distributed",
+        action="store_true",
+        help="separate processes on PostgreSQL and Redis instead of one process on SQLite",
+    )
+    running.add_argument(
+        "--database",
+        metavar="URL",
+        help="database of the distributed form (default: a PostgreSQL server of the run)",
+    )
+    running.add_argument(
+        "--broker", metavar="URL", help="broker of the distributed form (default: a Redis server of the run)"
+    )
+    running.add_argument(
+        "--kill",
+        type=int,
+        metavar="SEED",
+        help="kill processes of the distributed form at random points of this seed",
+    )
+    running.add_argument("--kills", type=int, metavar="N", help="number of kills (default: 4 a day)")
     running.set_defaults(handler=run_mission)
     for action in (adding, listing, showing):
         add_operator_options(action)
@@ -122,6 +142,7 @@ def run_mission(arguments: argparse.Namespace) -> int:
     from linna.output import log
     from payload_emulator.session.scenario import load_scenario
     from studies.mission_run import run
+    from studies.mission_run.distributed import Servers
 
     try:
         rate = 0.0 if arguments.speed == "max" else float(arguments.speed)
@@ -133,15 +154,32 @@ def run_mission(arguments: argparse.Namespace) -> int:
         raise UsageError(
             "--days, --observe-hours-a-day, --window-min: expected numbers above 0 and windows of a minute or more"
         )
+    if not arguments.distributed and (arguments.kill, arguments.kills, arguments.database, arguments.broker) != (
+        None, None, None, None,
+    ):  # fmt: skip
+        raise UsageError(
+            "--kill, --kills, --database, --broker: expected --distributed with them, found none"
+        )
+    kills = 0
+    if arguments.kill is not None:
+        kills = max(round(4 * arguments.days), 1) if arguments.kills is None else arguments.kills
+    elif arguments.kills is not None:
+        raise UsageError("--kills: expected --kill SEED with it, found none")
+    if kills < 0 or (arguments.kill or 0) < 0:
+        raise UsageError("--kill, --kills: expected numbers from 0")
     scenario = load_scenario(arguments.scenario)
     terms = run.RunTerms(
         arguments.days,
         rate,
         max(1, round(60.0 * arguments.observe_hours_a_day / arguments.window_min)),
         60.0 * arguments.window_min,
+        arguments.distributed,
+        arguments.kill,
+        kills,
     )
+    servers = Servers(arguments.database, arguments.broker)
     folder = arguments.folder or Path(f"run-{scenario.name}")
-    figures = run.run_mission(scenario, data_folder(), folder, terms, log)
+    figures = run.run_mission(scenario, data_folder(), folder, terms, log, servers)
     windows = figures["windows"]
     text = (
         f"{figures['days']:g} days in {figures['wall_s']:.0f} s: {windows['requested']} windows requested, "

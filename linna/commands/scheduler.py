@@ -44,7 +44,14 @@ def run(arguments: argparse.Namespace) -> int:
         dispatcher = dispatcher_for(ground, settings)
         follow_up = follow_in_process(ground, dispatcher.start)
         try:
-            Scheduler(ground, dispatcher, follow_up.drain, settings.kept).run(stopping, first_s=0.0)
+            scheduler = Scheduler(
+                ground,
+                dispatcher,
+                follow_up.drain,
+                settings.kept,
+                plan_hourly=settings.plan_hourly,
+            )
+            scheduler.run(stopping, first_s=0.0)
         finally:
             dispatcher.close()
     return 0

@@ -54,6 +54,7 @@ from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.snapshot import load_snapshot, save_snapshot
 from payload_emulator.session.spacecraft import Spacecraft, new_board
 from payload_emulator.session.station_ports import KEPT_LIMIT_OCTETS, StationPorts
+from payload_emulator.session.uplink_journal import JournalEntry, add_to_journal, load_journal
 from payload_emulator.session.world import (
     NO_SAMPLES,
     Exposure,
@@ -91,7 +92,7 @@ _CLOCK = struct.Struct("<q")
 _ARCS_KEPT = 2
 _EXACT = (
     "utc_ns", "spacecraft", "account", "contact", "_contacts", "_planned_until_ns", "_receiver",
-    "_transmitter", "_uplinks", "_uplinked", "_last_heard_ns", "_waiting",
+    "_transmitter", "_uplinks", "_uplinked", "_last_heard_ns", "_waiting", "_sent_up",
 )  # fmt: skip
 """Fields of a session that make up its exact state outside of observations, with the flight."""
 
@@ -112,6 +113,9 @@ class ContinuousSession:
         Where the state is kept between contacts and at the end.
     snapshot_file
         Where the exact state is written when the console says `save`, and read at the start if it exists.
+    journal_file
+        Where transmissions that the stations confirm are recorded. A start from the exact state repeats those after
+        it at their times, so that the session goes on as if the process had not ended.
     clock_file
         Where the mission time is written for the ground (`LINNA_CLOCK_FILE`).
     keeps
@@ -136,6 +140,7 @@ class ContinuousSession:
     station_ports: dict[str, tuple[int, int]] = field(default_factory=dict)
     checkpoint_file: Path | None = None
     snapshot_file: Path | None = None
+    journal_file: Path | None = None
     clock_file: Path | None = None
     keeps: bool = False
     ends_with_console: bool = False
@@ -157,7 +162,8 @@ class ContinuousSession:
     _transmitter: Transmitter = field(init=False)
     _uplinks: dict[int, TelecommandBuffer] = field(default_factory=dict)
     _uplinked: deque[tuple[int, bytes]] = field(default_factory=deque)
-    _uplinked_octets: dict[str, int] = field(default_factory=dict)
+    _sent_up: set[int] = field(default_factory=set)
+    _to_repeat: deque[JournalEntry] = field(default_factory=deque)
     _bench: InstrumentBench = field(init=False)
     _executor: ThreadPoolExecutor = field(init=False)
     _next_image: tuple[int, Future[Exposure]] | None = None
@@ -193,6 +199,9 @@ class ContinuousSession:
             self._continue_exactly(self.snapshot_file)
         if scenario.camera.images != "reduced":
             self.world.terrain.reserve()
+        if self.journal_file is not None:
+            left = [one for one in load_journal(self.journal_file) if one.number not in self._sent_up]
+            self._to_repeat.extend(sorted(left, key=lambda one: one.utc_ns))
         self._bench = InstrumentBench(self.world)
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
         self._write_clock()
@@ -290,6 +299,9 @@ class ContinuousSession:
 
     def _wait(self, selector: selectors.BaseSelector, due_ns: int) -> bool:
         """Serve the ports until it is time for the next step; False where the session is to stop."""
+        while self._to_repeat and self._to_repeat[0].utc_ns <= self.utc_ns:
+            entry = self._to_repeat.popleft()
+            self._send_up(entry.station, entry.number, entry.octets)
         due = time.monotonic() + (due_ns - self.utc_ns) / _NS / self.rate if self.rate > 0.0 else 0.0
         self._serve(selector, 0.0)
         while not self.stopping.is_set():
@@ -325,7 +337,7 @@ class ContinuousSession:
             "mode": self.spacecraft.payload.mode.name,
             "waiting": self._waiting if self.contact is not None else self.spacecraft.payload.waiting,
             "sent": {name: one.sent for name, one in self.stations.items()},
-            "uplinked": dict(self._uplinked_octets),
+            "unacknowledged": sum(one.unacknowledged for one in self.stations.values()),
             "frames": self.account.frames,
             "packets": self.account.packets,
             "telecommands": self.account.telecommands,
@@ -485,6 +497,7 @@ class ContinuousSession:
                 telemetry,
                 telecommand,
                 self.keeps,
+                taken=self._sent_up.union(one.number for one in self._to_repeat),
             )
         self.console = Server(
             "console",
@@ -509,14 +522,27 @@ class ContinuousSession:
             server, client = key.data
             server.serve(client, events)
 
-    def _take_telecommands(self, station: str, number: int, octets: bytes) -> None:
-        """Take octets that a station is to send up; without a contact of that station they are lost."""
-        connection = hash((station, number))
-        self._uplinked_octets[station] = self._uplinked_octets.get(station, 0) + len(octets)
-        if self.contact is None or self.contact.station != station:
+    def _take_telecommands(self, station: str, number: int, octets: bytes) -> bool:
+        """Take octets that a station is to send up; return whether it does.
+
+        Without a contact of that station, a transmission that is to be confirmed is refused and other octets are lost.
+        """
+        has_contact = self.contact is not None and self.contact.station == station
+        if self.keeps and not has_contact:
+            return False
+        if self.keeps and self.journal_file is not None:
+            add_to_journal(self.journal_file, JournalEntry(self.utc_ns, station, number, octets))
+        if has_contact:
+            self._send_up(station, number, octets)
+        else:
             self.account.telecommand_octets_lost += len(octets)
-        elif octets:
-            self._uplinked.append((connection, octets))
+        return has_contact
+
+    def _send_up(self, station: str, number: int, octets: bytes) -> None:
+        if octets:
+            self._uplinked.append((hash((station, number)), octets))
+        if self.keeps:
+            self._sent_up.add(number)
 
     def _take_words(self, connection: int, octets: bytes) -> None:
         *lines, rest = (self._words.get(connection, b"") + octets)[-4096:].split(b"\n")
@@ -566,7 +592,9 @@ class ContinuousSession:
             return
         if self._clock_map is None:
             self.clock_file.parent.mkdir(parents=True, exist_ok=True)
-            self.clock_file.write_bytes(_CLOCK.pack(self.utc_ns))
+            # Other processes have mapped the file of an earlier session: it must not become shorter.
+            with self.clock_file.open("r+b" if self.clock_file.exists() else "w+b") as file:
+                file.write(_CLOCK.pack(self.utc_ns))
             self._clock_map = np.memmap(self.clock_file, dtype="<i8", mode="r+", shape=(1,))
         self._clock_map[0] = self.utc_ns
 

@@ -63,7 +63,7 @@ class Server:
     name: str
     port: int
     host: str
-    receive: Callable[[int, bytes], None]
+    receive: Callable[[int, bytes], object]
     ended: Callable[[int], object] = lambda number: None
     document: bytes | None = None
     greeting: Callable[[Client], bytes] = lambda client: b""
@@ -107,6 +107,13 @@ class Server:
     def send(self, octets: bytes) -> None:
         """Send octets to every client without blocking; disconnect clients with too many unsent octets."""
         for client in list(self.clients.values()):
+            client.unsent += octets
+            self._flush(client)
+
+    def reply(self, number: int, octets: bytes) -> None:
+        """Send octets to one client, if it is still connected."""
+        client = self.clients.get(number)
+        if client is not None:
             client.unsent += octets
             self._flush(client)
 

@@ -147,7 +147,7 @@ def operations_mission_text(
     further
         TOML appended to the text: automation, approval and resources.
     acknowledge
-        Whether the stations keep telemetry until the ground acknowledges it.
+        Whether the stations keep telemetry until the ground acknowledges it, and confirm telecommands.
     """
     scenario, link = world.scenario, world.scenario.link
     step_ns = round(_TRACK_STEP_S * NS)
@@ -193,6 +193,7 @@ def operations_mission_text(
             "format": "cltu",
             "send": "automatic",
             "acknowledge": acknowledge,
+            "confirm": acknowledge,
             "silence_s": SILENCE_S,
         }
         lines += ["", "[[links]]", *(f"{key} = {_toml(value)}" for key, value in values.items())]

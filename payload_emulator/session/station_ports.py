@@ -3,7 +3,11 @@
 A record is the time of reception (unsigned 64-bit nanoseconds since 1970-01-01 UTC, most significant octet first) and
 a CADU. The station keeps records that a client has not acknowledged, if it is told to: a client acknowledges with the
 number of octets of its connection that are durable there (unsigned 64 bits, most significant octet first), and a new
-connection begins with what is not acknowledged.
+connection begins with the first record that is not acknowledged completely.
+
+Such a station also confirms telecommands: a transmission is its number (unsigned 64 bits), its number of octets
+(unsigned 32 bits) and the octets. The station answers with the number when it has taken the transmission, now or
+before, and with 0 when it cannot send it up now. A number is sent up once.
 """
 
 from __future__ import annotations
@@ -16,6 +20,9 @@ from payload_emulator.session.live_ports import Client, Server
 
 RECORD_HEADER = struct.Struct(">Q")
 _COUNT = struct.Struct(">Q")
+_TRANSMISSION = struct.Struct(">QI")
+_TRANSMISSION_LIMIT_OCTETS = 16 << 20
+_REFUSED = 0
 
 KEPT_LIMIT_OCTETS = 64 << 20
 """Largest number of octets that a station keeps for a client that is not there; the simulation waits beyond half."""
@@ -28,26 +35,32 @@ class StationPorts:
     Attributes
     ----------
     receive
-        Called with the number of the connection and telecommand octets; no octets: the connection has ended.
+        Called with the number of the connection, or of the transmission, and telecommand octets; no octets: the
+        connection has ended. Returns whether they are sent up.
     keeps
-        Whether records are kept until they are acknowledged.
+        Whether records are kept until they are acknowledged, and transmissions are confirmed.
     sent
         Octets of records handed to the telemetry port.
+    taken
+        Numbers of the transmissions that were sent up.
     """
 
     name: str
     host: str
-    receive: Callable[[int, bytes], None]
+    receive: Callable[[int, bytes], bool]
     telemetry_port: int = 0
     telecommand_port: int = 0
     keeps: bool = False
     sent: int = 0
+    taken: set[int] = field(default_factory=set)
     telemetry: Server = field(init=False)
     telecommand: Server = field(init=False)
     _kept: bytearray = field(default_factory=bytearray)
     _begin: int = 0
     _connections: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, bytes] = field(default_factory=dict)
+    _partial: dict[int, bytes] = field(default_factory=dict)
+    _record_octets: int = 1
 
     def __post_init__(self) -> None:
         self.telemetry = Server(
@@ -62,8 +75,8 @@ class StationPorts:
             f"telecommand of {self.name}",
             self.telecommand_port,
             self.host,
-            self.receive,
-            lambda number: self.receive(number, b""),
+            self._take if self.keeps else self.receive,
+            self._end_uplink,
         )
 
     @property
@@ -77,6 +90,7 @@ class StationPorts:
         head = RECORD_HEADER.pack(received_utc_ns)
         records = b"".join(head + cadus[at : at + cadu_length] for at in range(0, len(cadus), cadu_length))
         self.sent += len(records)
+        self._record_octets = len(head) + cadu_length
         if self.keeps:
             self._kept += records
             if len(self._kept) > KEPT_LIMIT_OCTETS:
@@ -87,6 +101,37 @@ class StationPorts:
         """Close both ports."""
         self.telemetry.close()
         self.telecommand.close()
+
+    @property
+    def unacknowledged(self) -> int:
+        """Octets that are kept because no client has acknowledged them."""
+        return len(self._kept)
+
+    def _take(self, number: int, octets: bytes) -> None:
+        """Take transmissions as they come, and answer each."""
+        left = self._partial.get(number, b"") + octets
+        while len(left) >= _TRANSMISSION.size:
+            transmission, length = _TRANSMISSION.unpack_from(left)
+            if length > _TRANSMISSION_LIMIT_OCTETS:
+                self.telecommand.drop(self.telecommand.clients[number])
+                return
+            stop = _TRANSMISSION.size + length
+            if len(left) < stop:
+                break
+            if transmission not in self.taken and self.receive(transmission, left[_TRANSMISSION.size : stop]):
+                self.taken.add(transmission)
+            answer = transmission if transmission in self.taken else _REFUSED
+            left = left[stop:]
+            self._partial[number] = left
+            self.telecommand.reply(number, _COUNT.pack(answer))
+            if number not in self.telecommand.clients:
+                return
+        self._partial[number] = left
+
+    def _end_uplink(self, number: int) -> None:
+        self._partial.pop(number, None)
+        if not self.keeps:
+            self.receive(number, b"")
 
     def _greet(self, client: Client) -> bytes:
         """Return what a new telemetry connection begins with: everything that is not acknowledged."""
@@ -106,6 +151,8 @@ class StationPorts:
         self._counts.pop(number, None)
 
     def _forget(self, count: int) -> None:
+        """Forget acknowledged octets, as far as they are whole records: a connection begins with a record."""
         count = min(max(count, 0), len(self._kept))
+        count -= count % self._record_octets
         del self._kept[:count]
         self._begin += count

@@ -20,13 +20,14 @@ class Checkpoints:
     folder
         Folder of the run.
     home
-        Folder of the ground service.
+        Folder of the ground service with its SQLite database; None: the archive of a server is not put back, since
+        it may be ahead of the spacecraft, which repeats what it did.
     snapshot
         File of the exact state of the spacecraft.
     """
 
     folder: Path
-    home: Path
+    home: Path | None
     snapshot: Path
 
     def keep(self, progress: Path) -> None:
@@ -39,11 +40,8 @@ class Checkpoints:
         new.mkdir(mode=0o700)
         shutil.copyfile(self.snapshot, new / SPACECRAFT)
         shutil.copyfile(progress, new / PROGRESS)
-        with (
-            closing(sqlite3.connect(self.home / "linna.db")) as source,
-            closing(sqlite3.connect(new / ARCHIVE)) as target,
-        ):
-            source.backup(target)
+        if self.home is not None:
+            self._keep_archive(self.home, new / ARCHIVE)
         old = self.folder / "checkpoint.old"
         shutil.rmtree(old, ignore_errors=True)
         if self._place.exists():
@@ -51,18 +49,29 @@ class Checkpoints:
         new.rename(self._place)
         shutil.rmtree(old, ignore_errors=True)
 
+    @staticmethod
+    def _keep_archive(home: Path, path: Path) -> None:
+        with (
+            closing(sqlite3.connect(home / "linna.db")) as source,
+            closing(sqlite3.connect(path)) as target,
+        ):
+            source.backup(target)
+
     def restore(self) -> Path | None:
         """Put spacecraft and archive back to the newest checkpoint, or to nothing without one; return its progress."""
         found = next((one for one in (self._place, self.folder / "checkpoint.old") if one.exists()), None)
         self.snapshot.unlink(missing_ok=True)
-        shutil.rmtree(self.home / "incoming", ignore_errors=True)
-        for suffix in ("", "-wal", "-shm"):
-            (self.home / f"linna.db{suffix}").unlink(missing_ok=True)
+        if self.home is not None:
+            shutil.rmtree(self.home / "incoming", ignore_errors=True)
+            for suffix in ("", "-wal", "-shm"):
+                (self.home / f"linna.db{suffix}").unlink(missing_ok=True)
+            if found is None:
+                shutil.rmtree(self.home, ignore_errors=True)
+            else:
+                shutil.copyfile(found / ARCHIVE, self.home / "linna.db")
         if found is None:
-            shutil.rmtree(self.home, ignore_errors=True)
             return None
         shutil.copyfile(found / SPACECRAFT, self.snapshot)
-        shutil.copyfile(found / ARCHIVE, self.home / "linna.db")
         return found / PROGRESS
 
     @property

@@ -12,7 +12,7 @@ from ground_service.evaluation.model import PassFigures
 from ground_service.planning.model import Window
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.timescales import parse_utc
-from studies.mission_run.ground import EmbeddedGround
+from studies.mission_run.ground import MissionGround
 from studies.mission_run.incidents import find_incidents
 from studies.mission_run.processes import summary
 
@@ -43,7 +43,7 @@ class RunProgress(Protocol):
 
 
 def closing_figures(
-    ground: EmbeddedGround, progress: RunProgress, days: float, scenario: str
+    ground: MissionGround, progress: RunProgress, days: float, scenario: str
 ) -> dict[str, Any]:
     """Return the figures of the closing report; what is not known is None."""
     windows = ground.windows()
@@ -104,7 +104,7 @@ def contacts_until(stop_utc_ns: int, processed_utc_ns: int, contact_stops: Seque
     return sum(stop_utc_ns < one <= processed_utc_ns for one in contact_stops)
 
 
-def _figures_of(ground: EmbeddedGround, window: Window) -> PassFigures | None:
+def _figures_of(ground: MissionGround, window: Window) -> PassFigures | None:
     """Return the figures of the newest report of a window; None without any."""
     if window.pass_id is None:
         return None

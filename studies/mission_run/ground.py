@@ -1,4 +1,4 @@
-"""The ground service of a mission run: in this process on SQLite, with the links of its mission description.
+"""The ground service of a mission run, and its embedded form: in this process on SQLite.
 
 A user posts the mission description, an ephemeris, two telecommands of commissioning and a standing request; after that
 the run only reads. Flight dynamics delivers an orbit determination a day, as a system of its own.
@@ -6,8 +6,9 @@ the run only reads. Flight dynamics delivers an orbit determination a day, as a 
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,16 +17,22 @@ from ground_service.access.model import AuditEntry
 from ground_service.access.service import RESERVED_NAMES
 from ground_service.client.local import local_client
 from ground_service.client.operations import Client
+from ground_service.client.problems import Unavailable, Unreachable
 from ground_service.clock import ClockFile, set_mission_clock
 from ground_service.ephemerides.service import add_ephemeris
-from ground_service.errors import GroundError
+from ground_service.errors import PASSING, GroundError
 from ground_service.ground import Ground, open_ground
-from ground_service.jobs.service import unfinished_jobs
+from ground_service.ingest.live import spooled_octets
+from ground_service.jobs.store import unfinished_jobs as unfinished
+from ground_service.links import service as links
+from ground_service.links.runner import INCOMING
 from ground_service.links.supervisor import LinkSupervisor
 from ground_service.planning.model import Window
+from ground_service.store.events import position_of, read_events
 from ground_service.store.telemetry import packet_headers
 from ground_service.store.vehicles import all_vehicles
 from ground_service.worker.actions import has_repetitions, repeat_due
+from ground_service.worker.follow_up import CONSUMER, KINDS
 from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
 from studies.mission_run.regions import Box
@@ -41,33 +48,22 @@ SETTLE_S = 300.0
 
 
 @dataclass(slots=True)
-class EmbeddedGround:
-    """Archive, links and follow-up work in this process, operated through the client of the API."""
+class MissionGround:
+    """The ground service of a mission run, operated through the client of the API.
+
+    Attributes
+    ----------
+    ground
+        Database and files of the service, to see whether it is idle, and for the closing figures.
+    """
 
     ground: Ground
     client: Client
-    links: LinkSupervisor
-
-    @classmethod
-    def open(cls, home: Path, data: DataFolder, clock_file: Path) -> EmbeddedGround:
-        """Open the ground service under a folder; mission time comes from a file."""
-        set_mission_clock(ClockFile(clock_file).read)
-        ground = open_ground(home, data)
-        client = local_client(ground, USER)
-        links = LinkSupervisor(ground)
-        links.start()
-        return cls(ground, client, links)
-
-    def close(self) -> None:
-        """Stop the links with received octets ingested, and close the archive."""
-        self.links.stop()
-        self.client.close()
-        set_mission_clock()
 
     def add_mission(self, text: bytes) -> None:
         """Add the mission description, and wait for its links."""
         self.client.add_mission(text)
-        self._wait(lambda: bool(self.links.runners), "links of the mission description")
+        self._wait(self._has_links, "links of the mission description")
 
     def deliver_reference(self, path: Path, day: int) -> None:
         """Add the orbit determination of a day as flight dynamics; later ones are preferred."""
@@ -79,48 +75,63 @@ class EmbeddedGround:
             actor=FLIGHT_DYNAMICS,
         )
 
-    def wait_sent(self) -> None:
-        """Wait until the links have sent every telecommand that can be sent now."""
-        self._wait(
-            lambda: not any(one.commands_unsent for one in self.links.runners.values()), "telecommands sent"
-        )
+    @property
+    def processes(self) -> dict[str, int]:
+        """The processes of the service by name."""
+        return {"ground": os.getpid()}
 
-    def wait_received(self, sent: Mapping[str, int]) -> None:
-        """Wait until all octets that stations have sent are ingested, and the work that follows is done."""
+    def wait_sent(self, station: str) -> None:
+        """Wait until the station of a contact has every telecommand that can be sent now."""
 
-        def is_done() -> bool:
-            runners = {one.declared.link.name: one for one in self.links.runners.values()}
-            got = all(
-                name in runners and runners[name].octets_received >= count for name, count in sent.items()
-            )
-            return got and not unfinished_jobs(self.ground)
+        def is_sent() -> bool:
+            declared = links.declared_links(self.ground).values()
+            return not any(links.unsent(self.ground, one) for one in declared if one.station == station)
 
-        self._wait(is_done, "telemetry ingested")
+        self._wait(is_sent, "telecommands sent")
+
+    def wait_idle(self) -> None:
+        """Wait until the work that follows from events is done."""
+        self._wait(self._is_idle, "end of the work that follows from events")
+
+    def wait_ingested(self) -> None:
+        """Wait until all octets that the links have stored are ingested, and the work that follows is done."""
+        self._wait(lambda: not self._spooled_octets() and self._is_idle(), "telemetry ingested")
 
     def wait_settled(self) -> None:
         """Wait until contacts that were silent for too long have ended, and the work that follows is done."""
         self._wait(
             lambda: (
-                all(one.is_settled for one in self.links.runners.values())
-                and not unfinished_jobs(self.ground)
-                and not self._repeats_actions()
+                not links.silent_contacts(self.ground) and self._is_idle() and not self._repeats_actions()
             ),
             "contacts ended",
         )
 
     def _repeats_actions(self) -> bool:
-        """Repeat the failed actions that are due; return whether any are to be repeated later."""
-        for job_id in repeat_due(self.ground):
-            run_job(self.ground, job_id)
+        """Return whether failed actions are to be repeated."""
         return has_repetitions(self.ground)
 
-    def octets_sent(self) -> dict[str, int]:
-        """Return the octets of telecommands that were sent, by link."""
-        return {name: one.octets_sent for name, one in self.links.runners.items()}
+    def _has_links(self) -> bool:
+        return all(one.owner is not None for one in self.client.list_links())
+
+    def _spooled_octets(self) -> int:
+        return sum(spooled_octets(one) for one in (self.ground.home / INCOMING).glob("link-*"))
+
+    def _is_idle(self) -> bool:
+        """Return whether all events are handled and no job is unfinished, at one moment."""
+        with self.ground.database.snapshot() as connection:
+            position = position_of(connection, CONSUMER)
+            return not (read_events(connection, position, 1, KINDS) or unfinished(connection))
 
     def windows(self) -> list[Window]:
         """Return all windows, the earliest first."""
-        return sorted(self.client.list_windows(), key=lambda one: one.start.utc_ns)
+        found: list[Window] = []
+
+        def is_read() -> bool:
+            found[:] = self.client.list_windows()
+            return True
+
+        self._wait(is_read, "answer of the API")
+        return sorted(found, key=lambda one: one.start.utc_ns)
 
     def packets_received(self) -> int:
         """Return the number of packets in the archive."""
@@ -148,10 +159,45 @@ class EmbeddedGround:
 
     def _wait(self, is_done: Callable[[], bool], what: str) -> None:
         until = time.monotonic() + SETTLE_S
-        while not is_done():
+        while not self._holds(is_done):
             if time.monotonic() > until:
                 raise GroundError(f"mission run: expected {what} within {SETTLE_S:.0f} s, found none")
             time.sleep(POLL_S)
+
+    def _holds(self, is_done: Callable[[], bool]) -> bool:
+        """Return whether a condition holds; False while a killed part of the service cannot be asked."""
+        try:
+            return is_done()
+        except (*PASSING, Unreachable, Unavailable):
+            return False
+
+
+class EmbeddedGround(MissionGround):
+    """Archive, links and follow-up work in this process, on SQLite."""
+
+    links: LinkSupervisor
+
+    @classmethod
+    def open(cls, home: Path, data: DataFolder, clock_file: Path) -> EmbeddedGround:
+        """Open the ground service under a folder; mission time comes from a file."""
+        set_mission_clock(ClockFile(clock_file).read)
+        ground = open_ground(home, data)
+        opened = cls(ground, local_client(ground, USER))
+        opened.links = LinkSupervisor(ground)
+        opened.links.start()
+        return opened
+
+    def _repeats_actions(self) -> bool:
+        """Repeat the failed actions that are due; return whether any are to be repeated later."""
+        for job_id in repeat_due(self.ground):
+            run_job(self.ground, job_id)
+        return has_repetitions(self.ground)
+
+    def close(self, *, is_finished: bool = False) -> None:
+        """Stop the links with received octets ingested, and close the archive."""
+        self.links.stop()
+        self.client.close()
+        set_mission_clock()
 
 
 def is_of_person(entry: AuditEntry) -> bool:

@@ -9,7 +9,7 @@ from ground_service.events import ContactMissed, ContactStarted, FollowUpFailed,
 from ground_service.planning.model import Window
 from ground_service.store.events import LoggedEvent, read_events
 from lunar.timescales import format_utc
-from studies.mission_run.ground import EmbeddedGround
+from studies.mission_run.ground import MissionGround
 
 LIMIT = 1_000_000
 KINDS = frozenset(
@@ -18,7 +18,7 @@ KINDS = frozenset(
 DOWN = ("waiting", "failed")
 
 
-def find_incidents(ground: EmbeddedGround, windows: Sequence[Window]) -> list[dict[str, Any]]:
+def find_incidents(ground: MissionGround, windows: Sequence[Window]) -> list[dict[str, Any]]:
     """Return what went wrong with its recovery (None: none), in order of time.
 
     Times of links and of failed work are those of the wall clock, others are mission time.
@@ -104,7 +104,7 @@ def _dropped(logged: LoggedEvent, event: LinkChanged, recovery: str | None) -> d
     )
 
 
-def _failed_work(ground: EmbeddedGround, events: Sequence[LoggedEvent]) -> Iterable[dict[str, Any]]:
+def _failed_work(ground: MissionGround, events: Sequence[LoggedEvent]) -> Iterable[dict[str, Any]]:
     for logged in events:
         if logged.kind == FollowUpFailed.event_kind:
             failed = FollowUpFailed.of(logged)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -20,11 +19,13 @@ from payload_emulator.session.flying import SPACECRAFT_ID
 from payload_emulator.session.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
 from studies.mission_run.checkpoints import Checkpoints
+from studies.mission_run.distributed import DistributedGround, Servers
 from studies.mission_run.dynamics import DAY_NS, FlightDynamics
 from studies.mission_run.figures import closing_figures
-from studies.mission_run.ground import POLL_S, EmbeddedGround, PlanTerms
-from studies.mission_run.processes import cpu_s, resident_mib
-from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
+from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround, PlanTerms
+from studies.mission_run.kills import SPACECRAFT, Keeper, plan_kills
+from studies.mission_run.processes import Usage
+from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftKilled, SpacecraftProcess
 
 DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 """Stations where the scenario names none: the Moon is always above the horizon of one of them."""
@@ -37,9 +38,6 @@ LAST_NS = 4 * 3600 * NS
 
 CHECKPOINT_S = 60.0
 """Wall time between two checkpoints."""
-
-SOCKET_S = 60.0
-"""Longest wait for octets that were sent to reach the spacecraft."""
 
 COUNTED = (
     "frames", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
@@ -67,16 +65,26 @@ one_person_for = [
 """
 
 Say = Callable[[str], None]
+OWN_SERVERS = Servers()
 
 
 @dataclass(frozen=True, slots=True)
 class RunTerms:
-    """What is run."""
+    """What is run.
+
+    Attributes
+    ----------
+    kills
+        Number of kills of processes at points of `kill_seed`, in the distributed form.
+    """
 
     days: float
     rate: float = 0.0
     windows_per_day: int = 2
     window_s: float = 720.0
+    distributed: bool = False
+    kill_seed: int | None = None
+    kills: int = 0
 
     @property
     def latitude_limit_deg(self) -> float:
@@ -121,7 +129,12 @@ class Progress:
 
 
 def run_mission(
-    scenario: Scenario, data: DataFolder, folder: Path, terms: RunTerms, say: Say
+    scenario: Scenario,
+    data: DataFolder,
+    folder: Path,
+    terms: RunTerms,
+    say: Say,
+    servers: Servers = OWN_SERVERS,
 ) -> dict[str, Any]:
     """Run a mission in a folder, or go on with the one that is there; the closing figures.
 
@@ -132,7 +145,7 @@ def run_mission(
     GroundError, LinkError
         A part did not do what is expected of it; the run can be taken up again.
     """
-    run = MissionRun(_prepared(scenario), data, folder, terms, say)
+    run = MissionRun(_prepared(scenario), data, folder, terms, say, servers)
     return run.run()
 
 
@@ -145,8 +158,18 @@ def _prepared(scenario: Scenario) -> Scenario:
 class MissionRun:
     """One run of a mission in a folder, by this process."""
 
-    def __init__(self, scenario: Scenario, data: DataFolder, folder: Path, terms: RunTerms, say: Say) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        data: DataFolder,
+        folder: Path,
+        terms: RunTerms,
+        say: Say,
+        servers: Servers = OWN_SERVERS,
+    ) -> None:
         self._scenario, self._data, self._folder, self._terms, self._say = scenario, data, folder, terms, say
+        self._servers = servers
+        self._keeper: Keeper | None = None
         self._files = SpacecraftFiles(
             folder / "scenario.toml",
             folder / "clock",
@@ -154,13 +177,15 @@ class MissionRun:
             folder / "operations.toml",
             folder / "spacecraft.log",
             folder / "spacecraft.snapshot",
+            folder / "spacecraft.journal",
         )
-        self._checkpoints = Checkpoints(folder, folder / "ground", self._files.snapshot)
+        home = None if terms.distributed else folder / "ground"
+        self._checkpoints = Checkpoints(folder, home, self._files.snapshot)
         self._progress_file = folder / "progress.json"
         self._progress = Progress()
         self._begun_s = self._kept_s = time.monotonic()
         self._wall_before_s = 0.0
-        self._cpu_before_s: dict[str, float] = {}
+        self._usage = Usage()
 
     def run(self) -> dict[str, Any]:
         """Run until the days are over; after an interruption the next call continues from the last checkpoint."""
@@ -179,51 +204,84 @@ class MissionRun:
             self._files, self._scenario.link.stations, self._terms.days, self._terms.rate
         )
         try:
-            ground = EmbeddedGround.open(self._folder / "ground", self._data, self._files.clock)
+            ground = self._open_ground()
             try:
                 self._operate(spacecraft, ground, dynamics)
                 return self._close(ground)
             finally:
-                ground.close()
+                ground.close(is_finished=self._progress.finished)
         finally:
             spacecraft.stop()
             self._save()
 
+    def _open_ground(self) -> EmbeddedGround | DistributedGround:
+        if self._terms.distributed:
+            return DistributedGround(self._folder, self._data, self._files.clock, self._servers)
+        return EmbeddedGround.open(self._folder / "ground", self._data, self._files.clock)
+
     def _operate(
-        self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, dynamics: FlightDynamics
+        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
     ) -> None:
         self._post(spacecraft, ground, dynamics)
-        spacecraft.order("run")
+        self._save()
+        if isinstance(ground, DistributedGround):
+            self._keeper = self._made_keeper(spacecraft, ground)
+            self._keeper.start()
+        try:
+            while True:
+                try:
+                    self._follow(spacecraft, ground, dynamics)
+                    return
+                except SpacecraftKilled:
+                    if self._keeper is None:
+                        raise
+                    self._go_back()
+                    spacecraft.restart()
+                    self._keeper.recovered()
+        finally:
+            if self._keeper is not None:
+                self._keeper.stop()
+
+    def _follow(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
+        """Let time pass from contact to contact until the end of the run."""
         messages = spacecraft.messages()
+        spacecraft.order("run")
         for message in messages:
             kind = message["kind"]
             if kind == "contact":
                 self._note(message)
                 now = parse_utc(message["utc"])
+                self._stop_for_kill(message["state"], now)
                 if message["state"] == "started":
                     self._deliver_reference(ground, dynamics, now)
-                    ground.wait_sent()
-                    self._wait_uplinked(spacecraft, ground, messages)
+                    # The links have begun the contact; they ingest its first frame with the next ones.
+                    self._wait_acknowledged(spacecraft, messages)
+                    ground.wait_idle()
+                    ground.wait_sent(message["station"])
                     spacecraft.order("run")
                 else:
                     # The ground has everything before time goes on, so that a run gives the same at any speed.
-                    ground.wait_received(message["sent"])
+                    self._wait_acknowledged(spacecraft, messages)
+                    ground.wait_ingested()
                     self._progress.contact_stops.append(message["utc"])
                     spacecraft.order(f"until {format_utc(now + SETTLE_NS)}")
             elif kind == "paused":
                 spacecraft.order("state")
             elif kind in ("state", "finished"):
                 self._note({**message, "state": kind})
-                ground.wait_received(message["sent"])
+                self._stop_for_kill("settled", parse_utc(message["utc"]))
+                self._wait_acknowledged(spacecraft, messages)
+                ground.wait_ingested()
                 ground.wait_settled()
                 if message["station"]:
-                    ground.wait_sent()
-                    self._wait_uplinked(spacecraft, ground, messages)
+                    ground.wait_sent(message["station"])
                 self._watch(ground, spacecraft, message)
                 if kind == "finished":
+                    if self._keeper is not None and not self._keeper.wait():
+                        continue  # the spacecraft was killed: its console has ended
                     return
                 due = time.monotonic() - self._kept_s >= CHECKPOINT_S
-                spacecraft.order("save" if due else "run")
+                spacecraft.order("save" if due or self._terms.kills else "run")
             elif kind == "saved":
                 if message["saved"]:
                     self._checkpoints.keep(self._progress_file)
@@ -233,25 +291,52 @@ class MissionRun:
                 raise LinkError(f"spacecraft: {message['text']}")
         raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
 
-    def _wait_uplinked(
-        self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, messages: Iterator[dict[str, Any]]
-    ) -> None:
-        """Wait until the stations of the spacecraft, whose time stands still, have what the links have sent."""
-        until = time.monotonic() + SOCKET_S
+    @staticmethod
+    def _wait_acknowledged(spacecraft: SpacecraftProcess, messages: Iterator[dict[str, Any]]) -> None:
+        """Wait until the links have stored everything that the stations have received, whose time stands still."""
+        until = time.monotonic() + SETTLE_S
         while True:
             spacecraft.order("state")
-            found = _next_state(messages)["uplinked"]
-            sent = ground.octets_sent()
-            if all(found.get(name, 0) >= count for name, count in sent.items()):
+            left = int(_next_state(messages)["unacknowledged"])
+            if not left:
                 return
             if time.monotonic() >= until:
                 raise LinkError(
-                    f"spacecraft: expected the octets of telecommands that were sent ({sent}) "
-                    f"within {SOCKET_S:.0f} s, found {found}"
+                    f"stations: expected the acknowledgement of all telemetry within {SETTLE_S:.0f} s, "
+                    f"found {left} octets without it"
                 )
             time.sleep(POLL_S)
 
-    def _post(self, spacecraft: SpacecraftProcess, ground: EmbeddedGround, dynamics: FlightDynamics) -> None:
+    # Kills
+
+    def _made_keeper(self, spacecraft: SpacecraftProcess, ground: DistributedGround) -> Keeper:
+        terms, epoch = self._terms, self._scenario.epoch_utc_ns
+        parts = (*ground.parts, SPACECRAFT)
+        stop = epoch + round(terms.days * DAY_NS)
+        planned = plan_kills(terms.kill_seed or 0, parts, epoch, stop, terms.kills)
+        return Keeper(
+            ground.parts,
+            planned,
+            spacecraft.kill,
+            ground.note_processes,
+            self._folder / "kills.json",
+            self._say,
+        )
+
+    def _stop_for_kill(self, phase: str, utc_ns: int) -> None:
+        if self._keeper is not None:
+            self._keeper.at_stop(phase, utc_ns)
+
+    def _go_back(self) -> None:
+        """Return to the last exact state of the spacecraft; the ground keeps what it has."""
+        known, kept = self._progress, self._checkpoints.restore()
+        before = Progress() if kept is None else _read_progress(kept)
+        self._progress = replace(
+            before, starts=known.starts, posts=known.posts, request_id=known.request_id,
+            reference_day=known.reference_day, memory_mib=known.memory_mib, cpu_s=known.cpu_s,
+        )  # fmt: skip
+
+    def _post(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
         """Post what a user posts: catalogue, mission description, ephemeris, commissioning, standing request.
 
         A later start posts the mission description only, which names the ports of the spacecraft.
@@ -276,7 +361,7 @@ class MissionRun:
             self._progress.request_id = ground.client.add_request(terms.request(SPACECRAFT_ID)).id
         self._progress.posts.append((before + 1, ground.audit_head()))
 
-    def _commission(self, ground: EmbeddedGround) -> None:
+    def _commission(self, ground: MissionGround) -> None:
         """Send what a new spacecraft is told once: reports of time, how often memory is checked."""
         for name, arguments in (
             ("set_time_report_rate", {"rate_exponent": TIME_RATE_EXPONENT}),
@@ -285,7 +370,7 @@ class MissionRun:
             command = ground.client.enter_telecommand(name, arguments, spacecraft_id=SPACECRAFT_ID)
             ground.client.release_telecommand(command.id)
 
-    def _deliver_reference(self, ground: EmbeddedGround, dynamics: FlightDynamics, now: int) -> None:
+    def _deliver_reference(self, ground: MissionGround, dynamics: FlightDynamics, now: int) -> None:
         """Give the ground the orbit determination of the day."""
         day = (now - self._scenario.epoch_utc_ns) // DAY_NS
         if day > self._progress.reference_day:
@@ -301,15 +386,12 @@ class MissionRun:
         for name in COUNTED:
             setattr(progress, name, message[name])
 
-    def _watch(self, ground: EmbeddedGround, spacecraft: SpacecraftProcess, message: dict[str, Any]) -> None:
+    def _watch(self, ground: MissionGround, spacecraft: SpacecraftProcess, message: dict[str, Any]) -> None:
         progress = self._progress
-        for name, process in (("ground", os.getpid()), ("spacecraft", spacecraft.process.pid)):
-            used = resident_mib(process)
-            if used is not None:
-                progress.memory_mib.setdefault(name, []).append(used)
-            spent = cpu_s(process)
-            if spent is not None:
-                progress.cpu_s[name] = round(self._cpu_before_s.get(name, 0.0) + spent, 1)
+        processes = {**ground.processes, SPACECRAFT: spacecraft.process.pid}
+        for name, process in processes.items():
+            self._usage.note(name, process, family=self._terms.distributed)
+        progress.memory_mib, progress.cpu_s = self._usage.memory_mib, self._usage.cpu_s
         windows = ground.windows()
         for window in windows:
             if window.state == "processed":
@@ -323,9 +405,15 @@ class MissionRun:
             f"{progress.frames} frames, {progress.packets} packets, windows: {states or 'none'}"
         )
 
-    def _close(self, ground: EmbeddedGround) -> dict[str, Any]:
+    def _close(self, ground: MissionGround) -> dict[str, Any]:
         self._save()
         figures = closing_figures(ground, self._progress, self._terms.days, self._scenario.name)
+        figures["form"] = "distributed" if self._terms.distributed else "embedded"
+        if self._keeper is not None:
+            figures["kills"] = {"seed": self._terms.kill_seed, **self._keeper.figures()}
+            figures["incidents"] = sorted(
+                [*figures["incidents"], *self._keeper.incidents()], key=lambda one: str(one["utc"])
+            )
         (self._folder / "report.json").write_text(json.dumps(figures, indent=2) + "\n")
         from studies.mission_run.document import save_document
 
@@ -354,10 +442,16 @@ class MissionRun:
             self._progress = _read_progress(self._progress_file)
         if self._progress.finished:
             return
-        kept = self._checkpoints.restore()
-        self._progress = Progress() if kept is None else _read_progress(kept)
-        self._wall_before_s = self._progress.wall_s
-        self._cpu_before_s = dict(self._progress.cpu_s)
+        if self._terms.distributed:
+            self._wall_before_s = self._progress.wall_s
+            self._go_back()
+        else:
+            # The archive goes back as well, and sends again what the spacecraft has not seen.
+            self._files.journal.unlink(missing_ok=True)
+            kept = self._checkpoints.restore()
+            self._progress = Progress() if kept is None else _read_progress(kept)
+            self._wall_before_s = self._progress.wall_s
+        self._usage = Usage(dict(self._progress.memory_mib), dict(self._progress.cpu_s))
         self._say(f"{self._folder}: continues from {self._progress.utc or 'the start'}")
 
     def _save(self) -> None:

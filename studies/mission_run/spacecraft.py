@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from payload_emulator.errors import LinkError
+from studies.mission_run.parts import free_port, kill_family
 
 START_S = 180.0
 STOP_S = 60.0
@@ -28,13 +29,6 @@ ALLOCATOR = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": str(4 << 20)}
 """Settings of the C library: large arrays go back to the system when they are dropped, so that memory stays flat."""
 
 
-def free_ports(count: int) -> list[int]:
-    """Return ports that are free now."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [one.getsockname()[1] for one in sockets]
-
-
 @dataclass(frozen=True, slots=True)
 class SpacecraftFiles:
     """Files of a spacecraft under the folder of a run."""
@@ -45,36 +39,56 @@ class SpacecraftFiles:
     operations: Path
     log: Path
     snapshot: Path
+    journal: Path
+
+
+class SpacecraftKilled(LinkError):
+    """The process of the spacecraft was killed; it can be started again from its last exact state."""
 
 
 class SpacecraftProcess:
     """The emulated spacecraft and its stations in a process; `messages` of its console in order."""
 
     def __init__(self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float) -> None:
+        self._files, self._stations, self._days, self._rate = files, stations, days, rate
         self._log = files.log
+        self._station_ports = [free_port() for _ in range(2 * len(stations))]
+        self._launch(keeps_ports=False)
+
+    def restart(self) -> None:
+        """Start the process after its end, from its last exact state and with the same ports of its stations."""
+        self._console.close()
+        self._launch(keeps_ports=True)
+
+    def _launch(self, *, keeps_ports: bool) -> None:
         for attempts_left in reversed(range(START_ATTEMPTS)):
             try:
-                self._start(files, stations, days, rate)
+                self._start()
                 break
             except LinkError as error:
                 # Another process can take a port between its choice and its use.
                 if attempts_left == 0 or "Address already in use" not in str(error):
                     raise
+                if not keeps_ports:
+                    self._station_ports = [free_port() for _ in self._station_ports]
         self._lines = self._console.makefile("r")
 
-    def _start(self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float) -> None:
-        console, mission, *station_ports = free_ports(2 + 2 * len(stations))
+    def _start(self) -> None:
+        files, station_ports = self._files, self._station_ports
+        console, mission = free_port(), free_port()
         self.mission_port = mission
-        words = ["emulate", files.scenario, "--continuous", "--days", days, "--rate", rate, "--hold-contacts"]
+        words = ["emulate", files.scenario, "--continuous", "--days", self._days, "--rate", self._rate]
+        words += ["--hold-contacts", "--journal", files.journal]
         words += ["--console-port", console, "--mission-port", mission, "--snapshot", files.snapshot]
         words += ["--clock-file", files.clock, "--operations", files.operations, "--craters", files.craters]
         words += ["--keep-unacknowledged", "--paused", "--end-with-console"]
         words += ["--json"]
-        for k, name in enumerate(stations):
+        for k, name in enumerate(self._stations):
             words += ["--station-port", f"{name}:{station_ports[2 * k]}:{station_ports[2 * k + 1]}"]
         command = [sys.executable, "-m", "linna", *map(str, words)]
         with files.log.open("ab") as log:
             # A group of its own: Ctrl-C reaches the runner, which stops the spacecraft in order.
+            self.was_killed = False
             self.process = subprocess.Popen(
                 command, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **ALLOCATOR}
             )
@@ -86,11 +100,27 @@ class SpacecraftProcess:
             for line in self._lines:
                 yield json.loads(line)
         except (OSError, ValueError) as error:
+            self._check_killed()
             raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
+        self._check_killed()
 
     def order(self, word: str) -> None:
         """Send a word to the console."""
-        self._console.sendall(word.encode() + b"\n")
+        try:
+            self._console.sendall(word.encode() + b"\n")
+        except OSError as error:
+            self._check_killed()
+            raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
+
+    def kill(self) -> None:
+        """Kill the process (SIGKILL)."""
+        self.was_killed = True
+        kill_family(self.process.pid)
+
+    def _check_killed(self) -> None:
+        if self.was_killed:
+            self.process.wait(STOP_S)
+            raise SpacecraftKilled("spacecraft: its process was killed")
 
     def mission_text(self) -> bytes:
         """Return the mission description that the spacecraft's operator hands over."""

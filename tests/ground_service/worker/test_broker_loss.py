@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -17,73 +16,32 @@ from ground_service.store.database import prepare_database
 from ground_service.worker.app import queued_jobs
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.scheduler import Scheduler
-from tests.ground_service.conftest import free_port, wait_for
-
-
-class Broker:
-    """A Redis server that keeps nothing on disk."""
-
-    def __init__(self, folder: Path, port: int) -> None:
-        words = [
-            "--port",
-            str(port),
-            "--bind",
-            "127.0.0.1",
-            "--dir",
-            str(folder),
-            "--save",
-            "",
-            "--appendonly",
-            "no",
-        ]
-        self.process = subprocess.Popen(["redis-server", *words], stdout=subprocess.DEVNULL)
-        self.url = f"redis://127.0.0.1:{port}/0"
-        import redis
-
-        def answers() -> bool:
-            try:
-                with redis.Redis.from_url(self.url) as client:
-                    return bool(client.ping())
-            except redis.RedisError:
-                return False
-
-        wait_for(answers, "redis-server")
-
-    def kill(self) -> None:
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
+from studies.mission_run.parts import RedisServer
+from tests.ground_service.conftest import wait_for
 
 
 @pytest.fixture
-def start_broker(tmp_path: Path) -> Iterator[Callable[[], Broker]]:
+def broker(tmp_path: Path) -> Iterator[RedisServer]:
     if shutil.which("redis-server") is None:
         pytest.skip("redis-server is not installed")
-    port, started = free_port(), []
-
-    def start() -> Broker:
-        started.append(Broker(tmp_path, port))
-        return started[-1]
-
-    yield start
-    for broker in started:
-        broker.process.kill()
-        broker.process.wait()
+    server = RedisServer(tmp_path)
+    yield server
+    server.part.end()
 
 
 def test_jobs_survive_a_broker_that_is_killed(
-    new_postgres_database: Callable[[], str], start_broker: Callable[[], Broker], tmp_path: Path
+    new_postgres_database: Callable[[], str], broker: RedisServer, tmp_path: Path
 ) -> None:
     url = new_postgres_database()
     prepare_database(url, upgrade=True).engine.dispose()
-    broker = start_broker()
     settings = Settings(home=tmp_path / "home", database_url=url, broker_url=broker.url)
     with open_ground(settings.home, database_url=url) as ground:
         dispatcher = dispatcher_for(ground, settings)
         jobs = [dispatcher.submit("plan", {}) for _ in range(5)]
         assert sorted(queued_jobs(settings)) == sorted(jobs)
-        broker.kill()
+        broker.part.kill()
         jobs.append(dispatcher.submit("plan", {}))  # accepted while there is no broker
-        start_broker()
+        broker.part.start()
         jobs.append(dispatcher.submit("plan", {}))  # the queue is not empty
         assert queued_jobs(settings) == jobs[-1:]
         Scheduler(ground, dispatcher, lambda: None, {"retention_days": 90}).tick()

@@ -16,7 +16,7 @@ import pytest
 from sqlalchemy import text
 
 from benchmarks.campaigns._clients import Session, cut_pieces
-from benchmarks.campaigns._deployment import Part, bare_environment, free_port, listens, wait_until
+from benchmarks.campaigns._deployment import wait_until
 from benchmarks.campaigns._failover import DatabaseCluster
 from benchmarks.campaigns.kill import contents, ends_of
 from benchmarks.ground import mixed_downlink
@@ -24,6 +24,7 @@ from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store.database import open_database
+from studies.mission_run.parts import Part, bare_environment, free_port, listens
 
 RECOVERY_S = 60.0
 """Requirement: time without a person from the loss of the primary to the next acknowledged upload."""

@@ -1,0 +1,181 @@
+"""The distributed ground service of a mission run: separate processes on PostgreSQL and Redis.
+
+The run starts a database server and a broker of its own, unless it is given some, an API process, workers, a scheduler
+and a process for the links. Mission time comes from the file of the spacecraft, so that all processes have the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pydantic import SecretStr
+
+from ground_service.access.service import add_user, renew_token
+from ground_service.client.operations import Client
+from ground_service.clock import ClockFile, set_mission_clock
+from ground_service.errors import Conflict, GroundError
+from ground_service.ground import Ground, open_ground
+from ground_service.links import service as links
+from ground_service.settings import Settings
+from ground_service.store import leases
+from ground_service.store.database import prepare_database
+from ground_service.worker.app import worker_answers
+from ground_service.worker.scheduler import LEASE
+from lunar.datafolder import DataFolder
+from studies.mission_run.ground import FLIGHT_DYNAMICS, USER, MissionGround
+from studies.mission_run.parts import (
+    Part,
+    PidFile,
+    PostgresServer,
+    RedisServer,
+    answers_http,
+    bare_environment,
+    free_port,
+    runs,
+)
+
+WORKERS = 2
+ANSWER_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Servers:
+    """URLs of a database and a broker that the run uses; None: it starts its own."""
+
+    database_url: str | None = None
+    broker_url: str | None = None
+
+
+class DistributedGround(MissionGround):
+    """The service as separate processes, `parts` by name."""
+
+    def __init__(self, folder: Path, data: DataFolder, clock_file: Path, servers: Servers) -> None:
+        self.parts: dict[str, Part] = {}
+        self.pids = PidFile(folder / "processes.json")
+        self.pids.end_left_over()
+        self._postgres: PostgresServer | None = None
+        self._clients: list[Client] = []
+        try:
+            settings = self._start_servers(folder, data, clock_file, servers)
+            set_mission_clock(ClockFile(clock_file).read)
+            self.ground = open_ground(settings.home, data, database_url=settings.resolved_database_url())
+            self._start_service(folder, settings, servers)
+            self.note_processes()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def processes(self) -> dict[str, int]:
+        """The processes by name, of which this one operates the run."""
+        return {"run": os.getpid(), **{name: part.pid for name, part in self.parts.items()}}
+
+    def note_processes(self) -> None:
+        """Record the processes, so that a later run can end them if this one is killed."""
+        self.pids.note({name: part.pid for name, part in self.parts.items()})
+
+    def deliver_reference(self, path: Path, day: int) -> None:
+        """Upload the orbit determination of a day as flight dynamics; the same file again changes nothing."""
+        name = f"orbit determination of day {day}"
+        self._wait(
+            lambda: bool(self._flight_dynamics.add_ephemeris(path, name=name, precedence=day)),
+            "upload of " + name,
+        )
+
+    def close(self, *, is_finished: bool = False) -> None:
+        """Stop all processes; the files of the database server of a run that is finished are removed."""
+        for client in self._clients:
+            client.close()
+        for name, part in reversed(self.parts.items()):
+            part.end(signal.SIGINT if name == "database" else signal.SIGTERM)
+        if hasattr(self, "ground"):
+            self.ground.close()
+        set_mission_clock()
+        if is_finished and self._postgres is not None:
+            self._postgres.remove()
+
+    def _start_servers(self, folder: Path, data: DataFolder, clock_file: Path, servers: Servers) -> Settings:
+        url, broker = servers.database_url, servers.broker_url
+        if url is None:
+            self._postgres = PostgresServer(folder)
+            self.parts["database"] = self._postgres.part
+            url = self._postgres.prepare_service()
+        else:
+            prepare_database(url, upgrade=True).engine.dispose()
+        if broker is None:
+            redis = RedisServer(folder)
+            self.parts["broker"] = redis.part
+            broker = redis.url
+        given = {
+            "LINNA_HOME": str(folder / "ground"),
+            "LINNA_DATABASE_URL": url,
+            "LINNA_BROKER_URL": broker,
+            "LINNA_CLOCK_FILE": str(clock_file.absolute()),
+            "LINNA_RATE_LIMIT_PER_S": "0",
+            "LINNA_LINKS": "false",
+            "LINNA_PLAN_HOURLY": "false",
+            "LINNA_ALLOW_DATABASE_OWNER": "false" if servers.database_url is None else "true",
+        }
+        self._environment = bare_environment(**given)
+        self._environment.pop("LINNA_DATA", None)
+        if data.root is not None:
+            self._environment["LINNA_DATA"] = str(data.root)
+        return Settings(
+            home=folder / "ground", database_url=SecretStr(url), broker_url=SecretStr(broker), data=data.root
+        )
+
+    def _start_service(self, folder: Path, settings: Settings, servers: Servers) -> None:
+        port = free_port()
+        address = f"http://127.0.0.1:{port}"
+        tokens = {name: _token(self.ground, name) for name in (USER, FLIGHT_DYNAMICS)}
+        commands: Mapping[str, tuple[list[str], Callable[[], bool]]] = {
+            "api": (["serve", "--port", str(port)], partial(answers_http, f"{address}/readyz")),
+            "worker": (
+                ["worker", "--concurrency", str(WORKERS)],
+                partial(worker_answers, settings, timeout_s=ANSWER_S),
+            ),
+            "scheduler": (["scheduler"], self._has_scheduler),
+            "link": (["link", "run"], self._are_links_operated),
+        }
+        for name, (words, ready) in commands.items():
+            command = [sys.executable, "-m", "linna", *words]
+            self.parts[name] = Part(command, folder / f"{name}.log", _safely(ready), env=self._environment)
+            self.parts[name].start()
+        self.client = Client(address, tokens[USER])
+        self._flight_dynamics = Client(address, tokens[FLIGHT_DYNAMICS])
+        self._clients = [self.client, self._flight_dynamics]
+
+    def _has_scheduler(self) -> bool:
+        with self.ground.database.reading() as connection:
+            return _is_here(leases.owner_of(connection, LEASE))
+
+    def _are_links_operated(self) -> bool:
+        return all(_is_here(one) for one in links.owners(self.ground).values())
+
+
+def _is_here(owner: str | None) -> bool:
+    """Return whether the owner of a lease, ``HOST:PID:ID``, is a process of this machine that runs."""
+    return owner is not None and runs(int(owner.split(":")[-2]))
+
+
+def _safely(ready: Callable[[], bool]) -> Callable[[], bool]:
+    def is_ready() -> bool:
+        with contextlib.suppress(GroundError, OSError):
+            return ready()
+        return False
+
+    return is_ready
+
+
+def _token(ground: Ground, name: str) -> str:
+    try:
+        return add_user(ground, name, "admin")
+    except Conflict:
+        return renew_token(ground, name)

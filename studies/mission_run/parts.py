@@ -1,0 +1,311 @@
+"""Processes of a deployment on private ports of this machine, each of which can be killed and started again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import text
+
+from ground_service.errors import GroundError
+from ground_service.store.database import prepare_database
+from ground_service.store.roles import grant_service
+
+START_S = 120.0
+STOP_S = 30.0
+PORTS = range(15_000, 32_000)
+"""Below the ports that the kernel gives to outgoing connections, which could take a port while its server is down."""
+
+SERVICE_ROLE = "service"
+
+
+def free_port() -> int:
+    """Return a port that is free now."""
+    for port in random.SystemRandom().sample(PORTS, 200):
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
+    raise GroundError(
+        f"ports {PORTS.start} to {PORTS.stop - 1}: expected a free one, found none in 200 attempts"
+    )
+
+
+def listens(port: int) -> bool:
+    """Return whether a program of this machine listens on a port."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def answers_http(url: str) -> bool:
+    """Return whether a GET request is answered with success."""
+    try:
+        with urllib.request.urlopen(url, timeout=5) as answer:
+            return bool(answer.status == 200)
+    except OSError:
+        return False
+
+
+class Part:
+    """A process of the deployment that can be killed with all its children and started again."""
+
+    def __init__(self, command: list[str], log: Path, ready: Callable[[], bool], **options: Any) -> None:
+        self._command, self._log, self._ready, self._options = command, log, ready, options
+        self._process: subprocess.Popen[bytes] | None = None
+        self._ended = False
+
+    def start(self) -> None:
+        """Start it, again when it gives up at once (what it was killed with may not be gone yet).
+
+        Raises
+        ------
+        GroundError
+            It is not ready within `START_S`.
+        """
+        until = time.monotonic() + START_S
+        while time.monotonic() < until and not self._ended:
+            with self._log.open("ab") as log:
+                self._process = subprocess.Popen(
+                    self._command, stdout=log, stderr=log, start_new_session=True, **self._options
+                )
+            while time.monotonic() < until and self._process.poll() is None:
+                if self._ready():
+                    return
+                time.sleep(0.1)
+            time.sleep(0.5)
+        if self._ended:
+            return
+        tail = self._log.read_text(errors="replace")[-500:].strip().replace("\n", " | ")
+        raise GroundError(
+            f"{' '.join(self._command[:4])}: expected it to start within {START_S:.0f} s, found: {tail}"
+        )
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it was started and has ended by itself."""
+        return not self._ended and self._process is not None and self._process.poll() is not None
+
+    def revive(self) -> None:
+        """Start it where it has ended by itself, as a supervisor would."""
+        if self.has_ended:
+            self.start()
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        assert self._process is not None
+        return self._process.pid
+
+    def kill_child(self, module: str) -> bool:
+        """Kill the child process that runs this module, which its parent restarts; return whether there was one."""
+        for pid in descendants(self.pid):
+            with contextlib.suppress(OSError):
+                if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                    os.kill(pid, signal.SIGKILL)
+                    return True
+        return False
+
+    def end(self, number: signal.Signals | None = None) -> None:
+        """End it for good, with a signal first if one is given: it is not started again."""
+        self._ended = True
+        if self._process is None:
+            return
+        if number is not None and self._process.poll() is None:
+            with contextlib.suppress(OSError, IndexError):
+                as_other = self._command[0] == "runuser"
+                os.kill(descendants(self._process.pid)[0] if as_other else self._process.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(STOP_S)
+        self.kill()
+
+    def finish(self, seconds: float = 120.0) -> None:
+        """Ask it to end (SIGTERM), as a supervisor would, and wait until it has."""
+        assert self._process is not None
+        self._process.terminate()
+        self._process.wait(seconds)
+
+    def kill(self) -> None:
+        """Kill it and all its children (SIGKILL), and wait for their end."""
+        assert self._process is not None
+        if self._process.poll() is not None:
+            return  # its number may be somebody else's by now
+        kill_family(self._process.pid)
+        self._process.wait()
+
+
+def kill_family(pid: int) -> None:
+    """Kill a process and its descendants, and wait until they have ended."""
+    family = [pid, *descendants(pid)]
+    for one in family:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(one, signal.SIGKILL)
+    until = time.monotonic() + 10.0
+    while any(runs(one) for one in family) and time.monotonic() < until:
+        time.sleep(0.05)
+
+
+def runs(pid: int) -> bool:
+    """Return whether a process exists and is not a zombie."""
+    return (started_ticks(pid) or 0) > 0
+
+
+def started_ticks(pid: int) -> int | None:
+    """Return the start of a running process in clock ticks since boot; None if it does not run."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the processes below another, by what the kernel says."""
+    children: dict[int, list[int]] = {}
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = entry.read_text().rpartition(")")[2].split()
+            children.setdefault(int(fields[1]), []).append(int(entry.parent.name))
+    found, waiting = [], list(children.get(pid, ()))
+    while waiting:
+        found.append(waiting.pop(0))
+        waiting += children.get(found[-1], ())
+    return found
+
+
+class PidFile:
+    """Processes that a run has started, by name, so that the next run can end those that a killed run has left."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+
+    def note(self, pids: Mapping[str, int]) -> None:
+        """Record the processes."""
+        with self._lock:
+            known = {name: [pid, started_ticks(pid)] for name, pid in pids.items()}
+            new = self._path.with_name(self._path.name + ".new")
+            new.write_text(json.dumps(known))
+            new.replace(self._path)
+
+    def end_left_over(self) -> None:
+        """Kill the recorded processes that still run."""
+        try:
+            known = json.loads(self._path.read_text())
+        except (OSError, ValueError):
+            return
+        for pid, started in known.values():
+            if started is not None and started_ticks(pid) == started:
+                kill_family(pid)
+        self._path.unlink(missing_ok=True)
+
+
+class PostgresServer:
+    """A PostgreSQL server on a private port, with a database `linna` and its files under `folder`.
+
+    Its own files are in a folder of the user `postgres` outside of `folder` if this process runs as root.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+        if not found:
+            raise GroundError("expected PostgreSQL on this machine, found none under /usr/lib/postgresql")
+        self._bin = found[-1].parent
+        self._user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
+        self._port = free_port()
+        self.url = f"postgresql+psycopg://linna@127.0.0.1:{self._port}/linna"
+        note = folder / "postgres-folder"
+        is_new = not note.exists()
+        if is_new:
+            self._place = Path(tempfile.mkdtemp(prefix="linna-postgres-", dir=None if self._user else folder))
+            if self._user:
+                shutil.chown(self._place, "postgres", "postgres")
+            self._run("initdb", "-D", str(self._place / "data"), "-U", "linna", "-A", "trust", "--no-sync")
+        else:
+            self._place = Path(note.read_text())
+        words = ["-p", str(self._port), "-k", str(self._place), "-h", "127.0.0.1", "-c", "fsync=off"]
+        server = [*self._user, str(self._bin / "postgres"), "-D", str(self._place / "data"), *words]
+        self.part = Part(server, folder / "postgres.log", self._answers, cwd=self._place)
+        self.part.start()
+        if is_new:
+            self._run("createdb", "-h", "127.0.0.1", "-p", str(self._port), "-U", "linna", "linna")
+            note.write_text(str(self._place))
+
+    def __enter__(self) -> PostgresServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.part.end()
+        self.remove()
+
+    def prepare_service(self) -> str:
+        """Create the schema as its owner and a role of the service that owns nothing; return the URL of the role."""
+        database = prepare_database(self.url, upgrade=True)
+        with database.writing() as connection:
+            query = text("SELECT 1 FROM pg_roles WHERE rolname = :name")
+            if connection.execute(query, {"name": SERVICE_ROLE}).first() is None:
+                connection.execute(text(f"CREATE ROLE {SERVICE_ROLE} LOGIN"))
+        grant_service(database, SERVICE_ROLE)
+        database.engine.dispose()
+        return self.url.replace("//linna@", f"//{SERVICE_ROLE}@")
+
+    def remove(self) -> None:
+        """Remove its files after its end."""
+        shutil.rmtree(self._place, ignore_errors=True)
+
+    def _run(self, program: str, *arguments: str) -> None:
+        subprocess.run(
+            [*self._user, str(self._bin / program), *arguments],
+            check=True,
+            cwd=self._place,
+            stdout=subprocess.DEVNULL,
+        )
+
+    def _answers(self) -> bool:
+        ask = [str(self._bin / "pg_isready"), "-h", "127.0.0.1", "-p", str(self._port), "-q"]
+        return subprocess.run(ask, check=False).returncode == 0
+
+
+class RedisServer:
+    """A Redis server on a private port that keeps nothing on disk: after a kill its queue is empty."""
+
+    def __init__(self, folder: Path) -> None:
+        program = shutil.which("redis-server")
+        if program is None:
+            raise GroundError("expected redis-server on this machine, found none")
+        port = free_port()
+        self.url = f"redis://127.0.0.1:{port}/0"
+        words = ["--port", str(port), "--bind", "127.0.0.1", "--dir", str(folder)]
+        words += ["--save", "", "--appendonly", "no"]
+        self.part = Part([program, *words], folder / "redis.log", lambda: _answers_ping(port))
+        self.part.start()
+
+
+def _answers_ping(port: int) -> bool:
+    """Return whether a Redis server answers on a port, without its client library."""
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=2.0) as connection:
+            connection.sendall(b"PING\r\n")
+            return connection.recv(16).startswith(b"+PONG")
+    except OSError:
+        return False
+
+
+def bare_environment(**settings: str) -> dict[str, str]:
+    """Return the environment with these settings of the service and none that it had before."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("LINNA_") or name == "LINNA_DATA"
+    }
+    return {**kept, **settings}
