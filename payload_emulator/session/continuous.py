@@ -299,9 +299,7 @@ class ContinuousSession:
 
     def _wait(self, selector: selectors.BaseSelector, due_ns: int) -> bool:
         """Serve the ports until it is time for the next step; False where the session is to stop."""
-        while self._to_repeat and self._to_repeat[0].utc_ns <= self.utc_ns:
-            entry = self._to_repeat.popleft()
-            self._send_up(entry.station, entry.number, entry.octets)
+        self._repeat_journal()
         due = time.monotonic() + (due_ns - self.utc_ns) / _NS / self.rate if self.rate > 0.0 else 0.0
         self._serve(selector, 0.0)
         while not self.stopping.is_set():
@@ -537,6 +535,12 @@ class ContinuousSession:
         else:
             self.account.telecommand_octets_lost += len(octets)
         return has_contact
+
+    def _repeat_journal(self) -> None:
+        """Send up what stations had confirmed at this time before the session was killed."""
+        while self._to_repeat and self._to_repeat[0].utc_ns <= self.utc_ns:
+            entry = self._to_repeat.popleft()
+            self._send_up(entry.station, entry.number, entry.octets)
 
     def _send_up(self, station: str, number: int, octets: bytes) -> None:
         if octets:

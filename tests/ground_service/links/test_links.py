@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import struct
 import threading
 import time
@@ -18,7 +20,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.links import service, store
 from ground_service.links.runner import LinkRunner
-from ground_service.links.stream import ACKNOWLEDGEMENT
+from ground_service.links.stream import ACKNOWLEDGEMENT, TRANSMISSION
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
 from tests.ground_service.archive_hash import archive_hash
@@ -498,3 +500,63 @@ def _lease(ground: Ground) -> int:
         found = store.find_link(connection, "lab")
     assert found is not None
     return found.lease_utc_ns
+
+
+class Confirming(Station):
+    """A station that confirms transmissions: `answers` are given first (None: the connection is closed)."""
+
+    def __init__(self, *answers: int | None) -> None:
+        self.answers = list(answers)
+        self.transmissions: list[tuple[int, bytes]] = []
+        super().__init__()
+
+    def _read(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while head := connection.recv(TRANSMISSION.size, socket.MSG_WAITALL):
+                number, length = TRANSMISSION.unpack(head)
+                self.transmissions.append((number, connection.recv(length, socket.MSG_WAITALL)))
+                answer = self.answers.pop(0) if self.answers else number
+                if answer is None:
+                    connection.shutdown(socket.SHUT_RDWR)
+                    return
+                connection.sendall(ACKNOWLEDGEMENT.pack(answer))
+
+
+@pytest.mark.parametrize("answer", [0, 5, None])
+def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(
+    either: Ground, stream: bytes, answer: int | None
+) -> None:
+    station = Confirming(answer, answer)
+    try:
+        declare(either, station.link("confirm = true"))
+        keys = released(either, 2)
+        with operated(either) as runner:
+            station.accept().sendall(stream[: 2 * CADU])
+            until(lambda: runner.commands_unsent == 0, "the record of the transmission")
+        numbers, octets = zip(*station.transmissions, strict=True)
+        assert len(numbers) == 3 and len(set(numbers)) == 1 and numbers[0] > 0
+        assert packets_of(octets[-1]) == octets_of(either, keys)
+    finally:
+        station.close()
+
+
+def test_the_next_owner_knows_when_a_contact_was_heard_last(
+    either: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mission time may stand still then: counted from the start of the process, the silence would never end."""
+    declare(either, station.link())
+    now = [utc_now_ns()]
+    set_mission_clock(lambda: now[0])
+    try:
+        with operated(either) as runner:
+            station.accept().sendall(stream)
+            until(lambda: runner.octets_received == len(stream), "all octets")
+        assert service.find_open_contact(either, "lab") is not None
+        now[0] += 2_000_000_000
+        assert service.silent_contacts(either) == ["lab"]
+        with operated(either, "next"):
+            station.accept()
+            until(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
+        assert service.silent_contacts(either) == []
+    finally:
+        set_mission_clock()

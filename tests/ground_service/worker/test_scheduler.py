@@ -103,6 +103,17 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(
     assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
 
 
+@pytest.mark.parametrize("hourly", [False, True])
+def test_without_the_hourly_plan_only_events_plan(
+    ground: Ground, hourly: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
+    begin, work = parse_utc("2029-08-07T05:00:00Z"), Recorder()
+    monkeypatch.setattr(scheduling, "mission_now_ns", lambda: begin)
+    assert Scheduler(ground, work, lambda: None, 90, plan_hourly=hourly).tick()
+    assert (plan_job_id(begin) in work.submitted) == hourly
+
+
 def test_the_plan_is_entered_once_an_hour_of_mission_time(
     ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:

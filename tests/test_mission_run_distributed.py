@@ -1,0 +1,235 @@
+"""The distributed form of a mission run: processes are killed, and the figures are those of the embedded form."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ground_service.errors import GroundError
+from linna import cli
+from lunar.datafolder import DataFolder
+from payload_emulator.session.scenario import parse_scenario
+from studies.mission_run.kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
+from studies.mission_run.parts import Part, PidFile, PostgresServer, runs
+from studies.mission_run.processes import Usage, family_cpu_s, family_mib
+from studies.mission_run.run import RunTerms, run_mission
+
+HOUR_NS = 3_600_000_000_000
+
+SCENARIO = """
+name = "half-a-day"
+seed = 3
+[orbit]
+epoch = "2029-08-07T00:00:00Z"
+[dynamics]
+gravity = "builtin"
+degree = 8
+[window]
+search = "none"
+duration_s = 60.0
+[camera]
+images = "reduced"
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+"""
+
+DIFFER = {
+    "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "interventions_list", "incidents", "form", "kills",
+}  # fmt: skip
+"""Keys of the closing report that depend on processes and on the wall clock."""
+
+KILLED = (
+    ("started", "database", 0.0),
+    ("started", "link", 0.3),
+    ("ended", "spacecraft", 0.1),
+    ("ended", "worker", 0.0),
+    ("settled", "broker", 0.2),
+    ("settled", "api", 0.0),
+)
+
+
+def needs_servers() -> None:
+    if not shutil.which("redis-server") or not list(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
+        pytest.skip("PostgreSQL or Redis is not installed")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    needs_servers()
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    scenario, data = parse_scenario(SCENARIO), DataFolder(None)
+    terms = RunTerms(days=0.25, windows_per_day=4, window_s=600.0)
+    whole = run_mission(scenario, data, tmp_path / "whole", terms, print)
+    planned = tuple(
+        PlannedKill(scenario.epoch_utc_ns, phase, part, delay_s, 0.1) for phase, part, delay_s in KILLED
+    )
+    monkeypatch.setattr("studies.mission_run.run.plan_kills", lambda *_: planned)
+    folder = tmp_path / "killed"
+    killing = replace(terms, distributed=True, kill_seed=1, kills=len(planned))
+    killed = run_mission(scenario, data, folder, killing, print)
+    assert killed["kills"]["by_part"] == {part: 1 for _, part, _ in sorted(KILLED, key=lambda one: one[1])}
+    assert killed["kills"]["done"] == killed["kills"]["planned"] == len(KILLED)
+    assert {key: value for key, value in killed.items() if key not in DIFFER} == {
+        key: value for key, value in whole.items() if key not in DIFFER
+    }
+    assert killed["windows"]["processed"] == killed["windows"]["flown"] > 0 and killed["interventions"] == 0
+    assert killed["packets_received"] == killed["packets"] > 0 and killed["packets_lost"] == 0
+    kills = [one for one in killed["incidents"] if one["kind"] == "kill"]
+    assert len(kills) == len(KILLED) and all(one["recovery"].startswith("works after") for one in kills)
+    parts = {"run", "database", "broker", "api", "worker", "scheduler", "link", "spacecraft"}
+    assert set(killed["memory_mib"]) == set(killed["cpu_s"]) == parts
+    assert all(one["first"] > 0.0 for one in killed["memory_mib"].values())
+    # Nothing is left of the deployment.
+    assert not any(runs(pid) for pid, _ in json.loads((folder / "processes.json").read_text()).values())
+    assert not Path((folder / "postgres-folder").read_text()).exists()
+
+
+def test_kills_are_planned_by_their_seed_for_every_part_in_every_phase() -> None:
+    parts = ["api", "database", "spacecraft"]
+    found = plan_kills(7, parts, 0, 30 * HOUR_NS, 30)
+    assert found == plan_kills(7, parts, 0, 30 * HOUR_NS, 30) != plan_kills(8, parts, 0, 30 * HOUR_NS, 30)
+    assert [one.utc_ns // HOUR_NS for one in found] == list(range(30))
+    assert {one.part for one in found[:3]} == {one.part for one in found[27:]} == set(parts)
+    assert {one.phase for one in found} == set(PHASES)
+    assert all(0.0 <= one.delay_s <= 2.0 and 0.0 <= one.down_s <= 2.0 for one in found)
+    assert plan_kills(7, parts, 0, HOUR_NS, 0) == ()
+
+
+def sleeper(folder: Path) -> Part:
+    return Part([sys.executable, "-c", "import time; time.sleep(600)"], folder / "log", lambda: True)
+
+
+def made_keeper(parts: dict[str, Part], planned: tuple[PlannedKill, ...], folder: Path) -> Keeper:
+    return Keeper(parts, planned, lambda: None, lambda: None, folder / "kills.json", lambda line: None)
+
+
+def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again(tmp_path: Path) -> None:
+    part = sleeper(tmp_path)
+    planned = (
+        PlannedKill(5, "ended", "api", 0.0, 0.0),
+        PlannedKill(5, "started", "api", 0.0, 0.0),
+    )
+    keeper = made_keeper({"api": part}, planned, tmp_path)
+    part.start()
+    try:
+        first = part.pid
+        keeper.start()
+        keeper.at_stop("ended", 4)  # not due yet
+        assert keeper.wait() and not keeper.kills
+        keeper.at_stop("ended", 5)
+        assert keeper.wait() and [(one.part, one.phase) for one in keeper.kills] == [("api", "ended")]
+        second = part.pid
+        assert second != first and not runs(first) and runs(second)
+        part.kill()
+        while part.pid == second:
+            keeper.check()
+        keeper.stop()
+        assert runs(part.pid) and keeper.figures()["ended_by_themselves"] == {"api": 1}
+        # A run that is continued carries out what is left.
+        again = made_keeper({"api": part}, planned, tmp_path)
+        assert again.kills == keeper.kills and isinstance(again.kills[0], Kill)
+        again.start()
+        again.at_stop("ended", 5)
+        again.at_stop("started", 5)
+        again.wait()
+        again.stop()
+        assert [one.phase for one in again.kills] == ["ended", "started"]
+        assert again.figures()["by_part"] == {"api": 2}
+    finally:
+        part.end()
+
+
+def test_a_part_that_does_not_start_ends_the_run_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("studies.mission_run.parts.START_S", 0.5)
+    part = Part([sys.executable, "-c", "raise SystemExit('no home')"], tmp_path / "log", lambda: False)
+    keeper = made_keeper({"api": part}, (), tmp_path)
+    with pytest.raises(GroundError, match=r"expected it to start within .* found: no home"):
+        part.start()
+    keeper.start()
+    with pytest.raises(GroundError, match="supervision of its parts"):
+        while True:
+            keeper.check()
+
+
+def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path: Path) -> None:
+    left, other = sleeper(tmp_path), sleeper(tmp_path)
+    left.start()
+    other.start()
+    try:
+        file = tmp_path / "processes.json"
+        PidFile(file).note({"api": left.pid})
+        known = json.loads(file.read_text())
+        # A number that belongs to a later process now.
+        known["worker"] = [other.pid, known["api"][1] - 1]
+        file.write_text(json.dumps(known))
+        PidFile(file).end_left_over()
+        assert not runs(left.pid) and runs(other.pid) and not file.exists()
+    finally:
+        left.end()
+        other.end()
+
+
+def test_a_database_server_continues_with_its_files(tmp_path: Path) -> None:
+    needs_servers()
+    first = PostgresServer(tmp_path)
+    url = first.prepare_service()
+    assert "//service@" in url
+    first.part.kill()
+    again = PostgresServer(tmp_path)
+    try:
+        assert again.prepare_service().rpartition("/")[2] == "linna"
+    finally:
+        again.part.end()
+        again.remove()
+
+
+def test_the_usage_of_a_replaced_process_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spent = iter([5.0, 7.0, 1.0, 2.0])
+    monkeypatch.setattr("studies.mission_run.processes.cpu_s", lambda process: next(spent))
+    monkeypatch.setattr("studies.mission_run.processes.resident_mib", lambda process: 10.0)
+    usage = Usage()
+    for process in (1, 1, 2, 2):
+        usage.note("api", process, family=False)
+    assert usage.cpu_s == {"api": 9.0} and usage.memory_mib == {"api": [10.0] * 4}
+
+
+def test_a_family_has_the_memory_and_time_of_its_children(tmp_path: Path) -> None:
+    alone = family_mib(os.getpid())
+    child = "import time; held = bytearray(200 << 20); print(held[0], flush=True); time.sleep(600)"
+    log = tmp_path / "log"
+    part = Part([sys.executable, "-c", child], log, lambda: log.exists() and log.read_text() == "0\n")
+    part.start()
+    try:
+        both = family_mib(os.getpid())
+        assert alone is not None and both is not None and both > alone + 150.0
+        assert family_cpu_s(part.pid) is not None
+    finally:
+        part.end()
+    assert family_mib(part.pid) is None and family_cpu_s(part.pid) is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--kill", "1"],
+        ["--database", "postgresql://x/y"],
+        ["--distributed", "--kills", "3"],
+        ["--distributed", "--kill", "-1"],
+        ["--distributed", "--kill", "1", "--kills", "-1"],
+    ],
+)
+def test_options_of_the_distributed_form_that_do_not_fit_are_refused_in_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
