@@ -111,11 +111,13 @@ def _job_of(message: bytes) -> str | None:
 
 def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:
     """Whether the worker of this machine answers over the broker."""
+    from redis import RedisError
+
     name = f"celery@{socket.gethostname()}"
     inspect = _app_of(settings).control.inspect(destination=[name], timeout=timeout_s)
     try:
         return bool(inspect.ping())
-    except (OperationalError, OSError):
+    except (OperationalError, RedisError, OSError):
         return False
 
 
