@@ -528,7 +528,7 @@ def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_i
 ) -> None:
     station = Confirming(answer, answer)
     try:
-        declare(either, station.link("confirm = true"))
+        declare(either, station.link("confirm = true").replace("silence_s = 1.0", "silence_s = 60.0"))
         keys = released(either, 2)
         with operated(either) as runner:
             station.accept().sendall(stream[: 2 * CADU])
