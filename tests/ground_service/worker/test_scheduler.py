@@ -110,7 +110,7 @@ def test_without_the_hourly_plan_only_events_plan(
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin, work = parse_utc("2029-08-07T05:00:00Z"), Recorder()
     monkeypatch.setattr(scheduling, "mission_now_ns", lambda: begin)
-    assert Scheduler(ground, work, lambda: None, 90, plan_hourly=hourly).tick()
+    assert Scheduler(ground, work, lambda: None, {"retention_days": 90}, plan_hourly=hourly).tick()
     assert (plan_job_id(begin) in work.submitted) == hourly
 
 
