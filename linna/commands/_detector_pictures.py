@@ -143,7 +143,7 @@ def _detect(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
     from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.flight.vision.picture_search import search_picture, sun_at_azimuth
-    from payload_emulator.training.data.pictures import read_picture
+    from payload_emulator.session.picture_files import read_picture
 
     if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
         raise UsageError(

@@ -13,7 +13,11 @@ if TYPE_CHECKING:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    parser.add_argument(
+        "scenario",
+        nargs="?",
+        help="scenario file, or the name of a shipped one (default with --images: scenario.toml of that folder)",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the pass archive to write")
     parser.add_argument(
         "--mode",
@@ -33,6 +37,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         choices=("none", "some", "all"),
         default="some",
         help="images kept in the archive (default: eight of them)",
+    )
+    parser.add_argument(
+        "--images",
+        type=Path,
+        metavar="DIR",
+        help="frames that others took instead of rendered ones: frames.csv (file, utc), images, an OEM, an AEM",
+    )
+    parser.add_argument(
+        "--evidence",
+        choices=("photographs", "other-renderer"),
+        default="",
+        help="what the images of --images are (default: not stated)",
     )
     _add_live(parser)
     _add_continuous(parser)
@@ -133,9 +149,17 @@ def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from payload_emulator.session.emulator import emulate
+    from payload_emulator.session.external import SCENARIO, load_external
     from payload_emulator.session.scenario import load_scenario
 
-    scenario = load_scenario(arguments.scenario).with_choices(
+    if arguments.scenario is None and arguments.images is None:
+        raise UsageError("emulate: expected a scenario or --images DIR, found none")
+    if arguments.evidence and arguments.images is None:
+        raise UsageError("--evidence: expected together with --images DIR, found alone")
+    if arguments.images is not None and (arguments.live or arguments.continuous or arguments.campaign):
+        raise UsageError("--images: expected together with --out DIR alone")
+    chosen = arguments.images / SCENARIO if arguments.scenario is None else arguments.scenario
+    scenario = load_scenario(chosen).with_choices(
         modes=arguments.mode, seed=arguments.seed, anchoring_catalogue=arguments.anchoring_catalogue
     )
     if arguments.campaign:
@@ -147,11 +171,15 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise UsageError("emulate: expected --out DIR, --live, --continuous or --campaign FILE, found none")
     kept = {"none": 0, "some": 8, "all": None}[arguments.frames]
+    external = (
+        None if arguments.images is None else load_external(arguments.images, scenario, arguments.evidence)
+    )
     summary = emulate(
         scenario,
         data_folder(),
         arguments.out,
         frames_kept=kept,
+        external=external,
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
     emit(arguments, summary, text=describe(summary, arguments.out))

@@ -25,6 +25,7 @@ from lunar.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.ports import ResetCause
+from payload_emulator.session.external import ExternalFrames
 from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
 from payload_emulator.session.instruments import onboard_attitudes
 from payload_emulator.session.loading import LoadedPayload, load_payload
@@ -61,6 +62,7 @@ def emulate(
     *,
     frames_kept: int | None = 0,
     progress: Progress | None = None,
+    external: ExternalFrames | None = None,
 ) -> dict[str, Any]:
     """Fly a scenario and write its pass archive into the folder `out`; the summary comes back.
 
@@ -70,6 +72,8 @@ def emulate(
         How many images, evenly spread, go into the archive; None keeps all.
     progress
         Wraps the iteration over frames (items, total), for a progress bar.
+    external
+        Frames that others took, instead of rendered ones; all of them are kept.
 
     Raises
     ------
@@ -78,7 +82,8 @@ def emulate(
     """
     started = time.monotonic()
     _require_replaceable(out)
-    world = build_world(scenario, data)
+    world = build_world(scenario, data, external)
+    frames_kept = frames_kept if external is None else None
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

@@ -308,6 +308,8 @@ def level_text(level: str, unseen: float | None) -> str:
 
 
 def _evidence(world: World) -> dict[str, Value]:
+    if world.external is not None:
+        return {"world": world.external.evidence or None}
     if world.scenario.terrain.source == "photograph":
         return {"world": "photographs", "seed": world.scenario.seed}
     if world.terrain.is_real:

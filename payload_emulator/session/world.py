@@ -33,6 +33,7 @@ from lunar.timescales import (
     utc_ns_from_tdb_s,
 )
 from payload_emulator.errors import ScenarioError
+from payload_emulator.session.external import ExternalFrames, external_scenario
 from payload_emulator.session.orbit import force_model, propagate_from, propagate_scenario
 from payload_emulator.session.scenario import ReferenceSection, Scenario, WindowSection
 from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
@@ -64,6 +65,7 @@ _MS = 1_000_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
 _BEFORE_JUMP_NS = 10_000
+_EDGE_NS = 1_000
 _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
 # What stands for an image where none is rendered.
@@ -76,7 +78,10 @@ _NIGHT_RAD = np.radians(12.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """The simulated world of a scenario: what is true in it, and when the payload looks."""
+    """The simulated world of a scenario: what is true in it, and when the payload looks.
+
+    `external` holds frames that others took, which take the place of rendered ones.
+    """
 
     scenario: Scenario
     truth: Truth
@@ -85,6 +90,7 @@ class World:
     burns: tuple[TrueBurn, ...]
     frame_utc_ns: IntArray
     data_names: tuple[str, ...]
+    external: ExternalFrames | None = None
 
     @property
     def gravity(self) -> GravityField:
@@ -134,8 +140,10 @@ class Exposure:
     instruments: Samples = field(default_factory=dict)
 
 
-def build_world(scenario: Scenario, data: DataFolder) -> World:
+def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:
     """The world of a scenario, flown as far as its observation windows reach.
+
+    With external frames, their ephemeris is the flight and their times are the frames.
 
     Raises
     ------
@@ -144,6 +152,8 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
     """
     terrain = scenario_terrain(scenario, data)
     model = force_model(scenario, data)
+    if external is not None:
+        return _external_world(external_scenario(scenario, external), external, terrain, model)
     truth, burns, windows = _fly_to_windows(scenario, model, terrain)
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
     band_rad = _band_rad(scenario)
@@ -158,6 +168,22 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
     return World(scenario, truth, terrain, model, burns, frame_utc_ns, _names(terrain, model))
+
+
+def _external_world(
+    scenario: Scenario, external: ExternalFrames, terrain: TiledTerrain, model: ForceModel
+) -> World:
+    """Return the world of external frames."""
+    truth = _truth_of_ephemeris(load_oem(external.ephemeris), model.orientation)
+    first, last = int(external.utc_ns[0]), int(external.utc_ns[-1])
+    if first < truth.start_utc_ns or last > truth.stop_utc_ns:
+        raise ScenarioError(
+            f"{external.ephemeris}: expected states from {format_utc(first)} to {format_utc(last)}, found "
+            f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
+        )
+    require_above_ground(truth, external.utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
+    names = (f"external images {external.files[0].parent.name}", *_names(terrain, model))
+    return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
 
 
 def open_world(scenario: Scenario, data: DataFolder, duration_s: float) -> World:
@@ -387,7 +413,11 @@ def _scene(world: World, utc_ns: int, number: int) -> _Scene:
     sun = true_sun_direction(world, position, utc_ns, rng)
     pointing = np.radians(scenario.attitude.pointing_error_deg) * rng.standard_normal(3)
     camera_from_mcmf = perturbed(world.camera_from_mcmf(position), pointing)
-    camera_from_icrf = camera_from_mcmf @ world.truth.orientation.mcmf_from_icrf(tdb_s)
+    mcmf_from_icrf = world.truth.orientation.mcmf_from_icrf(tdb_s)
+    camera_from_icrf = camera_from_mcmf @ mcmf_from_icrf
+    measured = None if world.external is None else world.external.camera_from_icrf(utc_ns)
+    if measured is not None:
+        camera_from_icrf, camera_from_mcmf = measured, measured @ mcmf_from_icrf.T
     radiance, picture = _seen(world, utc_ns, position, camera_from_mcmf, sun)
     return _Scene(utc_ns, camera_from_mcmf, camera_from_icrf, sun, radiance, picture, rng)
 
@@ -426,6 +456,8 @@ def _seen(
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
         return None, np.empty((0, 0, 3), dtype=np.uint8)
+    if world.external is not None:
+        return None, world.external.image(utc_ns)
     if world.scenario.camera.images == "reduced":
         return None, np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
     if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
@@ -567,7 +599,10 @@ def _executed(scenario: Scenario, maneuvers: tuple[Maneuver, ...]) -> tuple[True
 
 def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth:
     def state(tdb_s: FloatArray) -> FloatArray:
-        position, velocity = ephemeris.at(utc_ns_from_tdb_s(tdb_s))
+        utc_ns = utc_ns_from_tdb_s(tdb_s)
+        # TDB seconds resolve some tens of nanoseconds: an instant at the edge may come back just outside.
+        inside = np.clip(utc_ns, ephemeris.start_utc_ns, ephemeris.stop_utc_ns)
+        position, velocity = ephemeris.at(np.where(np.abs(utc_ns - inside) <= _EDGE_NS, inside, utc_ns))
         return np.concatenate([position, velocity], axis=1)
 
     return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation)

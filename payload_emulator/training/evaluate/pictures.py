@@ -26,7 +26,8 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.picture_search import PictureSearch, search_picture, sun_at_azimuth
-from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, read_picture
+from payload_emulator.session.picture_files import read_picture
+from payload_emulator.training.data.pictures import LabelledPicture, load_pictures
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
 from payload_emulator.training.evaluate.scoring import Tally, average_precision, bootstrap_f1

@@ -8,7 +8,8 @@ import pytest
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detections import Detections
-from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, read_picture
+from payload_emulator.session.picture_files import read_picture
+from payload_emulator.training.data.pictures import LabelledPicture, load_pictures
 from payload_emulator.training.evaluate.evaluate import open_for_evaluation
 from payload_emulator.training.evaluate.pictures import (
     Criterion,
