@@ -26,7 +26,7 @@ orientation = "iau"
 [window]
 search = "none"
 start = "2029-08-08T02:58:00Z"
-duration_s = 40.0
+duration_s = 60.0
 latitude_limit_deg = 90.0
 [camera]
 frame_interval_s = 20.0
