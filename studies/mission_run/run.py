@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -390,7 +391,8 @@ class MissionRun:
         progress = self._progress
         processes = {**ground.processes, SPACECRAFT: spacecraft.process.pid}
         for name, process in processes.items():
-            self._usage.note(name, process, family=self._terms.distributed)
+            # The processes of the service are children of this one.
+            self._usage.note(name, process, family=self._terms.distributed and process != os.getpid())
         progress.memory_mib, progress.cpu_s = self._usage.memory_mib, self._usage.cpu_s
         windows = ground.windows()
         for window in windows:
