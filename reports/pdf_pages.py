@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib.resources import files
@@ -45,6 +47,12 @@ _PAGE_IN = (8.27 - 2 * 0.66, 11.69 - 0.62 - 0.78)
 _CAPTION_IN = 0.8
 """Height kept free for the caption of a figure that fills the page."""
 
+_TYPESET = """
+import sys, typst
+root, fonts, out = sys.argv[1:]
+typst.compile(root + "/main.typ", root=root, font_paths=[fonts], ignore_system_fonts=True, format="pdf", output=out)
+"""
+
 _VERDICT_ROLES = {"good": "green", "caution": "orange", "bad": "vermillion"}
 _LONG_WORD = re.compile(r"\S{32}")
 _BREAK = "\u200b"
@@ -54,8 +62,6 @@ _SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1
 
 def pdf_pages(document: Document, drawings: Drawings | None = None) -> bytes:
     """Return the octets of the PDF; `drawings` keeps figures that another rendering has drawn."""
-    import typst
-
     drawn = Drawings() if drawings is None else drawings
     with TemporaryDirectory(prefix="linna-report-") as folder:
         root = Path(folder)
@@ -70,14 +76,21 @@ def pdf_pages(document: Document, drawings: Drawings | None = None) -> bytes:
         }
         (root / "document.json").write_text(json.dumps(_printable(given)), encoding="utf-8")
         (root / "main.typ").write_text(_template(), encoding="utf-8")
-        octets: bytes = typst.compile(
-            root / "main.typ",
-            root=root,
-            font_paths=[_font_folder()],
-            ignore_system_fonts=True,
-            format="pdf",
-        )
-    return octets
+        return _typeset(root)
+
+
+def _typeset(root: Path) -> bytes:
+    """Return the PDF of `main.typ` in a folder, typeset by a process of its own.
+
+    Typst keeps what it has computed until its process ends, about 20 MiB for each report.
+    """
+    out = root / "document.pdf"
+    words = [sys.executable, "-P", "-c", _TYPESET, str(root), str(_font_folder()), str(out)]
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        reason = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+        raise RuntimeError(f"PDF of a report: expected a document, found: {reason[0]}")
+    return out.read_bytes()
 
 
 @lru_cache(maxsize=1)

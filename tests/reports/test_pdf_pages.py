@@ -1,13 +1,16 @@
 """The PDF of a report: A4, reproducible, complete, and free of markup."""
 
 import io
+import subprocess
+import sys
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from pypdf import PdfReader
 
 from reports.document import Column, Document, Facts, Heading, Listing, Paragraph, Table
-from reports.pdf_pages import pdf_pages
+from reports.pdf_pages import _typeset, pdf_pages
 from reports.render import render_html, render_pages, render_pdf
 from reports.values import PassReport
 from tests.reports import example
@@ -134,3 +137,22 @@ def test_awkward_text_is_printed_and_not_interpreted() -> None:
 def test_a_pass_with_nothing_in_it_is_one_honest_document() -> None:
     text = "".join(pages_of(render_pdf(PassReport(title="Nothing", pass_id="p0"))))
     assert "not available" in text
+
+
+def test_the_process_of_a_report_does_not_keep_what_typesetting_computes() -> None:
+    program = (
+        "import sys; from reports.document import Document, Paragraph; from reports.pdf_pages import pdf_pages\n"
+        "octets = pdf_pages(Document('Test', 'Title', 't', (), (Paragraph('x'),)))\n"
+        "print(octets[:5], any(name.partition('.')[0] == 'typst' for name in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "b'%PDF-' False\n"
+
+
+def test_a_fault_of_typesetting_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "main.typ").write_text("#unknown-function()")
+    with pytest.raises(
+        RuntimeError, match=r"^PDF of a report: expected a document, found: .*unknown"
+    ) as raised:
+        _typeset(tmp_path)
+    assert "\n" not in str(raised.value)
