@@ -154,12 +154,20 @@ def live_frames() -> list[dict[str, object]]:
 class Service:
     """A running `linna serve`."""
 
-    def __init__(self, home: Path, log: Path, console_port: int, openmct: Path | None = None) -> None:
+    def __init__(
+        self,
+        home: Path,
+        log: Path,
+        console_port: int,
+        openmct: Path | None = None,
+        settings: dict[str, str] | None = None,
+    ) -> None:
         self.home = home
         environment = {key: value for key, value in os.environ.items() if not key.startswith("LINNA_")}
         environment["LINNA_LIVE_CONSOLE"] = f"127.0.0.1:{console_port}"
         environment["XDG_DATA_HOME"] = str(home / "nothing")
         environment["LINNA_OPENMCT"] = str(openmct or home / "nothing")
+        environment.update(settings or {})
         self._log = log.open("wb")
         command = [sys.executable, "-m", "linna", "serve", "--port", "0", "--home", str(home)]
         self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT, env=environment)
@@ -207,7 +215,7 @@ def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
 
 @pytest.fixture(scope="session")
 def serve() -> type[Service]:
-    """Start another service: ``serve(home, log, console_port, openmct)``."""
+    """Start another service: ``serve(home, log, console_port, openmct, settings)``."""
     return Service
 
 
