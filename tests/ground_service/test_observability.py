@@ -100,7 +100,7 @@ def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
 def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str, set[str]]) -> None:
     for expression in expressions():
         named = set(NAME.findall(expression))
-        assert named or "up{" in expression, expression
+        assert named or "up{" in expression or "probe_ssl_earliest_cert_expiry{" in expression, expression
         assert named <= set(samples), expression
         for name, selector in SELECTOR.findall(expression):
             assert set(re.findall(r"(\w+)[=!]", selector)) <= samples[name], expression
@@ -175,6 +175,11 @@ def test_the_status_names_what_has_to_be_looked_after(change: dict[str, Any], sa
 FIRING = {
     "LinnaDown": ('up{job="linna"}', "1x5 0x20", "20m"),
     "LinnaBackupOld": ("linna_backup_age_seconds", "90000+60x200", "180m"),
+    "LinnaCertificateExpires": (
+        'probe_ssl_earliest_cert_expiry{job="linna-proxy"}',
+        f"{13 * 86_400}x200",
+        "120m",
+    ),
     "LinnaNoScheduler": ("linna_scheduler", "1x5 0x20", "20m"),
     "LinnaQueueOld": ("linna_queue_age_seconds", "0+60x40", "40m"),
     "LinnaIngestLag": ("linna_ingest_lag_seconds", "0+60x40", "40m"),
@@ -185,6 +190,19 @@ FIRING = {
         "120m",
     ),
 }
+
+
+def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts() -> None:
+    program = shutil.which("promtool")
+    if program is None:
+        pytest.skip("promtool is not installed")
+    place = RULES.with_name("prometheus.yml")
+    checked = subprocess.run(
+        [program, "check", "config", str(place)], capture_output=True, text=True, check=False
+    )
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    jobs = {one["job_name"] for one in yaml.safe_load(place.read_text())["scrape_configs"]}
+    assert set(re.findall(r'job="([^"]+)"', RULES.read_text())) == jobs
 
 
 def expectation(expression: str, at: str, labels: str, value: float) -> dict[str, Any]:
@@ -240,6 +258,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
         {"series": "linna_scheduler", "values": "1x200"},
         {"series": "linna_backup_age_seconds", "values": "3600x200"},
         {"series": "linna_backup_configured", "values": "1x200"},
+        {"series": 'probe_ssl_earliest_cert_expiry{job="linna-proxy"}', "values": f"{15 * 86_400}x200"},
         {"series": "linna_queue_age_seconds", "values": "30x200"},
         {"series": "linna_disk_free_bytes", "values": "50x200"},
         {"series": "linna_disk_size_bytes", "values": "100x200"},
