@@ -50,9 +50,9 @@ def test_a_resource_is_valid(resource: dict[str, Any], version: str) -> None:
 
 
 def test_the_failover_overlay_leads_the_base_to_the_primary_and_keeps_a_copy_of_every_commit() -> None:
-    overlay = BASE / "failover"
+    overlay = BASE.parent / "overlays" / "failover"
     listed = yaml.safe_load((overlay / "kustomization.yaml").read_text())["resources"]
-    assert listed == ["../", *sorted(path.name for path in overlay.glob("[!k]*.yaml"))]
+    assert listed == ["../../kubernetes", *sorted(path.name for path in overlay.glob("[!k]*.yaml"))]
     cluster, policy = yaml.safe_load_all((overlay / "database.yaml").read_text())
     kubernetes_validate.validate(policy, VERSIONS[-1], strict=True)
     spec = cluster["spec"]
