@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +93,6 @@ def main(words: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.planning")
     parser.add_argument("--scenario", default="selenita")
     parser.add_argument("--days", type=float, default=30.0)
-    parser.add_argument("--degree", type=int, default=30, help="degree of the gravity field")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time of a solver for each program")
     parser.add_argument(
         "--ortools", type=Path, default=ORTOOLS, help="Python of an environment with OR-Tools"
@@ -102,8 +101,8 @@ def main(words: Sequence[str]) -> int:
     arguments = parser.parse_args(words)
     data = find_data(None)
     scenario = load_scenario(arguments.scenario)
-    scenario = replace(scenario, dynamics=replace(scenario.dynamics, degree=arguments.degree))
-    orbit = propagate_scenario(scenario, force_model(scenario, data), (arguments.days + 1.0) * 86_400.0)
+    model = force_model(scenario, data)
+    orbit = propagate_scenario(scenario, model, (arguments.days + 1.0) * 86_400.0)
     ephemeris, _ = sample(orbit, 60.0)
     start = ephemeris.start_utc_ns + 10 * NS
     stop = start + round(arguments.days * DAY_NS)
@@ -125,7 +124,8 @@ def main(words: Sequence[str]) -> int:
         print(json.dumps({"scenario": scenario.name, "candidates": len(options), "plans": plans}))
         return 0
     print(
-        f"{scenario.name}, {arguments.days:g} days, {len(options)} candidates of 5 to 25 min, Sun 2 to 60 deg"
+        f"{scenario.name}, {arguments.days:g} days, {len(options)} candidates of 5 to 25 min, Sun 2 to 60 deg, "
+        f"gravity field {model.gravity.name}"
     )
     print(f"{'case':<31} {'plan':<26} {'windows':>7} {'hours':>6} {'frames':>7} {'bound':>8} {'seconds':>8}")
     for row in rows:

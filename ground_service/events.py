@@ -203,6 +203,15 @@ class ArchiveImported(Event):
     vehicle_id: int
 
 
+class LandmarkChanged(Event):
+    """Landmarks of a spacecraft were found in a pass or decided; `proposed` of them wait for a decision."""
+
+    event_kind = "landmarks"
+    spacecraft_id: int
+    pass_id: int | None
+    proposed: int
+
+
 class AutomationChanged(Event):
     """An action of an automation rule was recorded, decided, or has ended; `event` is the event that caused it."""
 

@@ -32,6 +32,7 @@ OPERATIONS = (
     Router("ground_service.ingest.routes", "ingests", "telemetry"),
     Router("ground_service.evaluation.routes", "evaluation", "reports"),
     Router("ground_service.performance.routes", "reports", "monthly-reports"),
+    Router("ground_service.landmarks.routes", "landmarks", "landmarks"),
     Router("ground_service.exports.routes", "exports", "exports"),
     Router("ground_service.ephemerides.routes", "ephemerides", "ephemerides"),
     Router("ground_service.jobs.routes", "jobs", "jobs"),

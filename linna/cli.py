@@ -50,6 +50,10 @@ GROUPS: dict[str, tuple[str, str]] = {
         "navigation solutions of a pass as TUM files, with absolute and relative errors",
     ),
     "alarm": ("alarm", "list, acknowledge and shelve alarms"),
+    "landmarks": (
+        "landmarks",
+        "craters learned from flight: candidates, decisions, new catalogue, labels, upload",
+    ),
     "automation": ("automation", "list the rules and actions of the automation, approve or refuse actions"),
     "command": ("command", "queue, release, uplink and verify telecommands"),
     "serve": ("serve", "run the HTTP server of the ground service"),

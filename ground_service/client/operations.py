@@ -22,6 +22,7 @@ from ground_service.evaluation.model import PassFigures, Report, ReportOverview,
 from ground_service.exports.model import ExportFormatInfo, FormatName
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
+from ground_service.landmarks.model import Landmark, LandmarkDetail, LandmarkUpdate
 from ground_service.links.model import Contacts, LinkStatus
 from ground_service.missions.model import HeldCatalogue, MissionDetail, MissionRevision
 from ground_service.passes.model import (
@@ -423,6 +424,30 @@ class Client(Connection):
     def add_catalogue(self, file: Path, *, name: str | None = None) -> HeldCatalogue:
         """Upload a crater catalogue, which mission descriptions name by its SHA-256."""
         return self._post(HeldCatalogue, "/catalogues", file, name=name or file.name)
+
+    # Landmarks
+
+    def list_landmarks(
+        self, *, spacecraft_id: int | None = None, state: str | None = None
+    ) -> Listing[Landmark]:
+        """List the landmarks learned from flight, most passes first."""
+        return self._list(Landmark, "/landmarks", spacecraft_id=spacecraft_id, state=state)
+
+    def get_landmark(self, landmark_id: int) -> LandmarkDetail:
+        """Return a landmark with its sightings and their images."""
+        return self._get(LandmarkDetail, f"/landmarks/{landmark_id}")
+
+    def accept_landmark(self, landmark_id: int, reason: str = "") -> LandmarkDetail:
+        """Accept a proposed landmark as a crater of the next anchoring catalogue."""
+        return self._post(LandmarkDetail, f"/landmarks/{landmark_id}/accept", {"reason": reason})
+
+    def reject_landmark(self, landmark_id: int, reason: str = "") -> LandmarkDetail:
+        """Reject a proposed landmark."""
+        return self._post(LandmarkDetail, f"/landmarks/{landmark_id}/reject", {"reason": reason})
+
+    def find_landmarks(self, pass_id: int) -> LandmarkUpdate:
+        """Search a pass for landmarks and enter them; what the pass said before is replaced."""
+        return self._post(LandmarkUpdate, f"/passes/{pass_id}/landmarks")
 
     # Automation
 

@@ -35,6 +35,7 @@ ACTIONS: Final = (
     "report",
     "mark_processed",
     "keep_archive",
+    "find_landmarks",
     "run_regression",
     "compute_trends",
     "monthly_report",
@@ -50,7 +51,7 @@ CONDITIONS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Triggers that have the value of each condition."""
 
-PASS_ACTIONS: Final = ("align", "evaluate", "report", "mark_processed", "keep_archive")
+PASS_ACTIONS: Final = ("align", "evaluate", "report", "mark_processed", "keep_archive", "find_landmarks")
 """Actions on one pass."""
 
 PASS_TRIGGERS: Final = (

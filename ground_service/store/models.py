@@ -997,6 +997,39 @@ AUTOMATION_ACTIONS = Table(
 """
 
 
+LANDMARKS = Table(
+    "landmarks",
+    METADATA,
+    key("id", Integer),
+    column("spacecraft_id", Integer),
+    column("state", String(16)),
+    column("latitude_deg", Double),
+    column("longitude_deg", Double),
+    column("height_m", Double),
+    column("sigma_east_m", Double),
+    column("sigma_north_m", Double),
+    column("sigma_up_m", Double),
+    column("diameter_m", Double),
+    column("diameter_sigma_m", Double),
+    column("passes", Integer),
+    column("sightings", Integer),
+    column("looks", Integer),
+    column("score", Double),
+    column("evidence", JSON),
+    optional("decided_by", String(64)),
+    optional("decided_utc_ns", BigInteger),
+    optional("reason", Text),
+    column("created_utc_ns", BigInteger),
+    column("changed_utc_ns", BigInteger),
+    Index("ix_landmarks_spacecraft_id_state", "spacecraft_id", "state"),
+)
+"""Place at which detections recur that no catalogued crater explains.
+
+`evidence` has the place and the sightings of each pass that looked at it. `state` is seen, proposed, accepted or
+rejected.
+"""
+
+
 BUILDS = Table(
     "builds",
     METADATA,

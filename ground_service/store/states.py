@@ -64,6 +64,13 @@ AUTOMATION_ACTION = StateMachine(
     },
 )
 
+LANDMARK = StateMachine(
+    "landmark",
+    repository.LANDMARKS,
+    # Sightings decide between seen and proposed, a person about the rest, who may change the decision.
+    {"proposed": ("accepted", "rejected"), "accepted": ("rejected",), "rejected": ("accepted",)},
+)
+
 
 def move(
     connection: Connection,

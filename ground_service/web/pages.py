@@ -77,6 +77,7 @@ PAGES = (
     Page("/alarms", "alarms", "Alarms", "Alarms"),
     Page("/commands", "commands", "Commands", "Commands"),
     Page("/regression", "regression", "Regression", "Regression"),
+    Page("/landmarks", "landmarks", "Landmarks learned from flight", "Landmarks"),
     Page("/live", "live", "Live", "Live"),
     Page("/missions", "missions", "Missions", "Missions"),
     Page("/missions/{revision}", "mission", "Mission", "", "missions"),

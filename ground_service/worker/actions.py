@@ -262,6 +262,12 @@ def _keep_archive(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     return {"archive": kept.digest, "frames": kept.frames, "state": kept.state, "reason": kept.reason}
 
 
+def _find_landmarks(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    from ground_service.landmarks.service import update_landmarks
+
+    return update_landmarks(ground, _pass_of(action)).model_dump(mode="json")
+
+
 def _run_regression(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     from ground_service.regression.jobs import prepared, regression_job
 
@@ -323,6 +329,7 @@ DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
     "report": _report,
     "mark_processed": _mark_processed,
     "keep_archive": _keep_archive,
+    "find_landmarks": _find_landmarks,
     "run_regression": _run_regression,
     "compute_trends": _compute_trends,
     "monthly_report": _monthly_report,

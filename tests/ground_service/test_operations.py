@@ -21,18 +21,19 @@ with warnings.catch_warnings():
     from fastapi.testclient import TestClient
 
 VERBS = {
-    "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export", "get",
-    "import", "keep", "list", "refuse", "reject", "release", "render", "request", "revoke", "run",
+    "accept", "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export",
+    "find", "get", "import", "keep", "list", "refuse", "reject", "release", "render", "request", "revoke", "run",
     "search", "send", "shelve", "start", "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
-    "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "End",
-    "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register", "Reject",
-    "Release", "Render", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress", "Take",
+    "Accept", "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable",
+    "End", "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register",
+    "Reject", "Release", "Render", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress",
+    "Take",
 }  # fmt: skip
 TAGS = {
-    "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "links", "missions", "passes",
-    "planning", "regression", "reports", "requests", "status", "telecommands", "telemetry", "time",
+    "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "landmarks", "links", "missions",
+    "passes", "planning", "regression", "reports", "requests", "status", "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 

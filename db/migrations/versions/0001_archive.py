@@ -975,9 +975,35 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_automation_actions_pass_id"), "automation_actions", ["pass_id"], unique=False)
     op.create_index(op.f("ix_automation_actions_state"), "automation_actions", ["state"], unique=False)
+    op.create_table(
+        "landmarks",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("spacecraft_id", sa.Integer(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        *(
+            sa.Column(name, sa.Double(), nullable=False)
+            for name in (
+                "latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m",
+                "diameter_m", "diameter_sigma_m",
+            )
+        ),
+        sa.Column("passes", sa.Integer(), nullable=False),
+        sa.Column("sightings", sa.Integer(), nullable=False),
+        sa.Column("looks", sa.Integer(), nullable=False),
+        sa.Column("score", sa.Double(), nullable=False),
+        sa.Column("evidence", sa.JSON(), nullable=False),
+        sa.Column("decided_by", sa.String(length=64), nullable=True),
+        sa.Column("decided_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("reason", sa.Text(), nullable=True),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_landmarks")),
+    )  # fmt: skip
+    op.create_index("ix_landmarks_spacecraft_id_state", "landmarks", ["spacecraft_id", "state"], unique=False)
 
 
 def downgrade() -> None:
+    op.drop_table("landmarks")
     op.drop_table("transmissions")
     op.drop_table("contacts")
     op.drop_table("leases")

@@ -1,0 +1,1 @@
+"""Landmarks learned from flight: persistent detections that no catalogued crater explains."""
