@@ -39,6 +39,9 @@ orientation = "IAU WGCCRE 2009"
 gravity_field = "GRGM1200L (12x12, built in)"
 [camera]
 pointing = "nadir"
+width_px = 512
+height_px = 512
+fov_deg = 120.0
 k1 = 0.0
 [reference]
 sigma_rtn_m = [3.0, 4.0, 0.0]
