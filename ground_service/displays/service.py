@@ -5,6 +5,7 @@ from __future__ import annotations
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.displays import store
+from ground_service.displays.core import signed
 from ground_service.displays.model import OBJECTS_LIMIT, Display, DisplayIn, DisplaySummary
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import DisplayChanged, publish
@@ -32,6 +33,8 @@ def get_display(ground: Ground, key: str) -> Display:
 def keep_display(ground: Ground, key: str, given: DisplayIn, *, actor: str) -> Display:
     """Store an object: a new one with version 0, else the next version of the one with the given version.
 
+    Authors in its document are those of the previous version and `actor`.
+
     Raises
     ------
     Conflict
@@ -43,6 +46,8 @@ def keep_display(ground: Ground, key: str, given: DisplayIn, *, actor: str) -> D
     """
     now = utc_now_ns()
     with ground.database.writing() as connection:
+        previous = store.get(connection, key).document if given.version else None
+        given = given.model_copy(update={"document": signed(given.document, previous, actor=actor)})
         if given.version == 0:
             total = store.count(connection)
             if total >= OBJECTS_LIMIT:

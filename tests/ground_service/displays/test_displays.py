@@ -90,3 +90,43 @@ def test_the_depth_of_documents_is_limited(either: Ground) -> None:
         layout(items=nested(DEPTH_LIMIT))
     with pytest.raises(ValidationError, match="levels"):
         layout(items=nested(900))
+
+
+def notebook(version: int = 0, entries: tuple[dict[str, object], ...] = (), **given: object) -> DisplayIn:
+    document = {"configuration": {"entries": {"section": {"page": list(entries)}}}} | given
+    return DisplayIn(name="Notes", type="notebook", version=version, document=document)
+
+
+def entry(number: int, text: str, **authors: str) -> dict[str, object]:
+    return {"id": f"entry-{number}", "text": text, "createdBy": "ada"} | authors
+
+
+def authors(ground: Ground) -> list[tuple[object, ...]]:
+    found = service.get_display(ground, "mine").document["configuration"]["entries"]["section"]["page"]
+    return [tuple(one.get(name) for name in ("createdBy", "modifiedBy", "createdByRole")) for one in found]
+
+
+def test_authors_of_entries_are_those_who_stored_them(either: Ground) -> None:
+    keep(either, notebook(0, (entry(1, "one", createdByRole="director"),), createdBy="ada", modifiedBy="ada"))
+    assert authors(either) == [("eva", None, None)]
+    given = (entry(1, "one", modifiedBy="ada"), entry(2, "two", modifiedBy="ada"))
+    keep(either, notebook(1, given, createdBy="ada", modifiedBy="ada"), "ida")
+    assert authors(either) == [("eva", None, None), ("ida", "ida", None)]
+    document = service.get_display(either, "mine").document
+    assert (document["createdBy"], document["modifiedBy"]) == ("eva", "ida")
+
+
+def test_a_changed_entry_names_who_changed_it(either: Ground) -> None:
+    keep(either, notebook(0, (entry(1, "one"), entry(2, "two"))))
+    keep(either, notebook(1, (entry(1, "none"), entry(2, "two"))), "ida")
+    changed = ("eva", "ida", "changed by ida")
+    assert authors(either) == [changed, ("eva", None, None)]
+    keep(either, notebook(2, (entry(1, "none"), entry(2, "2"))))
+    assert authors(either) == [changed, ("eva", "eva", None)]
+
+
+def test_an_entry_without_identifier_is_new(either: Ground) -> None:
+    unnamed: dict[str, object] = {"text": "one", "createdBy": "ada"}
+    keep(either, notebook(0, (unnamed,), createdBy="ada"))
+    keep(either, notebook(1, (unnamed, unnamed | {"id": 4}), createdBy="ada"), "ida")
+    assert authors(either) == [("ida", None, None), ("ida", None, None)]

@@ -31,6 +31,12 @@ function installConductor(last) {
   );
 }
 
+// Objects and entries of notebooks name the user who made them.
+function installUser(session) {
+  const user = new openmct.user.User(session.name, session.name);
+  openmct.user.setProvider({ isLoggedIn: () => true, getCurrentUser: async () => user, hasRole: async () => false, getPossibleRoles: async () => [] });
+}
+
 function installIndicators(session) {
   const feed = openmct.indicators.simpleIndicator();
   feed.iconClass("icon-connectivity");
@@ -57,6 +63,8 @@ async function start() {
   const { plugins } = openmct;
   openmct.install(matchMedia("(prefers-color-scheme: light)").matches ? plugins.Snow() : plugins.Espresso());
   openmct.install(plugins.DisplayLayout({ showAsView: [] }));
+  openmct.install(plugins.Notebook());
+  installUser(session);
   installDictionary(openmct);
   installTelemetry(openmct);
   installLayouts(openmct);

@@ -28,23 +28,34 @@ async function read(key) {
   return document;
 }
 
+// Writes of an object follow each other, since each one states the version that the one before it made.
+const writing = new Map();
+function afterWrites(key, work) {
+  const done = (writing.get(key) ?? Promise.resolve()).catch(() => {}).then(work);
+  writing.set(key, done);
+  return done;
+}
+
 const emptyRoot = () => ({ identifier: { namespace: NAMESPACE, key: ROOT }, name: "Stored layouts", type: "folder", composition: [], location: "ROOT" });
 
 function provider(openmct, session) {
   async function write(object) {
-    const { key } = object.identifier;
-    const json = { name: object.name, type: object.type, version: versions.get(key) ?? 0, document: object };
+    const { identifier, name, type } = object;
+    const json = { name, type, document: JSON.parse(JSON.stringify(object)) }; // Open MCT may change it in the meantime
+    return afterWrites(identifier.key, () => put(identifier.key, json));
+  }
+  async function put(key, json) {
     try {
       const answer = await request(`displays/${key}`, {
         method: "PUT",
         headers: { "Content-Type": "application/json" },
-        body: JSON.stringify(json),
+        body: JSON.stringify({ ...json, version: versions.get(key) ?? 0 }),
       });
       versions.set(key, (await answer.json()).version);
       (await stored)?.add(key);
     } catch (error) {
       if (error.status === 409) throw new openmct.objects.errors.Conflict(error.message);
-      openmct.notifications.error(`"${object.name}" was not stored: ${error.message}`);
+      openmct.notifications.error(`"${json.name}" was not stored: ${error.message}`);
       throw error;
     }
     return true;
@@ -56,7 +67,9 @@ function provider(openmct, session) {
     isReadOnly: () => session.role === "viewer",
     observe: ({ key }, callback) =>
       listen("display", async ({ payload }) => {
-        if (payload.key !== key || payload.version === undefined || payload.version === versions.get(key)) return;
+        if (payload.key !== key || payload.version === undefined) return;
+        await writing.get(key)?.catch(() => {}); // it may be this write
+        if (payload.version <= (versions.get(key) ?? 0)) return;
         const found = await read(key);
         if (found) callback(found);
       }),
