@@ -23,11 +23,12 @@ import httpx
 import numpy as np
 
 from benchmarks._ground_service import READS
-from benchmarks.campaigns._deployment import Deployment, descendants
+from benchmarks.campaigns._deployment import Deployment
 from benchmarks.ground import START, STEP_NS, mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from lunar.timescales import format_utc
+from studies.mission_run.parts import descendants
 
 ROUND_S = 60
 EACH_USER_S = 2.0

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.campaigns._clients import Session, cut_pieces
-from benchmarks.campaigns._deployment import Deployment, runs, wait_until
+from benchmarks.campaigns._deployment import Deployment, wait_until
 from benchmarks.campaigns._failover import DatabaseCluster
 from benchmarks.campaigns.kill import contents, ends_of
 from benchmarks.ground import mixed_downlink
@@ -36,6 +36,7 @@ from ground_service.errors import GroundError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.worker.scheduler import has_scheduler
+from studies.mission_run.parts import runs
 
 PARTS = ("api 1", "worker 1", "scheduler 1", "broker")
 SERVER, HOST = "database server", "database host"
