@@ -89,8 +89,8 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
         )
 
 
-class Uplink:
-    """A spacecraft that keeps orders, and a ground that has sent 40 octets."""
+class Orders:
+    """A spacecraft that keeps orders."""
 
     def __init__(self) -> None:
         self.orders: list[str] = []
@@ -98,32 +98,28 @@ class Uplink:
     def order(self, word: str) -> None:
         self.orders.append(word)
 
-    def octets_sent(self) -> dict[str, int]:
-        return {"madrid": 40}
-
 
 def state(octets: int) -> dict[str, Any]:
-    return {"kind": "state", "uplinked": {"madrid": octets}}
+    return {"kind": "state", "unacknowledged": octets}
 
 
 @pytest.mark.parametrize(
     ("said", "error"),
     [
-        ([{"kind": "error", "text": "out of memory"}, state(40)], "spacecraft: out of memory"),
+        ([{"kind": "error", "text": "out of memory"}, state(0)], "spacecraft: out of memory"),
         ([state(10)], "expected its state, found its end"),
-        ([state(10)] * 3, r"sent \({'madrid': 40}\) within 0 s, found {'madrid': 10}"),
-        ([{"kind": "paused"}, state(40)], None),
+        ([state(10)] * 3, "all telemetry within 0 s, found 10 octets without it"),
+        ([{"kind": "paused"}, state(10), state(0)], None),
     ],
 )
-def test_a_wait_for_octets_at_the_spacecraft_ends_with_an_error_or_with_all(
-    said: list[dict[str, Any]], error: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_wait_for_stored_telemetry_ends_with_an_error_or_with_all(
+    said: list[dict[str, Any]], error: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("studies.mission_run.run.SOCKET_S", 0.0 if len(said) == 3 else 60.0)
-    run = MissionRun(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, print)
-    both: Any = Uplink()
+    monkeypatch.setattr("studies.mission_run.run.SETTLE_S", 0.0 if len(said) == 3 and error else 60.0)
+    spacecraft: Any = Orders()
     with nullcontext() if error is None else pytest.raises(LinkError, match=error):
-        run._wait_uplinked(both, both, iter(said))
-    assert set(both.orders) == {"state"}
+        MissionRun._wait_acknowledged(spacecraft, iter(said))
+    assert set(spacecraft.orders) == {"state"}
 
 
 @pytest.mark.parametrize(
