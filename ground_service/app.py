@@ -115,22 +115,27 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         redoc_url=None,
         lifespan=lifespan,
     )
+    _set_state(app, settings)
+    routers = (*(one.load() for one in OPERATIONS), operations, pages, sign_in, displays, documentation)
+    for one in (*routers, live, payload_console):
+        app.include_router(one)
+    app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
+    start_tracing(settings)
+    problems.install(app)
+    _add_middleware(app, settings, budgets)
+    return app
+
+
+def _set_state(app: FastAPI, settings: Settings) -> None:
+    """Set what requests read before the ground service is open."""
     app.state.draining = False
     app.state.provider = provider_of(settings)
     app.state.open_without_users = settings.host in LOOPBACK and app.state.provider is None
     app.state.live_console = settings.resolved_live_console()
     app.state.openmct = settings.openmct or FOLDER
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    routers = (*(one.load() for one in OPERATIONS), operations, pages, sign_in, displays, documentation)
-    for one in (*routers, live, payload_console):
-        app.include_router(one)
-    app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
     app.state.backups = settings.backups
     app.state.metrics = Metrics(settings.backups)
-    start_tracing(settings)
-    problems.install(app)
-    _add_middleware(app, settings, budgets)
-    return app
 
 
 def _add_middleware(app: FastAPI, settings: Settings, budgets: SharedBudgets | None) -> None:
