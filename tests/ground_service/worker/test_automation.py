@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged,
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
+from ground_service.landmarks.service import list_landmarks
 from ground_service.missions.catalogues import add_catalogue, catalogue_of, list_catalogues
 from ground_service.missions.model import parse_mission
 from ground_service.missions.service import add_mission
@@ -35,6 +37,7 @@ from ground_service.worker.actions import has_repetitions, repeat_due
 from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from ground_service.worker.jobs import run_job
+from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import (
     CADENCE_S,
@@ -478,3 +481,35 @@ def test_an_imported_archive_acts_once(ground: Ground, flown: SyntheticPass) -> 
         ("report of an archive", "report", "done"),
     ]
     assert report_of(ground, pass_id)["detector"] is not None
+
+
+LEARNING = """
+[automation]
+evaluate = true
+[[automation.rules]]
+name = "learn from every pass"
+on = "window processed"
+do = ["find_landmarks"]
+"""
+
+
+def test_a_processed_pass_is_searched_for_landmarks(
+    either: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    full = load_catalogue(flown.folder / "catalogue.csv")
+    thin = SyntheticPass(tmp_path / "thin", flown.packets, flown.utc_ns, flown.expected, flown.missed)
+    shutil.copytree(flown.folder, thin.folder)
+    save_catalogue(full.select(np.arange(len(full)) % 3 != 0), thin.folder / "catalogue.csv")
+    window_id = prepared(either, thin, LEARNING)
+    receive(either, thin.packets, tmp_path)
+    window = get_window(either, window_id)
+    assert window.state == "processed" and window.pass_id is not None
+    [searched] = [one for one in list_actions(either)[0] if one.action == "find_landmarks"]
+    assert (searched.rule, searched.state, searched.pass_id) == (
+        "learn from every pass",
+        "done",
+        window.pass_id,
+    )
+    assert searched.result is not None and searched.result["added"] > 20
+    found, total = list_landmarks(either, limit=1000)
+    assert total == searched.result["added"] and {one.state for one in found} == {"seen"}
