@@ -44,8 +44,11 @@ images = "reduced"
 source = "procedural"
 [navigation]
 estimators = ["spherical"]
+[clock]
+offset_s = 0.4
+drift_ppm = 5.0
 """
-
+DRIFT_PPM = 5.0
 
 TERMS = RunTerms(days=0.5, windows_per_day=1, window_s=600.0)
 
@@ -72,6 +75,11 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
     assert [one.partition(":")[0] for one in figures["reports_lack"]].count("nees") == 1
     assert figures["frames"] == figures["frames_received"] == flown["frames"]
     assert flown["contacts_to_processed"] == 1
+    # The clock of this scenario drifts: the time reports of the contacts tell by how much.
+    (line,) = figures["time_correlation"].values()
+    assert line["time_reports"] >= 3 and line["rejected"] == 0
+    assert line["drift_ppb"] == pytest.approx(-1e3 * DRIFT_PPM, abs=20.0)
+    assert line["residual_max_us"] < 100.0
     # All that was posted is the set-up: catalogue, mission, ephemeris, commissioning, standing request.
     assert figures["interventions"] == 0 and figures["interventions_list"] == []
     for name in ("ground", "spacecraft"):

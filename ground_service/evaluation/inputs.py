@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -40,6 +40,8 @@ from ground_service.passes.store import code_labels, detection_samples, event_li
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.timekeeping.model import Correlation
+from ground_service.timekeeping.store import correlations_in_force
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.ephemeris_files import load_ephemeris
@@ -150,7 +152,16 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             housekeeping=_housekeeping(connection, span),
             events=event_list(connection, span),
             images=ArchivedImages(ground.files, passes.frame_files(connection, pass_id)),
-            provenance=_provenance(mission, declared, manifest, record, vehicle, ephemeris, span),
+            provenance=_provenance(
+                mission,
+                declared,
+                manifest,
+                record,
+                vehicle,
+                ephemeris,
+                span,
+                correlations_in_force(connection, span.vehicle),
+            ),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
             evidence_level=mission.evidence.text,
             configuration=_configuration(manifest, record),
@@ -399,6 +410,18 @@ def _catalogue(ground: Ground, record: PassRecord) -> CraterCatalogue | None:
     )
 
 
+def _correlation_text(lines: Sequence[Correlation]) -> str:
+    """Return the time correlations in force of a spacecraft with their residuals."""
+    texts = []
+    for one in lines:
+        residuals = ""
+        if one.residual_rms_ns is not None and one.residual_max_ns is not None:
+            rms_us, max_us = one.residual_rms_ns * 1e-3, one.residual_max_ns * 1e-3
+            residuals = f", residuals {rms_us:.0f} us rms, {max_us:.0f} us at most"
+        texts.append(f"{one.id} ({one.points} time reports, drift {one.drift_ppb:.0f} ppb{residuals})")
+    return "; ".join(texts) or "0 (ideal clock)"
+
+
 def _provenance(
     mission: Mission,
     declared: DeclaredFrames,
@@ -407,6 +430,7 @@ def _provenance(
     vehicle: Vehicle,
     ephemeris: EphemerisEntry | None,
     span: PassSpan,
+    correlations: Sequence[Correlation],
 ) -> dict[str, str]:
     build = manifest.get("build") or {}
     gravity = manifest.get("gravity") or {}
@@ -428,7 +452,7 @@ def _provenance(
         ),
         "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
         "dictionary": _dictionary_text(span.dictionary_version),
-        "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
+        "time correlation": _correlation_text(correlations),
         "reference ephemeris": (
             f"{ephemeris.object_name}, {ephemeris.frame}, SHA-256 {ephemeris.sha256[:16]}"
             if ephemeris

@@ -43,7 +43,8 @@ class FrameBlock:
     """Corrected frames (n, frame_length) of CADUs at known offsets, `good` (n,) if codes and checksums are valid.
 
     `corrected` (n,) is the number of corrected symbols, `wrong_bits` (n,) that of corrected bits, and
-    `codewords_lost` (n,) that of codewords with too many errors.
+    `codewords_lost` (n,) that of codewords with too many errors. `received_utc_ns` (n,) is the reception time in the
+    records of the station, `NO_TIME` where there is none; None: no such times.
     """
 
     settings: LinkSettings
@@ -54,6 +55,7 @@ class FrameBlock:
     corrected: IntArray
     wrong_bits: IntArray
     codewords_lost: IntArray
+    received_utc_ns: IntArray | None = None
 
     def of(self, spacecraft_id: int) -> NDArray[np.bool_]:
         """Return which frames (n,) are good frames of a spacecraft."""
@@ -178,32 +180,46 @@ class ChannelReader:
 
     def read(self, block: FrameBlock, spacecraft_id: int) -> PacketBatch:
         """Return the decoded packets of a spacecraft that are complete with this block."""
-        buffer, cut = self.cut(block, spacecraft_id)
-        return batch_of_cut(buffer, cut, self.dictionary, spacecraft_id)
+        buffer, cut, received_utc_ns = self._cut(block, spacecraft_id)
+        return batch_of_cut(buffer, cut, self.dictionary, spacecraft_id, received_utc_ns)
 
     def cut(self, block: FrameBlock, spacecraft_id: int) -> tuple[bytes, PacketCut]:
         """Return octets, and the positions in them of the packets of a spacecraft that are complete with this block."""
+        buffer, cut, _ = self._cut(block, spacecraft_id)
+        return buffer, cut
+
+    def _cut(self, block: FrameBlock, spacecraft_id: int) -> tuple[bytes, PacketCut, IntArray | None]:
+        """Return what `cut` does, and the reception time of each packet where the block has such times.
+
+        It is that of the frame in which the packet begins; of a packet that began before the block, that of its end.
+        """
         parts: list[bytes | OctetArray] = []
         segments: list[tuple[int, int]] = []
+        starts, frames_used = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
         filled = 0
-        for channel, zones, count, pointer in _channels(block, spacecraft_id):
+        for channel, zones, count, pointer, rows in _channels(block, spacecraft_id):
             checked = is_checked(block.settings)
-            for octets, ranges in self._channel(channel, zones, count, pointer, checked):
+            for octets, ranges, used in self._channel(channel, zones, count, pointer, checked):
                 parts.append(octets)
                 segments += [(filled + start, filled + stop) for start, stop in ranges]
+                starts.append(filled + zones.shape[1] * np.arange(used.size, dtype=np.int64))
+                frames_used.append(rows[used])
                 filled += len(octets)
         buffer = b"".join(bytes(part) for part in parts)
-        used = np.array(segments, dtype=np.int64).reshape(-1, 2)
+        ranges_used = np.array(segments, dtype=np.int64).reshape(-1, 2)
         cut = cut_packets(
             buffer,
-            segments=used,
+            segments=ranges_used,
             error_control=self.error_control,
             unchecked_apids=self.unchecked_apids(spacecraft_id),
         )
         self.packets += int(np.count_nonzero(cut.crc_ok))
         self.crc_errors += cut.crc_errors
-        self.octets_unused += _not_in_packets(used, cut)
-        return buffer, cut
+        self.octets_unused += _not_in_packets(ranges_used, cut)
+        if block.received_utc_ns is None:
+            return buffer, cut, None
+        frame = np.searchsorted(np.concatenate(starts), cut.offsets, side="right") - 1
+        return buffer, cut, block.received_utc_ns[np.concatenate(frames_used)[frame]]
 
     def close(self) -> None:
         """Add the incomplete packets to the edges."""
@@ -219,10 +235,11 @@ class ChannelReader:
 
     def _channel(
         self, channel: Channel, zones: OctetArray, count: IntArray, pointer: IntArray, checked: bool
-    ) -> Iterator[tuple[bytes | OctetArray, list[tuple[int, int]]]]:
-        """Yield octets and the segments of them that hold complete packets."""
+    ) -> Iterator[tuple[bytes | OctetArray, list[tuple[int, int]], IntArray]]:
+        """Yield octets, the segments of them that hold complete packets, and the frames whose zones they are."""
         zone = zones.shape[1]
         idle = pointer == ONLY_IDLE_DATA
+        filled = np.flatnonzero(~idle)
         buffer = np.ascontiguousarray(zones[~idle]).reshape(-1)
         row = np.concatenate(([0], np.cumsum(~idle)))
         breaks = np.flatnonzero(np.diff(count) % COUNTS != 1) + 1
@@ -253,7 +270,7 @@ class ChannelReader:
             end = packets_end(buffer, (low + int(begins[-1])) * zone + int(pointers[begins[-1]]), high * zone)
             if kept is not None and kept.role == OPENER:
                 joint = kept.octets + head
-                yield joint, [(0, len(joint))]
+                yield joint, [(0, len(joint))], filled[low + begins[:1]]
             else:
                 lead = kept.octets + head if kept is not None else head
                 if lead:
@@ -265,7 +282,7 @@ class ChannelReader:
                 self._open[channel] = Edge(OPENER, UNKNOWN, after, tail)
                 if not checked:  # its octets are also searched and counted
                     self.octets_unused -= len(tail)
-        yield buffer, ranges
+        yield buffer, ranges, filled
 
 
 def packets_end(buffer: OctetArray | bytes, start: int, stop: int) -> int:
@@ -280,8 +297,11 @@ def packets_end(buffer: OctetArray | bytes, start: int, stop: int) -> int:
 
 def _channels(
     block: FrameBlock, spacecraft_id: int
-) -> Iterator[tuple[Channel, OctetArray, IntArray, IntArray]]:
-    """Yield packet zones (m, zone), channel counts and first header pointers (m,) of each channel of a spacecraft."""
+) -> Iterator[tuple[Channel, OctetArray, IntArray, IntArray, IntArray]]:
+    """Yield the frames of each channel of a spacecraft.
+
+    Packet zones (m, zone), channel counts, first header pointers and indices in the block (m,).
+    """
     header = block.header
     end = block.settings.frame_length - (CRC_LENGTH if block.settings.checksum else 0)
     secondary = block.frames[:, FRAME_HEADER_LENGTH] & 0x3F
@@ -298,8 +318,8 @@ def _channels(
             again = again[(zones[again] == zones[again - 1]).all(axis=1)]
             keep = np.ones(rows.size, dtype=np.bool_)
             keep[again] = False
-            zones, count, pointer = zones[keep], count[keep], pointer[keep]
-        yield (spacecraft_id, channel, low, high), zones, count, pointer
+            zones, count, pointer, rows = zones[keep], count[keep], pointer[keep], rows[keep]
+        yield (spacecraft_id, channel, low, high), zones, count, pointer, rows
 
 
 def _is_idle(octets: bytes) -> bool:

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_service.ingest.quality import NO_TIME
 from lunar.arrays import IntArray
+from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.timescales import utc_ns_from_ticks
 from tmtc.arrays import Octets, as_octets
 from tmtc.cuc import NO_TICKS, onboard_ticks
 from tmtc.dictionary import DICTIONARY
@@ -21,6 +24,12 @@ from tmtc.stream import PacketCut, primary_headers
 Columns = dict[str, Any]
 
 DIGEST_OCTETS = 16
+
+CLOCKS_AGREE_NS = 60 * NANOSECONDS_PER_SECOND
+"""Largest difference of the on-board clock from the reception time of its report, light time included.
+
+Two independent clocks that agree are believed. A larger difference is a wrong clock of the station, or a report that
+was played back from the store."""
 
 _TIMED_HEADER = np.dtype(
     [("primary", "V6"), ("pus", "u1"), ("kind", "V6"), ("p_field", "u1"), ("coarse", ">u4"), ("fine", ">u2")]
@@ -35,7 +44,8 @@ class PacketBatch:
 
     `spacecraft_id` is None where the stream does not say whose the packets are. `ticks` is the on-board time of the
     packet, `NO_TICKS` where it carries none. `rows` holds, per kind of sample,
-    the decoded columns and in ``"packet"`` the index of each row's packet in this batch.
+    the decoded columns and in ``"packet"`` the index of each row's packet in this batch. `received_utc_ns` is the
+    reception time in the records of the station, `NO_TIME` where there is none; None: no such times.
     """
 
     apid: IntArray
@@ -47,15 +57,23 @@ class PacketBatch:
     dictionary_version: int
     rows: Mapping[str, Columns]
     unknown: int
+    received_utc_ns: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.octets)
 
 
 def batch_of_cut(
-    buffer: Octets, cut: PacketCut, dictionary: Dictionary = DICTIONARY, spacecraft_id: int | None = None
+    buffer: Octets,
+    cut: PacketCut,
+    dictionary: Dictionary = DICTIONARY,
+    spacecraft_id: int | None = None,
+    received_utc_ns: IntArray | None = None,
 ) -> PacketBatch:
-    """The packets of `cut` whose checksum holds, with what the dictionary decodes from them."""
+    """The packets of `cut` whose checksum holds, with what the dictionary decodes from them.
+
+    `received_utc_ns` (n,) are the reception times of the packets of `cut`.
+    """
     good = np.flatnonzero(cut.crc_ok)
     headers = primary_headers(buffer, cut)
     tables = dictionary.unpack_many(buffer, cut)
@@ -77,7 +95,28 @@ def batch_of_cut(
         dictionary_version=dictionary.version,
         rows=decoded_rows(tables, place),
         unknown=len(good) - known,
+        received_utc_ns=None if received_utc_ns is None else received_utc_ns[good],
     )
+
+
+def time_receptions(batch: PacketBatch) -> dict[tuple[int, int], int]:
+    """Return the reception times (UTC, ns) of the time reports of a batch, by packet time and sequence count.
+
+    Left out are reports without a reception time, and those from whose reception the on-board clock differs by more
+    than `CLOCKS_AGREE_NS`.
+    """
+    reports = batch.rows.get("time_reports")
+    if reports is None or batch.received_utc_ns is None:
+        return {}
+    packet = reports["packet"]
+    received = batch.received_utc_ns[packet]
+    shown = np.asarray(utc_ns_from_ticks(reports["reported_ticks"]))
+    live = (received != NO_TIME) & (np.abs(received - shown) <= CLOCKS_AGREE_NS)
+    found: dict[tuple[int, int], int] = {}
+    for index, time in zip(packet[live].tolist(), received[live].tolist(), strict=True):
+        key = int(batch.ticks[index]), int(batch.sequence_count[index])
+        found[key] = min(found.get(key, time), time)
+    return found
 
 
 def decoded_rows(tables: Mapping[str, Table], place: IntArray) -> dict[str, Columns]:

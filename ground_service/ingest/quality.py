@@ -14,6 +14,10 @@ CDS_EPOCH_DAYS = 4383
 """Days from 1958-01-01 to 1970-01-01."""
 
 
+NO_TIME = -1
+"""Reception time of a CADU whose record states none."""
+
+
 @dataclass(frozen=True, slots=True)
 class RecordFormat:
     """Octets of a station's record around each CADU; `time_code` None: the header has no reception time."""
@@ -29,19 +33,22 @@ class RecordFormat:
         return self.header_octets + self.trailer_octets
 
     def times_utc_ns(self, stream: OctetArray, offsets: IntArray) -> IntArray:
-        """Return the reception times (m,) of the CADUs at `offsets` (n,) whose header is in the stream."""
+        """Return the reception times (n,) of the CADUs at `offsets` (n,); `NO_TIME` without a header in the stream."""
+        times = np.full(offsets.size, NO_TIME, dtype=np.int64)
         if self.time_code is None:
-            return offsets[:0]
+            return times
         at = offsets - self.header_octets + self.time_offset
-        at = at[at >= 0]
+        known = at >= 0
+        at = at[known]
         octets = 6 if self.time_code == "cds" else 8
         value = np.zeros(at.size, dtype=np.int64)
         for k in range(octets):
             value = value << 8 | stream[at + k]
         if self.time_code == "cds":
             days, milliseconds = value >> 32, value & 0xFFFFFFFF
-            return (days - CDS_EPOCH_DAYS) * DAY_NS + milliseconds * 1_000_000
-        return value
+            value = (days - CDS_EPOCH_DAYS) * DAY_NS + milliseconds * 1_000_000
+        times[known] = np.where(value < 0, NO_TIME, value)
+        return times
 
 
 NO_RECORD = RecordFormat()
@@ -86,7 +93,8 @@ class LinkQuality:
         return self.wrong_bits / self.checked_bits if self.checked_bits else None
 
     def add_times(self, times_utc_ns: IntArray) -> None:
-        """Include reception times (n,)."""
+        """Include reception times (n,); `NO_TIME` is left out."""
+        times_utc_ns = times_utc_ns[times_utc_ns != NO_TIME]
         if times_utc_ns.size:
             first, last = int(times_utc_ns.min()), int(times_utc_ns.max())
             self.first_utc_ns = first if self.first_utc_ns is None else min(self.first_utc_ns, first)

@@ -22,7 +22,7 @@ from ground_service.ingest import store
 from ground_service.ingest.frames import ChannelEdge, is_checked
 from ground_service.ingest.joining import Joiner
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
-from ground_service.ingest.packets import PacketBatch
+from ground_service.ingest.packets import PacketBatch, time_receptions
 from ground_service.ingest.parameters import decode_declared, definitions_in_force, definitions_of_spacecraft
 from ground_service.ingest.reception import ExpectedLink, expected_link, remember_link
 from ground_service.ingest.redecode import catch_up, redecode
@@ -498,6 +498,7 @@ class _Reading:
         vehicle = self.joiner.vehicle(connection, found.packets.spacecraft_id)
         self.joiner.keep_channel_edges(connection, found.channel_edges)
         stored = store.store_batch(connection, vehicle, found.packets)
+        store.note_receptions(connection, vehicle, self.piece.station, time_receptions(found.packets))
         self.new += stored.new
         edges.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=False)
         defined = np.isin(found.packets.apid, self._definitions(found.packets.spacecraft_id).apids)

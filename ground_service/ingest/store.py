@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -9,8 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from pydantic import ValidationError
 from sqlalchemy import Connection, bindparam, delete, func, select
+from sqlalchemy.dialects import postgresql, sqlite
 
-from ground_service.events import TelemetryReceived, publish
+from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
 from ground_service.ingest.model import Ingest, IngestResult
 from ground_service.store import repository
 from ground_service.store.bulk import insert_columns
@@ -27,6 +29,12 @@ _TABLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
 _PACKETS: Any = PACKETS
 _INGESTS = repository.INGESTS
 _FILES = repository.FILES
+_RECEPTIONS = repository.RECEPTIONS
+
+RECEPTIONS_LIMIT = 100_000
+"""Largest number of reception times of time reports of a vehicle."""
+
+log = logging.getLogger(__name__)
 
 _PACKED: dict[str, Callable[..., list[bytes]]] = {
     "detections": pack_detections,
@@ -118,6 +126,40 @@ def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored
             ),
         )
     return Stored(added, count - added, samples)
+
+
+def note_receptions(
+    connection: Connection, vehicle_id: int, station: str, received: Mapping[tuple[int, int], int]
+) -> None:
+    """Note when a station received time reports (packet time, sequence count); the first reception counts.
+
+    Nothing is noted beyond `RECEPTIONS_LIMIT` reports of a vehicle.
+    """
+    if not received:
+        return
+    count = select(func.count()).select_from(_RECEPTIONS).where(_RECEPTIONS.c.vehicle_id == vehicle_id)
+    if connection.execute(count).scalar_one() + len(received) > RECEPTIONS_LIMIT:
+        log.warning("vehicle %d: more than %d time reports, none noted", vehicle_id, RECEPTIONS_LIMIT)
+        return
+    dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
+    changed = 0
+    for (ticks, sequence_count), utc_ns in sorted(received.items()):
+        statement: Any = dialect.insert(_RECEPTIONS).values(
+            vehicle_id=vehicle_id,
+            ticks=ticks,
+            sequence_count=sequence_count,
+            station=station,
+            earth_utc_ns=utc_ns,
+        )
+        earlier = statement.excluded.earth_utc_ns
+        statement = statement.on_conflict_do_update(
+            index_elements=list(_RECEPTIONS.primary_key.columns),
+            set_={"earth_utc_ns": earlier},
+            where=earlier < _RECEPTIONS.c.earth_utc_ns,
+        )
+        changed += connection.execute(statement.returning(_RECEPTIONS.c.ticks)).first() is not None
+    if changed:
+        publish(connection, ReceptionsEntered(vehicle_id=vehicle_id, reports=changed))
 
 
 def store_samples(

@@ -7,7 +7,7 @@ Incomplete units at the ends of the stream are returned as edges, to be joined w
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,7 +223,9 @@ class DownlinkReader:
             before = _led_back(stream, int(offsets[0]), settings)
             offsets = np.concatenate((before, offsets))
             cadus = np.concatenate((_cadus_at(stream, before, length), cadus))
-        block = frames_of(cadus, offsets, settings)
+        times = self._record.times_utc_ns(stream, offsets)
+        self.accounting.quality.add_times(times)
+        block = replace(frames_of(cadus, offsets, settings), received_utc_ns=times)
         first_found = not self._located and offsets.size > 0
         own = 0
         for spacecraft in self._wanted(block):
@@ -254,11 +256,10 @@ class DownlinkReader:
         self._position = base + stream.size
 
     def _note_lock(self, stream: OctetArray, sync: cadu.CaduSync, base: int, length: int) -> None:
-        """Count the CADUs of a window that are not where the lock expects them, and read their reception times."""
+        """Count the CADUs of a window that are not where the lock expects them."""
         quality = self.accounting.quality
         quality.frames_inverted += int(np.count_nonzero(sync.inverted))
         quality.octets_records += sync.offsets.size * self._record.octets
-        quality.add_times(self._record.times_utc_ns(stream, sync.offsets))
         if sync.start_bits.size:
             starts = sync.start_bits + 8 * base
             expected = starts[:-1] + 8 * (length + self._record.octets)

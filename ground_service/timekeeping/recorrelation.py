@@ -7,6 +7,7 @@ in which they came. Fitting again without anything new changes nothing.
 from __future__ import annotations
 
 import csv
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -23,6 +24,8 @@ from ground_service.errors import InvalidInput
 from ground_service.events import CorrelationChanged, ReceptionsEntered, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime, time_of
+from ground_service.ingest.store import RECEPTIONS_LIMIT
+from ground_service.missions.places import stations_of
 from ground_service.missions.stations import STATIONS
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.store.vehicles import lock_vehicle, vehicle_id
@@ -41,7 +44,6 @@ from lunar.visibility import link
 AUTOMATIC = "time reports, light time"
 """Method of correlations that are fitted again by themselves."""
 
-RECEPTIONS_LIMIT = 100_000
 _LINE = (
     "start_ticks",
     "stop_ticks",
@@ -272,6 +274,9 @@ def _light_time_ns(
         return np.zeros(0, dtype=np.int64)
     light_s = np.full(len(earth_utc_ns), np.nan)
     known = {station.name: station for station in STATIONS}
+    mission = mission_of_vehicle(connection, vehicle)
+    if mission is not None:
+        known |= {station.name: station for station in stations_of(mission.link)}
     names = np.array(stations)
     for ephemeris in _references(ground, connection, vehicle, earth_utc_ns):
         covered = (earth_utc_ns - 2 * 10**9 >= ephemeris.start_utc_ns) & (
@@ -296,4 +301,10 @@ def _references(
     rows = covering_ephemerides(connection, int(earth_utc_ns.min()), int(earth_utc_ns.max()))
     if mine:
         rows = [row for row in rows if row.id in mine]
-    return [load_ephemeris(ground.files.path(row.sha256)) for row in rows]
+    return [_load(ground.files.path(row.sha256)) for row in rows]
+
+
+@functools.lru_cache(maxsize=64)
+def _load(path: Path) -> Ephemeris:
+    """Return the ephemeris in a stored file, whose name is its SHA-256."""
+    return load_ephemeris(path)

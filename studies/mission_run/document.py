@@ -14,7 +14,7 @@ _STYLE = (
 
 SECTIONS = (
     "windows", "navigation", "detector", "verdicts", "requirements", "trends", "evidence", "reports_lack",
-    "memory_mib", "cpu_s",
+    "time_correlation", "memory_mib", "cpu_s",
 )  # fmt: skip
 COLUMNS = (
     "window", "start", "state", "contacts_to_processed", "frames", "packets_lost", "verdict", "recall",

@@ -12,6 +12,7 @@ from ground_service.evaluation.model import PassFigures
 from ground_service.planning.model import Window
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.timescales import parse_utc
+from payload_emulator.session.flying import SPACECRAFT_ID
 from studies.mission_run.ground import MissionGround
 from studies.mission_run.incidents import find_incidents
 from studies.mission_run.processes import summary
@@ -77,6 +78,7 @@ def closing_figures(
             f"{name}: {reason}" for one in evaluated for name, reason in _missing(one).items()
         ),
         "evidence": _counted(one.evidence_level for one in evaluated),
+        "time_correlation": _correlations(ground),
         "interventions": len(interventions),
         "interventions_list": interventions,
         "navigation": _navigation(evaluated),
@@ -110,6 +112,21 @@ def _figures_of(ground: MissionGround, window: Window) -> PassFigures | None:
         return None
     reports = ground.client.list_reports(window.pass_id).page(1).items
     return ground.client.get_report_summary(reports[0].id) if reports else None
+
+
+def _correlations(ground: MissionGround) -> dict[str, dict[str, float | int | None]]:
+    """Return the time correlations in force by their first reported time, on-board ticks."""
+    return {
+        str(one.start_ticks): {
+            "time_reports": one.points,
+            "rejected": one.rejected,
+            "drift_ppb": one.drift_ppb,
+            "residual_rms_us": None if one.residual_rms_ns is None else one.residual_rms_ns * 1e-3,
+            "residual_max_us": None if one.residual_max_ns is None else one.residual_max_ns * 1e-3,
+        }
+        for one in ground.client.list_correlations(SPACECRAFT_ID)
+        if one.in_force
+    }
 
 
 def _missing(one: PassFigures) -> dict[str, str]:
