@@ -21,7 +21,7 @@ SEED   ?= 1
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 
-.PHONY: demo test check openmct docs pictures links sbom licences package release bench bench-planning mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures page-table links sbom licences package release bench bench-planning mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -56,6 +56,10 @@ deploy/openmct/node_modules/.package-lock.json: deploy/openmct/package.json depl
 # Pictures of the pages in the documentation, taken by the test of a shift.
 pictures: $(VENV)/.dev
 	LINNA_PICTURES=docs/pictures $(BIN)/python -m pytest -q tests/ground_service/web/test_shift.py
+
+# Table of the pages by width, colours, font and data, written by the test of all pages.
+page-table: $(VENV)/.dev
+	LINNA_PAGE_TABLE=docs/reference/pages.md $(BIN)/python -m pytest -q tests/ground_service/web/test_matrix.py
 
 # Software bill of materials of the runtime, CycloneDX.
 sbom: $(VENV)/.dev

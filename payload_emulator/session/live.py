@@ -47,6 +47,7 @@ from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, tran
 from payload_emulator.sim.render.labels import label_frame
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
+from tmtc.event_texts import event_text
 from tmtc.link import LinkSettings
 from tmtc.uplink import CLTU_START, CLTU_TAIL
 
@@ -486,8 +487,14 @@ def _add_packets(message: dict[str, Any], packets: Sequence[bytes]) -> dict[str,
             continue
         if name.startswith("event_"):
             event = labels(name, "event_id").get(values["event_id"], "")
+            numbers = [values["value_1"], values["value_2"]]
             message["events"].append(
-                {"severity": name[6:], "event": event, "values": [values["value_1"], values["value_2"]]}
+                {
+                    "severity": name[6:],
+                    "event": event,
+                    "values": numbers,
+                    "text": event_text(event, *numbers),
+                }
             )
         elif name.startswith("verification_"):
             message["verifications"].append({"stage": name[13:], **values})

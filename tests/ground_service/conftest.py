@@ -379,8 +379,8 @@ costs = json.loads((build / "costs.json").read_text())
 """
 
 
-@pytest.fixture
-def make_build(tmp_path: Path) -> Callable[..., Path]:
+@pytest.fixture(scope="session")
+def make_build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """A function that writes a build: a program that sends packets prepared for each pass, or any other script."""
 
     def make(
@@ -391,7 +391,7 @@ def make_build(tmp_path: Path) -> Callable[..., Path]:
         network_ms: float = 10.0,
         extra: str = "",
     ) -> Path:
-        folder = tmp_path / f"build-{name}"
+        folder = tmp_path_factory.mktemp("builds") / f"build-{name}"
         folder.mkdir()
         files = {"fly.py": program, "costs.json": json.dumps({"network": network_ms})}
         for file, content in files.items():

@@ -53,7 +53,7 @@ function take(message) {
   }
   say(message.paused ? "paused" : "running");
   for (const event of message.events) {
-    log(`${timeText(message.utc)} ${event.severity}: ${event.event.replaceAll("_", " ")} ${event.values.map((value) => figure(value)).join(", ")}`);
+    log(`${timeText(message.utc)} ${event.severity}: ${event.event.replaceAll("_", " ")}${event.text ? `: ${event.text}` : ""}`);
   }
   if (message.kind === "frame") drawFrame(message);
 }

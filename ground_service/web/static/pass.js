@@ -145,25 +145,35 @@ function showCompleteness(found) {
       rows,
       "No packet of this pass has come.",
     ),
-    table(
-      "Link quality by reception",
-      [
-        ["Station", (row) => row.station || "not stated"],
-        ["First frame", (row) => row.first_received ?? "unknown"],
-        ["Last frame", (row) => row.last_received ?? "unknown"],
-        ["Frames", (row) => figure(row.frames), "num"],
-        ["Good", (row) => figure(row.frames_good), "num"],
-        ["Symbols corrected", (row) => figure(row.symbols_corrected), "num"],
-        ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : row.bit_error_rate.toExponential(1)), "num"],
-        ["Lock losses", (row) => figure(row.lock_losses), "num"],
-        ["Octets", (row) => figure(row.octets), "num"],
-        ["Outside frames", (row) => figure(row.octets_other), "num"],
-        ["Link settings", (row) => row.source + (row.ambiguous ? ", ambiguous" : "")],
-      ],
-      found.receptions,
-      "No frames of this pass have been received.",
-    ),
+    receptionTable(found.receptions),
   );
+}
+
+const OPEN_RECEPTIONS = 8; // more are listed on request: a contact in progress is received in many parts
+
+function receptionTable(receptions) {
+  const listed = table(
+    "Link quality by reception",
+    [
+      ["Station", (row) => row.station || "not stated"],
+      ["First frame", (row) => row.first_received ?? "unknown"],
+      ["Last frame", (row) => row.last_received ?? "unknown"],
+      ["Frames", (row) => figure(row.frames), "num"],
+      ["Good", (row) => figure(row.frames_good), "num"],
+      ["Symbols corrected", (row) => figure(row.symbols_corrected), "num"],
+      ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : row.bit_error_rate.toExponential(1)), "num"],
+      ["Lock losses", (row) => figure(row.lock_losses), "num"],
+      ["Octets", (row) => figure(row.octets), "num"],
+      ["Outside frames", (row) => figure(row.octets_other), "num"],
+      ["Link settings", (row) => row.source + (row.ambiguous ? ", ambiguous" : "")],
+    ],
+    receptions,
+    "No frames of this pass have been received.",
+  );
+  if (receptions.length <= OPEN_RECEPTIONS) return listed;
+  const good = receptions.reduce((sum, row) => sum + row.frames_good, 0);
+  const frames = receptions.reduce((sum, row) => sum + row.frames, 0);
+  return element("details", {}, element("summary", {}, `Link quality: ${figure(receptions.length)} receptions, ${figure(good)} of ${figure(frames)} frames good`), listed);
 }
 
 async function terrainOf(pass) {

@@ -6,6 +6,7 @@ import { loadRequests } from "./requests.js";
 
 const ROW_PX = 34;
 const HEAD_PX = 24;
+const LABEL_PX = 16; // name of a section, above its bars
 const DAY_S = 86400;
 let windows = [];
 let candidates = [];
@@ -77,11 +78,16 @@ function drawTimeline() {
   const lane = lanes(ordered);
   const rows = Math.max(1, ...lane.map((one) => one + 1));
   const sections = [
-    { name: "candidates", top: HEAD_PX, height: ROW_PX },
-    { name: "windows", top: HEAD_PX + ROW_PX, height: rows * ROW_PX },
-    { name: "contacts", top: HEAD_PX + ROW_PX + rows * ROW_PX, height: ROW_PX },
+    { name: "candidates", height: LABEL_PX + ROW_PX },
+    { name: "windows", height: LABEL_PX + rows * ROW_PX },
+    { name: "contacts", height: LABEL_PX + ROW_PX },
   ];
-  const lanesTop = sections[2].top + ROW_PX;
+  let lanesTop = HEAD_PX;
+  for (const one of sections) {
+    one.top = lanesTop;
+    one.bars = one.top + LABEL_PX;
+    lanesTop += one.height;
+  }
   const height = lanesTop + lanesHeight();
   const drawn = svg("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "timeline of windows" });
   const step = tickStep(view[1] - view[0]);
@@ -92,28 +98,28 @@ function drawTimeline() {
     text.textContent = step >= DAY_S || time % DAY_S === 0 ? iso.slice(5, 10) : iso.slice(11, 16);
     drawn.append(text);
   }
-  for (const { name, top, height: tall } of sections) {
+  for (const { name, top } of sections) {
     drawn.append(svg("line", { x1: 0, x2: width, y1: top, y2: top, class: "edge" }));
-    const text = svg("text", { x: 4, y: top + tall - 5, class: "lane" });
+    const text = svg("text", { x: 4, y: top + 12, class: "lane" });
     text.textContent = name;
     drawn.append(text);
   }
   drawLanes(drawn, x, width, lanesTop);
   for (const one of linked) {
-    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop ?? one.start)), sections[2].top + 6, `contact ${one.state}`, `link ${one.link}, ${one.station}, ${one.state}, ${timeText(one.start)} to ${timeText(one.stop)}`));
+    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop ?? one.start)), sections[2].bars, `contact ${one.state}`, `link ${one.link}, ${one.station}, ${one.state}, ${timeText(one.start)} to ${timeText(one.stop)}`));
   }
   for (const one of contacts) {
-    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[2].top + 6, "contact", `${one.station} ${timeText(one.start)} to ${timeText(one.stop)}`));
+    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[2].bars, "contact", `${one.station} ${timeText(one.start)} to ${timeText(one.stop)}`));
   }
   for (const one of rejected) {
-    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].top + 4, "candidate rejected", `rejected ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}: ${one.reason}`));
+    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].bars, "candidate rejected", `rejected ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}: ${one.reason}`));
   }
   for (const one of candidates) {
-    const made = bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].top + 4, "candidate", `candidate ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}${mayOperate() ? ": plan it" : ""}`);
+    const made = bar(x(seconds(one.start)), x(seconds(one.stop)), sections[0].bars, "candidate", `candidate ${timeText(one.start)}, ${lengthText(seconds(one.stop) - seconds(one.start))}${mayOperate() ? ": plan it" : ""}`);
     if (mayOperate()) pressable(made, acting(() => plan(one)));
     drawn.append(made);
   }
-  ordered.forEach((row, index) => drawn.append(windowBar(row, x, sections[1].top + 4 + lane[index] * ROW_PX, scale)));
+  ordered.forEach((row, index) => drawn.append(windowBar(row, x, sections[1].bars + lane[index] * ROW_PX, scale)));
   drawn.addEventListener("pointermove", (event) => readAt(view[0] + (event.clientX - drawn.getBoundingClientRect().left) / scale));
   const cursor = svg("line", { y1: HEAD_PX - 6, y2: height, class: "cursor" });
   drawn.append(cursor);

@@ -84,6 +84,9 @@ function tokenAction(token) {
 }
 
 async function load() {
+  const { role } = await get("session");
+  byId("refused").hidden = role === "admin";
+  if (role !== "admin") return;
   const [users, tokens] = await Promise.all([get("users"), get("tokens")]);
   show(
     "users",

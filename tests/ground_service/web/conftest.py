@@ -122,7 +122,9 @@ def live_frame(number: int) -> dict[str, object]:
         "mode": "observing",
         "paused": False,
         "rate": 1.0,
-        "events": [{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0]}]
+        "events": [
+            {"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}
+        ]
         if number == 3
         else [],
         "verifications": [],

@@ -41,6 +41,16 @@ from tmtc.uplink import UplinkDecoder
 NS = 1_000_000_000
 SPACECRAFT = 76
 
+# Names of the sections of the timeline that a bar covers.
+COVERED_LABELS = """() => {
+    const box = (one) => one.getBoundingClientRect();
+    const bars = [...document.querySelectorAll("#timeline .span rect")].map(box);
+    const covered = (label) => bars.some((bar) => bar.left < label.right && label.left < bar.right
+        && bar.top < label.bottom - 2 && label.top + 2 < bar.bottom);
+    const labels = [...document.querySelectorAll("#timeline .lane")];
+    return labels.filter((one) => covered(box(one))).map((one) => one.textContent);
+}"""
+
 MISSION = """name = "selenita"
 [spacecraft]
 id = 76
@@ -72,6 +82,23 @@ kind = "tcp"
 station = "canberra"
 send = "manual"
 uplink = "127.0.0.1:{up}"
+"""
+
+PASS_MISSION = """name = "archive"
+[spacecraft]
+id = 76
+[camera]
+pointing = "nadir"
+[requirements]
+estimator = "spherical"
+median_error_m = 200.0
+p95_error_m = 300.0
+better_than = ["propagate-only"]
+packets_percent = 99.9
+frames_percent = 99.0
+recall = 0.7
+precision = 0.5
+temperature_max_c = 60.0
 """
 
 
@@ -106,6 +133,12 @@ class Spacecraft:
             ticks = int(ticks_from_utc_ns(time.time_ns())) + self._count
             packet = DICTIONARY.pack(name, zeros | values, ticks=ticks, sequence_count=self._count)
             self._listeners[-1].sendall(self._encoder.encode([packet]))
+
+    def replay(self, packets: list[bytes]) -> None:
+        """Send packets of a recorded pass."""
+        wait_until(lambda: bool(self._listeners), "the service has not connected")
+        with self._sending:
+            self._listeners[-1].sendall(self._encoder.encode(packets))
 
     def _accept_listeners(self) -> None:
         while True:
@@ -151,7 +184,7 @@ class Shift:
 @pytest.fixture
 def shift(
     tmp_path: Path,
-    synthetic_pass: Any,
+    make_pass: Callable[..., Any],
     make_flyable: Callable[..., Any],
     make_build: Callable[..., Path],
     console: Any,
@@ -167,10 +200,10 @@ def shift(
     with open_ground(home) as ground:
         add_user(ground, "root", "admin")
         token = add_user(ground, "ann", "operator")
+        import_archive(ground, make_pass(mission=PASS_MISSION).folder)
         add_mission(ground, MISSION.format(**ports).encode(), actor="root")
         stored = ground.files.put_file(tmp_path / "coming.oem")
         add_ephemeris(ground, stored, name="coming.oem", precedence=0, actor="root")
-        import_archive(ground, synthetic_pass.folder)
         keep_archive(ground, flyable.folder)
         for name, program in (("good", None), ("broken", "raise SystemExit(4)")):
             options = {} if program is None else {"program": program}
@@ -244,6 +277,8 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     page.locator("#timeline .window.draft").first.click()
     expect(page.locator("#selected")).to_contain_text("Sun elevation")
     expect(page.locator("#timeline .curve")).to_have_count(3)
+    expect(page.locator("#timeline .contact.predicted").first).to_be_attached()
+    assert page.evaluate(COVERED_LABELS) == []
     dismiss_notices(page)
     pictures.take(page, "planner")
 
@@ -286,6 +321,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     page.get_by_role("button", name="Make a report").click()
     expect(page.locator("#verdict .verdict")).not_to_be_empty()
     expect(page.locator("#completeness tbody tr").first).to_be_visible()
+    expect(page.locator("#verdict tr", has_text="detector recall")).to_contain_text("≥ 0.7")
     dismiss_notices(page)
     pictures.take(page, "pass")
     with page.expect_popup() as opened:

@@ -1,0 +1,323 @@
+"""Every page at three widths, light and dark, with two fonts, with and without data: layout, barriers, keyboard.
+
+LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `make page-table`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserContext, Page, expect
+
+from ground_service.access.service import add_user
+from ground_service.client import Client
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.evaluation.service import make_report
+from ground_service.ground import open_ground
+from ground_service.landmarks.service import update_landmarks
+from ground_service.missions.service import add_mission
+from ground_service.passes.archive_import import import_archive
+from ground_service.regression.archives import keep_archive
+from ground_service.regression.builds import load_build, register_build
+from ground_service.web.pages import DISPLAYS, PAGES
+from lunar.catalogue import load_catalogue, save_catalogue
+from lunar.timescales import format_utc
+from tests.ground_service.conftest import SPACECRAFT, START
+from tests.ground_service.landmarks.test_learned_landmarks import rewrite
+from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, Service, wait_until
+from tests.ground_service.web.test_in_browser import answered, settled
+from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
+
+WIDTHS = (1280, 820, 390)
+SCHEMES = ("light", "dark")
+FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
+"""Fonts by the name in the table; Liberation Sans has the widths of Arial."""
+
+AXE_RUNS = {("dark", 1280), ("light", 390)}
+SIGN_IN = "sign-in"
+API_PAGE = "/docs"
+"""Page of Swagger UI, which has tests of its own."""
+
+PATHS = [page.path for page in PAGES if page is not DISPLAYS and page.path != API_PAGE]
+DETAILS = ("/passes/{pass_id}", "/missions/{revision}")
+MOST_STEPS = 400
+NS = 1_000_000_000
+
+USABLE = """() => {
+    const usable = "a[href], button, input, select, textarea, summary, [role=button], [tabindex]";
+    const shown = (one) => one.checkVisibility({visibilityProperty: true}) && !one.disabled && one.tabIndex >= 0;
+    const place = document.querySelector("dialog[open]") ?? document;
+    const all = [...place.querySelectorAll(usable)].filter(shown);
+    window.linnaUsable = new Set(all.filter((one) => one.type !== "radio"));
+    window.linnaVisited = new Set();
+    return linnaUsable.size;
+}"""
+VISIT = """() => {
+    const one = document.activeElement;
+    const again = linnaVisited.has(one);
+    linnaVisited.add(one);
+    return again && one !== document.body;
+}"""
+MISSED = """() => [...linnaUsable].filter((one) => one.isConnected && !linnaVisited.has(one))
+    .map((one) => one.outerHTML.slice(0, 120))"""
+FRAMES_DRAWN = (
+    "() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(() => drawn())))"
+)
+# Width of the content; charts take the width of the window in the frame after the change.
+WIDTH = "document.documentElement.scrollWidth"
+
+
+@pytest.fixture(scope="module")
+def empty_service(tmp_path_factory: pytest.TempPathFactory, console: Any, serve: Any) -> Iterator[Service]:
+    """A service without any data."""
+    home = tmp_path_factory.mktemp("empty") / "home"
+    home.mkdir()
+    running = serve(home, home / "serve.log", console.port)
+    yield running
+    running.stop()
+
+
+class Worked:
+    """A service with users and data, and the token of an administrator."""
+
+    def __init__(self, service: Service, token: str, paths: dict[str, str]) -> None:
+        self.url = service.url
+        self.token = token
+        self.paths = paths
+
+
+@pytest.fixture(scope="module")
+def worked(
+    tmp_path_factory: pytest.TempPathFactory,
+    make_pass: Callable[..., Any],
+    make_flyable: Callable[..., Any],
+    make_build: Callable[..., Path],
+    console: Any,
+    serve: Any,
+) -> Iterator[Worked]:
+    """A service with a pass received over TCP, a report, landmarks, a window, telecommands, an alarm and a build."""
+    folder = tmp_path_factory.mktemp("worked")
+    home = folder / "home"
+    spacecraft = Spacecraft()
+    received = make_pass(mission=PASS_MISSION)
+    learned = make_pass(frames=24, seed=4)
+    catalogue = load_catalogue(learned.folder / "catalogue.csv")
+    save_catalogue(catalogue.select(np.arange(len(catalogue)) % 3 > 0), learned.folder / "catalogue.csv")
+    flyable = make_flyable(frames=12, seed=61)
+    build = make_build("good", {"synthetic pass 61": flyable.packets})
+    ports = {"down": spacecraft.down.getsockname()[1], "up": spacecraft.up.getsockname()[1]}
+    with open_ground(home) as ground:
+        token = add_user(ground, "root", "admin")
+        make_report(ground, import_archive(ground, received.folder), pdf=False)
+        for name in ("first pass", "second pass"):
+            rewrite(learned.folder, name)
+            update_landmarks(ground, import_archive(ground, learned.folder))
+        mission = add_mission(ground, MISSION.format(**ports).encode(), actor="root")
+        stored = ground.files.put_file(received.folder / "reference.oem")
+        add_ephemeris(ground, stored, name="reference.oem", precedence=0, actor="root")
+        keep_archive(ground, flyable.folder)
+        register_build(ground, load_build(build.parent), actor="root")
+    running = serve(home, home / "serve.log", console.port)
+    try:
+        with Client(running.url, token) as api:
+            live = work(api, spacecraft, received.packets)
+        revision = mission.revision[:16]
+        yield Worked(
+            running,
+            token,
+            {
+                "/passes/{pass_id}": f"/passes/{live}",
+                "/missions/{revision}": f"/missions/{revision}",
+                "/comparison": f"/comparison?pass=1&pass={live}",
+                "/telemetry": f"/telemetry?spacecraft={SPACECRAFT}+flight&packet=housekeeping",
+                "/landmarks": "/landmarks",
+            },
+        )
+    finally:
+        running.stop()
+        spacecraft.close()
+
+
+def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
+    """Receive a pass over TCP, and leave traces on every page; return the number of the pass."""
+    spacecraft.replay(packets)
+    spacecraft.report("event_high", event_id=20, frame_number=7)
+    wait_until(lambda: api.list_alarms().total > 0, "no alarm was raised")
+    live = api.define_pass(
+        {
+            "name": "live pass",
+            "spacecraft_id": SPACECRAFT,
+            "start": format_utc(START - 600 * NS),
+            "stop": format_utc(START + 1200 * NS),
+        }
+    ).id
+    window = api.add_window(
+        {
+            "name": "morning",
+            "start": format_utc(START - 300 * NS),
+            "stop": format_utc(START + 300 * NS),
+            "spacecraft_id": SPACECRAFT,
+        }
+    ).id
+    api.change_window(window, {"state": "approved"})
+    api.uplink_window(window)
+    api.send_link("madrid")
+    api.make_report(live)
+    return live
+
+
+class Faults:
+    """Faults of a page by kind, in the order of the columns of the table."""
+
+    def __init__(self, page: Page) -> None:
+        self.console: list[str] = []
+        page.on("console", lambda one: self.console.append(one.text) if one.type == "error" else None)
+        page.on("pageerror", lambda error: self.console.append(str(error)))
+        self.layout: list[str] = []
+        self.barriers: list[str] = []
+        self.keyboard: list[str] = []
+
+    def find(self, page: Page) -> None:
+        """Look at an opened page in all forms."""
+        for scheme in SCHEMES:
+            page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]  # one of its words
+            for name, family in FONTS.items():
+                page.evaluate(
+                    "(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", family
+                )
+                for width in WIDTHS:
+                    page.set_viewport_size({"width": width, "height": 844})
+                    page.evaluate(FRAMES_DRAWN)
+                    if (wide := page.evaluate(WIDTH)) > width:
+                        self.layout.append(f"{scheme}, {name}, {width} px: {wide} px wide")
+                    if name == "Arial" and (scheme, width) in AXE_RUNS:
+                        self.barriers += [f"{scheme}, {width} px: {one}" for one in barriers(page)]
+        self.keyboard = missed_by_keyboard(page)
+
+    def columns(self) -> dict[str, list[str]]:
+        """Return the faults by the name of their column."""
+        return {
+            "wider than the window": self.layout,
+            "axe": self.barriers,
+            "console errors": self.console,
+            "not reached by Tab": self.keyboard,
+        }
+
+
+def barriers(page: Page) -> list[str]:
+    """Return the serious and critical findings of axe."""
+    return [
+        f"{one['id']} {[node['html'][:100] for node in one['nodes'][:2]]}"
+        for one in Axe().run(page).response["violations"]
+        if one["impact"] in ("serious", "critical")
+    ]
+
+
+def missed_by_keyboard(page: Page) -> list[str]:
+    """Return what the Tab key does not reach, from the start of the page to its end."""
+    page.set_viewport_size({"width": 1280, "height": 844})
+    count = page.evaluate(USABLE)
+    page.evaluate("document.activeElement.blur()")
+    for _ in range(min(count + 20, MOST_STEPS)):
+        page.keyboard.press("Tab")
+        if page.evaluate(VISIT):
+            break
+    missed: list[str] = page.evaluate(MISSED)
+    return missed
+
+
+@pytest.fixture(scope="module")
+def rows() -> Iterator[list[str]]:
+    """Rows of the table, written at the end where a file is named."""
+    lines: list[str] = []
+    yield lines
+    if file := os.environ.get("LINNA_PAGE_TABLE"):
+        head = Path(file).read_text().split("| page |")[0]
+        heading = "| page | data | wider than the window | axe | console errors | not reached by Tab |"
+        Path(file).write_text("\n".join([f"{head}{heading}", "|---" * 6 + "|", *lines, ""]))
+
+
+def record(rows: list[str], path: str, state: str, found: Faults) -> None:
+    """Add a row of the table, and fail if the page has faults."""
+    columns = found.columns()
+    counts = " | ".join(str(len(texts)) if texts else "none" for texts in columns.values())
+    rows.append(f"| `{path}` | {state} | {counts} |")
+    assert {kind: texts for kind, texts in columns.items() if texts} == {}
+
+
+def new_page(context: BrowserContext) -> Page:
+    """Return a page that counts its requests."""
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_S * 1e3)
+    page.add_init_script(COUNT_REQUESTS)
+    return page
+
+
+@pytest.fixture(scope="module")
+def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
+    """The browser of somebody who is signed in."""
+    context = browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844})
+    page = context.new_page()
+    page.goto("/licences")
+    page.get_by_label("Token").fill(worked.token)
+    page.locator("dialog").get_by_role("button", name="Sign in").click()
+    expect(page.locator("#user")).to_have_text("root, admin")
+    page.close()
+    yield context
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def newcomer(browser: Browser, empty_service: Service) -> Iterator[BrowserContext]:
+    """The browser of somebody at a service without data."""
+    context = browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844})
+    yield context
+    context.close()
+
+
+def test_the_fonts_of_the_matrix_are_installed() -> None:
+    listed = subprocess.run(["fc-list", ":", "family"], capture_output=True, text=True, check=True).stdout
+    assert [family for family in FONTS.values() if family not in listed] == []
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_page_with_data_has_no_fault(
+    administrator: BrowserContext, worked: Worked, rows: list[str], path: str
+) -> None:
+    page = new_page(administrator)
+    found = Faults(page)
+    settled(page, worked.paths.get(path, path))
+    answered(page)
+    found.find(page)
+    page.close()
+    record(rows, path, "with", found)
+
+
+@pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
+def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[str], path: str) -> None:
+    page = new_page(newcomer)
+    found = Faults(page)
+    settled(page, path)
+    answered(page)
+    found.find(page)
+    page.close()
+    record(rows, path, "without", found)
+
+
+def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[str]) -> None:
+    context = browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844})
+    page = new_page(context)
+    page.goto("/")
+    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+    answered(page)
+    found = Faults(page)
+    found.find(page)
+    context.close()
+    record(rows, SIGN_IN, "with", found)
