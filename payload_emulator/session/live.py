@@ -18,12 +18,13 @@ import selectors
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
@@ -42,7 +43,7 @@ from payload_emulator.session.flying import (
 from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.live_ports import Server
 from payload_emulator.session.spacecraft import Spacecraft
-from payload_emulator.session.world import World, continued, exposures
+from payload_emulator.session.world import Exposure, Samples, World, continued, exposures
 from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, transmit
 from payload_emulator.sim.render.labels import label_frame
 from tmtc.dictionary import DICTIONARY
@@ -193,6 +194,7 @@ class LivePayload:
     _downwards: Flight[bytes] = field(init=False)
     _light_s: float = LIGHT_S
     _heard: bool = True
+    _craters: dict[int, list[dict[str, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._upwards = Flight(self._arrive)
@@ -253,7 +255,7 @@ class LivePayload:
 
     def _fly(self) -> None:
         operator = Operator(self.world) if self.has_operator else Nobody()
-        frames = exposures(self.world, InstrumentBench(self.world).sample)
+        frames = self._exposures()
         pending = deque(timeline(self.world))
         last = pending[-1]
         try:
@@ -270,7 +272,7 @@ class LivePayload:
                         if isinstance(operator, Operator):
                             operator.world = self.world
                         if self.world.frame_utc_ns.size > number:
-                            frames = exposures(self.world, InstrumentBench(self.world).sample, number)
+                            frames = self._exposures(number)
                     moment = pending.popleft()
                     self._wait(selector, 0.0 if before is None else (moment.utc_ns - before.utc_ns) / _NS)
                     if self.stopping.is_set():
@@ -290,6 +292,18 @@ class LivePayload:
                     self._send_frame(flown)
         finally:
             frames.close()
+
+    def _exposures(self, first: int = 0) -> Generator[Exposure]:
+        """Yield the frames from the `first` on; the craters to show with each are kept in `_craters`."""
+        world, bench = self.world, InstrumentBench(self.world)
+
+        def sample(utc_ns: int, camera_from_mcmf: FloatArray) -> Samples:
+            # The thread of the terrain calls this.
+            if world.scenario.camera.images != "reduced":
+                self._craters[utc_ns] = _rims(world, utc_ns, camera_from_mcmf)
+            return bench.sample(utc_ns, camera_from_mcmf)
+
+        return exposures(world, sample, first)
 
     def _beyond(self, last: Moment) -> list[Moment]:
         """Fly on beyond the scenario's arc and return the moments after its last; turns without frames fill the gaps.
@@ -422,16 +436,26 @@ class LivePayload:
             octets = transmit([dump], self._transmitter.settings, section, seed).octets
             self._downwards.start(octets, self._way_s)
             self.sent += 1
+        craters = None if flown.exposure is None else self._craters.pop(flown.exposure.utc_ns, None)
         if self._servers["console"].clients:
-            self._send_message(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate))
+            self._send_message(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate, craters))
 
     def _send_message(self, message: dict[str, Any]) -> None:
         if "console" in self._servers:
             self._servers["console"].send(json.dumps(message).encode() + b"\n")
 
 
-def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, rate: float) -> dict[str, Any]:
+def snapshot(
+    world: World,
+    spacecraft: Spacecraft,
+    flown: Flown,
+    paused: bool,
+    rate: float,
+    craters: list[dict[str, float]] | None = None,
+) -> dict[str, Any]:
     """A moment for a viewer: image, detections, catalogue, outcome estimate of each estimator, and truth.
+
+    `craters` are those of the catalogue in the image; None: on the sphere, as the detections of reduced images are.
 
     A detection that the payload identified has the `crater_id` that it reported.
     """
@@ -460,7 +484,7 @@ def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, r
             },
             "altitude_km": altitude / 1e3,
             "terrain": {"name": world.terrain.name, "real": world.terrain.is_real},
-            "catalogue": _catalogue(world, flown),
+            "catalogue": _on_sphere(world, flown.exposure) if craters is None else craters,
             "image_jpeg": _jpeg(flown.exposure.image),
         }
         for estimate in estimates.values():
@@ -527,23 +551,24 @@ def _add_packets(message: dict[str, Any], packets: Sequence[bytes]) -> dict[str,
     return estimates
 
 
-def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
-    """Return the largest craters in the image: over rendered ground, the ellipses of their rims at their heights."""
-    assert flown.exposure is not None
-    if world.scenario.camera.images == "reduced":
-        # Nothing is rendered: the detections are made of the catalogue on the sphere.
-        index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX)
-        columns = {"u_px": uv[:, 0], "v_px": uv[:, 1], "diameter_px": diameter_px}
-    else:
-        camera, position = world.true_camera, world.truth.positions_mcmf(flown.exposure.utc_ns)[0]
-        altitude_m = float(spherical_from_mcmf(position)[2])
-        smallest_m = _SMALLEST_SHOWN_PX * altitude_m / camera.focal_px
-        labels = label_frame(
-            world.terrain, camera, position, flown.exposure.camera_from_mcmf, minimum_diameter_m=smallest_m
-        )
-        seen = np.flatnonzero(labels.inside & (labels.diameter_px > _SMALLEST_SHOWN_PX))
-        names = ("u_px", "v_px", "diameter_px", "major_px", "minor_px", "angle_rad")
-        index, columns = labels.index[seen], {name: getattr(labels, name)[seen] for name in names}
+def _rims(world: World, utc_ns: int, camera_from_mcmf: FloatArray) -> list[dict[str, float]]:
+    """Return the largest craters in an image of rendered ground: the ellipses of their rims at their heights."""
+    camera, position = world.true_camera, world.truth.positions_mcmf(utc_ns)[0]
+    altitude_m = float(spherical_from_mcmf(position)[2])
+    smallest_m = _SMALLEST_SHOWN_PX * altitude_m / camera.focal_px
+    labels = label_frame(world.terrain, camera, position, camera_from_mcmf, minimum_diameter_m=smallest_m)
+    seen = np.flatnonzero(labels.inside & (labels.diameter_px > _SMALLEST_SHOWN_PX))
+    names = ("u_px", "v_px", "diameter_px", "major_px", "minor_px", "angle_rad")
+    return _largest(world, labels.index[seen], {name: getattr(labels, name)[seen] for name in names})
+
+
+def _on_sphere(world: World, exposure: Exposure) -> list[dict[str, float]]:
+    """Return the largest craters in a reduced image, whose detections are made of the catalogue on the sphere."""
+    index, uv, diameter_px = craters_in_view(world, exposure, _SMALLEST_SHOWN_PX)
+    return _largest(world, index, {"u_px": uv[:, 0], "v_px": uv[:, 1], "diameter_px": diameter_px})
+
+
+def _largest(world: World, index: IntArray, columns: dict[str, FloatArray]) -> list[dict[str, float]]:
     shown = np.argsort(-columns["diameter_px"], kind="stable")[:_SHOWN_CRATERS].tolist()
     ids = world.terrain.catalogue.ids[index]
     return [

@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from payload_emulator.session.live import Flight, LivePayload, TelecommandBuffer
 from payload_emulator.session.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import Exposure, World, build_world
+from payload_emulator.session.world import Exposure, World, build_world, expose_frame
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.uplink import UplinkEncoder
@@ -99,9 +100,9 @@ class Watcher:
             connection.close()
 
 
-@pytest.fixture
-def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, Watcher]]:
-    world, loaded = flown
+@contextmanager
+def watched(world: World, loaded: LoadedPayload) -> Iterator[tuple[LivePayload, Watcher]]:
+    """Fly a payload live, paused at the start, with a client."""
     live = LivePayload(world, new_spacecraft(world, loaded), rate=0.0, paused=True)
     thread = threading.Thread(target=live.run, daemon=True)
     watcher = Watcher(live)
@@ -115,6 +116,12 @@ def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, W
     assert not thread.is_alive()
 
 
+@pytest.fixture
+def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, Watcher]]:
+    with watched(*flown) as both:
+        yield both
+
+
 def ping(count: int) -> bytes:
     return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
 
@@ -126,17 +133,16 @@ def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> Flown:
     return Flown(Moment(utc_ns, 0, 1.0, True, 0), exposure, b"", packets, b"")
 
 
-def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground(
-    flown: tuple[World, LoadedPayload],
-) -> None:
+def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None:
     world = build_world(parse_scenario(SCENARIO.replace('"reduced"', '"rendered"')), NO_DATA)
-    utc_ns = int(world.frame_utc_ns[0])
-    message = snapshot(world, new_spacecraft(world, flown[1]), seen_from(world, utc_ns, []), False, 1.0)
-    rings = message["catalogue"]
+    with watched(world, load_scenario_payload(world, NO_DATA)[0]) as (_, watcher):
+        watcher.say("run")
+        rings = watcher.until(lambda message: message["kind"] == "frame")[-1]["catalogue"]
+    exposure = expose_frame(world, 0)
     row = {int(one): k for k, one in enumerate(world.terrain.catalogue.ids)}
     craters = world.terrain.measured(np.array([row[one["id"]] for one in rings]))
-    position = world.truth.positions_mcmf(utc_ns)[0]
-    axes = (world.true_camera, world.camera_from_mcmf(position), position)
+    position = world.truth.positions_mcmf(exposure.utc_ns)[0]
+    axes = (world.true_camera, exposure.camera_from_mcmf, position)
     rims = project_mcmf(*axes, craters.position_mcmf_m)
     sphere = project_mcmf(*axes, mcmf_from_spherical(craters.latitude_rad, craters.longitude_rad, 0.0))
     shown = np.array([[one["u_px"], one["v_px"]] for one in rings])
