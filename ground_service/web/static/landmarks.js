@@ -1,5 +1,5 @@
 import { get, send } from "./api.js";
-import { acting, element, pager, show, table, timeText, trouble } from "./page.js";
+import { acting, element, pager, show, table, timeText, trouble, watch } from "./page.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const CROP = 3; // diameters of the crater that a picture shows
@@ -74,7 +74,7 @@ async function open(id) {
   byId("detail").hidden = false;
   byId("sightings-title").textContent = `Sightings of landmark ${row.id}`;
   byId("decision-text").textContent = row.decided_by ? `${row.state} by ${row.decided_by}` : row.state;
-  for (const button of ["accept", "reject"]) byId(button).disabled = row.state === "seen" || row.state === `${button}ed`;
+  for (const button of ["accept", "reject"]) byId(button).hidden = row.state === "seen" || row.state === `${button}ed`;
   show(
     "passes",
     table(
@@ -101,6 +101,7 @@ for (const decision of ["accept", "reject"]) {
       await send("POST", `landmarks/${shown}/${decision}`, { reason: byId("reason").value });
       byId("reason").value = "";
       await open(shown);
+      byId("sightings-title").focus(); // the button is hidden now
       await load();
     }),
   );
@@ -114,4 +115,5 @@ const load = pager(async (limit, offset) => {
 });
 
 byId("state").addEventListener("change", () => load.first().catch((error) => error.status === 401 || trouble(error)));
+watch((message) => message.kind === "landmarks" && load().catch(trouble), load);
 load().catch((error) => error.status === 401 || trouble(error));
