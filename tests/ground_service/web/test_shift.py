@@ -293,7 +293,9 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     row = page.locator("#links tbody tr", has_text="madrid")
     expect(row.get_by_role("button", name="Send now")).to_be_enabled()
     row.get_by_role("button", name="Send now").click()
-    command = page.locator("#commands tbody tr", has_text="insert activity").filter(has_text="by ann").first
+    # The planner uplinks approved windows that begin soon: its name is there if it was quicker.
+    named = re.compile(r"by (ann|planner)")
+    command = page.locator("#commands tbody tr", has_text="insert activity").filter(has_text=named).first
     expect(command.locator(".state")).to_have_text("completed")
     expect(command.get_by_role("img", name="accepted, started, completed")).to_be_visible()
     pictures.take(page, "commands", "section[aria-labelledby=queue-title]")
