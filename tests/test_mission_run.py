@@ -18,6 +18,7 @@ from ground_service.evaluation.model import PassFigures
 from linna import cli
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
+from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run.checkpoints import Checkpoints
@@ -149,6 +150,18 @@ def test_a_trend_needs_three_known_values() -> None:
 
 def test_contacts_count_from_the_end_of_a_window_to_its_processing() -> None:
     assert contacts_until(100, 200, [90, 100, 150, 200, 210]) == 2
+
+
+def test_stations_in_succession_are_one_contact(tmp_path: Path) -> None:
+    run = MissionRun(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, lambda text: None)
+    start = parse_utc("2029-08-07T03:00:00Z")
+    for gap_s, stops in ((0.02, []), (1.0, []), (1.1, ["2029-08-07T03:00:00Z"])):
+        run._progress.contact_stops = ["2029-08-07T03:00:00Z"]
+        run._join_handover(start + round(gap_s * 1e9))
+        assert run._progress.contact_stops == stops
+    run._progress.contact_stops = []
+    run._join_handover(start)
+    assert run._progress.contact_stops == []
 
 
 def test_what_a_person_does_after_the_posts_is_an_intervention(tmp_path: Path) -> None:

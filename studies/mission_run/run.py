@@ -34,6 +34,9 @@ DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 SETTLE_NS = (round(SILENCE_S) + 5) * NS
 """Mission time after a contact at which the ground notices its end."""
 
+HANDOVER_NS = NS
+"""Longest gap between two contacts that are one, handed over from station to station."""
+
 LAST_NS = 4 * 3600 * NS
 """No windows so long before the end of the run, so that the data of the last one are down and evaluated."""
 
@@ -102,7 +105,7 @@ class Progress:
     posts
         First and last number of the entries of the audit log for the posts of each start.
     contact_stops
-        Ends of the contacts, UTC.
+        Ends of the contacts, UTC; of stations in succession, the end at the last.
     processed
         Mission time at which a window was first seen as processed, by the id of the window.
     memory_mib, cpu_s
@@ -254,6 +257,7 @@ class MissionRun:
                 now = parse_utc(message["utc"])
                 self._stop_for_kill(message["state"], now)
                 if message["state"] == "started":
+                    self._join_handover(now)
                     self._deliver_reference(ground, dynamics, now)
                     # The links have begun the contact; they ingest its first frame with the next ones.
                     self._wait_acknowledged(spacecraft, messages)
@@ -291,6 +295,12 @@ class MissionRun:
             elif kind == "error":
                 raise LinkError(f"spacecraft: {message['text']}")
         raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
+
+    def _join_handover(self, start_utc_ns: int) -> None:
+        """Count a contact that follows on another station at once as a part of the same contact."""
+        stops = self._progress.contact_stops
+        if stops and start_utc_ns - parse_utc(stops[-1]) <= HANDOVER_NS:
+            stops.pop()
 
     @staticmethod
     def _wait_acknowledged(spacecraft: SpacecraftProcess, messages: Iterator[dict[str, Any]]) -> None:
