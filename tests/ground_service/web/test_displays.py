@@ -243,6 +243,9 @@ def stored_notebook(url):
 FOLLOW = """async (key) => {
     const object = await openmct.objects.get({ namespace: "linna", key });
     window.followed = [];
+    const interval = openmct.time.getBounds();
+    const had = await openmct.telemetry.request(object, { ...interval, size: 1000, strategy: "minmax" });
+    window.had = Math.max(...had.map((one) => one.utc));
     openmct.telemetry.subscribe(object, (given) => followed.push(...[given].flat()), { strategy: "batch" });
 }"""
 
@@ -269,6 +272,8 @@ def test_what_comes_within_a_minute_of_the_newest_telemetry_is_shown_once(mct, s
         mct.wait_for_function(
             "(time) => followed.some((one) => Math.abs(one.utc - time) < 500)", arg=time, timeout=2 * WAIT_MS
         )
+    if kind == "parameter":  # plots append
+        assert mct.evaluate("Number.isFinite(had) && followed.every((one) => one.utc > had)")
     given = mct.evaluate("followed.map((one) => JSON.stringify(one))")
     assert len(given) == len(set(given))
     assert sorted(mct.evaluate("followed.map((one) => one.utc)"))[-2:] == mct.evaluate(

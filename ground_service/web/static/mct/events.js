@@ -53,7 +53,7 @@ function subscribe(openmct, object, callback) {
 export function installEvents(openmct) {
   const isEvents = (object) => object.type === "linna.events";
   openmct.types.addType("linna.events", { name: "Events", cssClass: "icon-tabular-realtime", creatable: false });
-  addExtra("events", () => ({ type: "linna.events", name: "Events", telemetry: METADATA }));
+  addExtra("events", () => ({ type: "linna.events", name: "Events", telemetry: METADATA, configuration: { hiddenColumns: { name: true } } }));
   openmct.telemetry.addProvider({
     supportsRequest: isEvents,
     request,

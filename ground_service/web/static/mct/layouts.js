@@ -13,7 +13,7 @@ async function values(spacecraft, given) {
 }
 
 function addTable(kind, name, names) {
-  addExtra(kind, async (spacecraft) => ({ type: "LadTable", name, configuration: { hiddenColumns: HIDDEN, isFixedLayout: true }, composition: await values(spacecraft, names) }), false);
+  addExtra(kind, async (spacecraft) => ({ type: "LadTable", name, configuration: { hiddenColumns: HIDDEN, isFixedLayout: false }, composition: await values(spacecraft, names) }), false);
 }
 
 function addPlot(kind, name, names) {

@@ -45,10 +45,13 @@ function installIndicators(session) {
     feed.statusClass(connected ? "s-status-on" : "s-status-off");
   });
   openmct.indicators.add(feed);
-  const user = openmct.indicators.simpleIndicator();
-  user.iconClass("icon-person");
-  user.text(session.browser ? `${session.name}, ${session.role}` : session.name);
-  openmct.indicators.add(user);
+  // The name of the user has an indicator of Open MCT itself.
+  if (session.browser) {
+    const role = openmct.indicators.simpleIndicator();
+    role.iconClass("icon-people");
+    role.text(session.role);
+    openmct.indicators.add(role);
+  }
   const home = openmct.indicators.simpleIndicator();
   home.iconClass("icon-arrow-left");
   home.text("LINNA pages");
@@ -79,7 +82,7 @@ async function start() {
   installConductor(last);
   installIndicators(session);
   // Without an object in the address: the layout of a shift.
-  if (spacecraft && !location.hash) location.hash = addressOf(spacecraft, SHIFT);
+  if (spacecraft && !location.hash) location.hash = `${addressOf(spacecraft, SHIFT)}?hideInspector=true`;
   openmct.on("start", () => performance.mark("linna-started"));
   openmct.start(document.body.firstElementChild);
 }

@@ -63,10 +63,13 @@ async function latest(object, options) {
   }
 }
 
+const shown = new Map(); // key of an object -> end of the history last requested
+
 async function history(object, options) {
   if (options.strategy === "latest" || options.size === 1 || !object.parameter.series) return latest(object, options);
   const points = Math.min(Math.max(Math.round(options.size ?? MOST_POINTS), 100), MOST_POINTS);
   const { buckets } = await series(object, options.start, options.end, points, options.signal);
+  if (buckets.length) shown.set(object.identifier.key, milliseconds(buckets.at(-1).stop));
   return samplesOf(buckets, options.strategy === "minmax" && !Object.keys(object.parameter.labels).length);
 }
 
@@ -74,10 +77,12 @@ async function history(object, options) {
 // The first request is that of the history: its interval ends after the newest telemetry, so its end would hide what follows.
 function followSeries(object, callback, since) {
   let last = since - 1;
-  let points = MOST_POINTS;
+  let points = 0;
   return afterTelemetry(isNewest(object) ? null : "navigation_states", async () => {
     try {
-      const { buckets } = await series(object, last + 1, FAR, points);
+      // Plots append what follows, so nothing of the history is repeated.
+      if (!points) last = Math.max(last, shown.get(object.identifier.key) ?? last);
+      const { buckets } = await series(object, last + 1, FAR, points || MOST_POINTS);
       points = POINTS;
       const found = samplesOf(buckets, false).filter((one) => one.utc > last);
       if (!found.length) return;
