@@ -26,6 +26,7 @@ from sqlalchemy import Column, Connection, Table, text
 
 from benchmarks.capacity import database_octets, named_copy
 from benchmarks.ground import mixed_downlink
+from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
@@ -127,7 +128,7 @@ class Year:
         names = ", ".join(f'"{column.name}"' for column in table.columns)
         values = ", ".join(self._value(table, column) for column in table.columns)
         return (
-            f"INSERT INTO {table.name} ({names}) SELECT {values} FROM generate_series(:first, :last) AS k "
+            f"INSERT INTO {table.name} ({names}) SELECT {values} FROM generate_series(CAST(:first AS int8), :last) AS k "
             f"CROSS JOIN one_{table.name} AS t ORDER BY k ON CONFLICT DO NOTHING"
         )
 
@@ -137,17 +138,17 @@ class Year:
         serial = SERIAL.get(name) or (table.name if name == "id" and table.name in self._serial else None)
         if serial is not None:
             least, count = self._serial[serial]
-            return f"{value} - {least} + :next_{serial} + (k - :first) * {count}"
+            return f"{value} - {least} + :next_{serial} + (k - CAST(:first AS int8)) * {count}"
         if name.endswith("ticks"):
-            return f"CASE WHEN {value} < 0 THEN {value} ELSE {value} + k::int8 * {PERIOD_TICKS} END"
+            return f"CASE WHEN {value} < 0 THEN {value} ELSE {value} + k * {PERIOD_TICKS} END"
         if name.endswith("utc_ns"):
-            return f"{value} + k::int8 * {PERIOD_NS}"
+            return f"{value} + k * {PERIOD_NS}"
         if name == "bucket":
-            return f"{value} + k::int8 * {PERIOD_TICKS} / ({BASE_TICKS} * (4 ^ t.level)::int8)"
+            return f"{value} + k * {PERIOD_TICKS} / ({BASE_TICKS} * (4 ^ t.level)::int8)"
         if name == "sequence_count":
             return f"({value} + k * {self._frames}) % 16384"
         if name == "frame_number" and table.name != "events":
-            return f"{value} + k::int8 * {self._frames}"
+            return f"{value} + k * {self._frames}"
         if name == "digest":
             return f"decode(md5({value}::text || k), 'hex')"
         if name == "id":
@@ -177,12 +178,14 @@ def _p95(values: list[float]) -> float:
     return round(float(np.percentile(values, 95)), 1)
 
 
-def read_times(settings: Settings, year: Year, spacecraft: int, rounds: int) -> dict[str, list[float]]:
+def read_times(settings: Settings, token: str, spacecraft: int, rounds: int) -> dict[str, list[float]]:
     """Return the times of the reads in ms; each round reads another pass."""
     times: dict[str, list[float]] = {path: [] for path in READS}
-    with TestClient(create_app(settings, inline_jobs=True)) as client:
-        newest = client.get("/api/v1/passes?limit=200").json()["items"]
-        found = [one["id"] for one in newest if one["spacecraft_id"] == spacecraft]
+    headers = {"Authorization": f"Bearer {token}"}
+    app = create_app(settings, inline_jobs=True)
+    with TestClient(app, base_url="http://127.0.0.1:8042", headers=headers) as client:
+        newest = client.get("/api/v1/passes?limit=200&instance=flight").raise_for_status().json()["items"]
+        found = [one["id"] for one in newest]
         chosen = random.Random(1)
         for turn in range(rounds + 1):
             for path in READS:
@@ -198,6 +201,7 @@ class Measured:
 
     def __init__(self, ground: Ground, settings: Settings, archive: Path, folder: Path) -> None:
         self._ground, self._settings, self._archive, self._folder = ground, settings, archive, folder
+        self._token = add_user(ground, "ann", "operator")
         self._done = 0
 
     def whole_pass(self) -> float:
@@ -224,7 +228,7 @@ class Measured:
         after = stop_utc_ns + (year.passes - 1) * PERIOD_NS + 300_000_000_000
         ingest = self.ingest_times(spacecraft, after, rounds)
         whole = [self.whole_pass() for _ in range(2)]
-        reads = read_times(self._settings, year, spacecraft, rounds)
+        reads = read_times(self._settings, self._token, spacecraft, rounds)
         slowest = max(reads, key=lambda path: float(np.median(reads[path])))
         return {
             "passes": year.passes,
