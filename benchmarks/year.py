@@ -55,14 +55,14 @@ QUARTERS = 4
 
 COPIED = (
     "files", "ingests", "pieces", "packets", *(table.name for table in models.SAMPLE_TABLES), "rollups",
-    "correlations", "receptions", "passes", "pass_frames", "jobs", "reports", "event_log",
+    "passes", "jobs", "reports", "event_log",
 )  # fmt: skip
 SERIAL = {"packet_id": "packets", "pass_id": "passes", "ingest_id": "ingests"}
 """Columns with the number of a row of a copied table."""
 OWN_FILES = "SELECT file_sha256 FROM ingests UNION SELECT html_sha256 FROM reports \
 UNION SELECT json_sha256 FROM reports UNION SELECT pdf_sha256 FROM reports"
-SHARED_HASHES = {"passes": {"catalogue_sha256", "attitude_sha256"}, "pass_frames": {"file_sha256"}}
-"""Hashes of files that are the same for all passes."""
+SHARED_HASHES = ("catalogue_sha256", "attitude_sha256")
+"""Columns of passes with the hashes of files that are the same for all of them."""
 
 READS = (
     "/passes", "/passes/{pass}", "/passes/{pass}/completeness", "/passes/{pass}/events?limit=50",
@@ -86,7 +86,7 @@ class Year:
                 where = f"WHERE sha256 IN ({OWN_FILES})" if name == "files" else ""
                 connection.execute(text(f"CREATE TABLE one_{name} AS SELECT * FROM {name} {where}"))
                 self.rows[name] = _number(connection, f"SELECT count(*) FROM one_{name}")
-            for name in (*SERIAL.values(), "correlations", "event_log"):
+            for name in (*SERIAL.values(), "event_log"):
                 least, count = (
                     _number(connection, f"SELECT coalesce({one}, 0) FROM one_{name}")
                     for one in ("min(id)", "max(id) - min(id) + 1")
@@ -128,7 +128,8 @@ class Year:
         names = ", ".join(f'"{column.name}"' for column in table.columns)
         values = ", ".join(self._value(table, column) for column in table.columns)
         return (
-            f"INSERT INTO {table.name} ({names}) SELECT {values} FROM generate_series(CAST(:first AS int8), :last) AS k "
+            f"INSERT INTO {table.name} ({names}) SELECT {values} "
+            f"FROM generate_series(CAST(:first AS int8), :last) AS k "
             f"CROSS JOIN one_{table.name} AS t ORDER BY k ON CONFLICT DO NOTHING"
         )
 
@@ -154,8 +155,7 @@ class Year:
         if name == "id":
             return f"md5({value} || k)"
         if "sha256" in name or name == "archive_digest":
-            shared = name in SHARED_HASHES.get(table.name, ())
-            return value if shared else f"md5({value} || k) || md5(k || {value})"
+            return value if name in SHARED_HASHES else f"md5({value} || k) || md5(k || {value})"
         return value
 
 
