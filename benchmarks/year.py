@@ -1,7 +1,7 @@
-"""Simulated year of passes in a PostgreSQL database: python -m benchmarks.year [--days 365].
+"""Simulated year of passes in a PostgreSQL database: python -m benchmarks.year [--passes-a-day 28].
 
 One pass of a scenario is emulated, imported and reported by the service. The database then copies the rows of this
-pass, as passes of one spacecraft every 3,072 s (28 a day), with times, ids, counts and hashes of their own. Before the
+pass, as passes of one spacecraft (28 a day), with times, ids, counts and hashes of their own. Before the
 first copy and after each quarter, the service itself reads, ingests and reports; this is timed. Files are not copied.
 Of roll-ups that several passes share, copies do not add to the values. PostgreSQL runs without `fsync`.
 """
@@ -46,10 +46,9 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     from fastapi.testclient import TestClient
 
-PERIOD_S = 3_072
-"""Time between passes; a multiple of the three shortest buckets of the roll-ups."""
-PERIOD_TICKS = PERIOD_S << 16
-PERIOD_NS = PERIOD_S * 1_000_000_000
+STEP_S = 1_024
+"""The time between passes is a multiple of the three shortest buckets of the roll-ups."""
+S = 1_000_000_000
 BLOCK = 100
 QUARTERS = 4
 
@@ -59,10 +58,9 @@ COPIED = (
 )  # fmt: skip
 SERIAL = {"packet_id": "packets", "pass_id": "passes", "ingest_id": "ingests"}
 """Columns with the number of a row of a copied table."""
-OWN_FILES = "SELECT file_sha256 FROM ingests UNION SELECT html_sha256 FROM reports \
-UNION SELECT json_sha256 FROM reports UNION SELECT pdf_sha256 FROM reports"
-SHARED_HASHES = ("catalogue_sha256", "attitude_sha256")
-"""Columns of passes with the hashes of files that are the same for all of them."""
+OWN_FILES = "SELECT html_sha256 FROM reports UNION SELECT json_sha256 FROM reports UNION SELECT pdf_sha256 FROM reports"
+SHARED_HASHES = ("catalogue_sha256", "attitude_sha256", "file_sha256")
+"""Columns with hashes of files that are the same for all passes: the copies have the downlink of the first pass."""
 
 READS = (
     "/passes", "/passes/{pass}", "/passes/{pass}/completeness", "/passes/{pass}/events?limit=50",
@@ -75,8 +73,8 @@ READS = (
 class Year:
     """Database with the rows of one pass, which it copies."""
 
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
+    def __init__(self, ground: Ground, period_s: int) -> None:
+        self._ground, self._period_s = ground, period_s
         self.passes = 1
         self.rows: dict[str, int] = {}
         self._serial: dict[str, tuple[int, int]] = {}
@@ -93,6 +91,11 @@ class Year:
                 )
                 self._serial[name] = (least, count)
             self._frames = _number(connection, "SELECT count(DISTINCT frame_number) FROM one_detections")
+
+    @property
+    def span_ns(self) -> int:
+        """Time from the first to the last pass."""
+        return (self.passes - 1) * self._period_s * S
 
     def copy(self, passes: int) -> None:
         """Add copies of the pass."""
@@ -141,11 +144,11 @@ class Year:
             least, count = self._serial[serial]
             return f"{value} - {least} + :next_{serial} + (k - CAST(:first AS int8)) * {count}"
         if name.endswith("ticks"):
-            return f"CASE WHEN {value} < 0 THEN {value} ELSE {value} + k * {PERIOD_TICKS} END"
+            return f"CASE WHEN {value} < 0 THEN {value} ELSE {value} + k * {self._period_s << 16} END"
         if name.endswith("utc_ns"):
-            return f"{value} + k * {PERIOD_NS}"
+            return f"{value} + k * {self._period_s * S}"
         if name == "bucket":
-            return f"{value} + k * {PERIOD_TICKS} / ({BASE_TICKS} * (4 ^ t.level)::int8)"
+            return f"{value} + k * {self._period_s << 16} / ({BASE_TICKS} * (4 ^ t.level)::int8)"
         if name == "sequence_count":
             return f"({value} + k * {self._frames}) % 16384"
         if name == "frame_number" and table.name != "events":
@@ -219,13 +222,13 @@ class Measured:
         times = []
         path = self._folder / "new.cadu"
         for number in range(files):
-            path.write_bytes(mixed_downlink(1_440, after_utc_ns + number * 60_000_000_000))
+            path.write_bytes(mixed_downlink(1_440, after_utc_ns + number * 60 * S))
             times.append(_milliseconds(lambda: ingest_file(self._ground, path, spacecraft_id=spacecraft)))
         return times
 
     def figures(self, year: Year, spacecraft: int, stop_utc_ns: int, rounds: int) -> dict[str, Any]:
         """Return the figures of the database at its present size."""
-        after = stop_utc_ns + (year.passes - 1) * PERIOD_NS + 300_000_000_000
+        after = stop_utc_ns + year.span_ns + 300 * S
         ingest = self.ingest_times(spacecraft, after, rounds)
         whole = [self.whole_pass() for _ in range(2)]
         reads = read_times(self._settings, self._token, spacecraft, rounds)
@@ -243,7 +246,9 @@ class Measured:
         }
 
 
-def simulate(folder: Path, url: str, archive: Path, days: float, rounds: int) -> dict[str, Any]:
+def simulate(
+    folder: Path, url: str, archive: Path, passes_a_day: float, days: float, rounds: int
+) -> dict[str, Any]:
     """Fill a database with passes; return the figures before the first copy and after each quarter."""
     data = find_data(os.environ.get("LINNA_DATA") or None)
     home = folder / "home"
@@ -255,25 +260,26 @@ def simulate(folder: Path, url: str, archive: Path, days: float, rounds: int) ->
         with ground.database.reading() as connection:
             spacecraft = _number(connection, "SELECT ccsds_id FROM vehicles")
             stop = _number(connection, "SELECT stop_utc_ns FROM passes")
-        year = Year(ground)
+        period_s = max(round(86_400 / passes_a_day / STEP_S), 1) * STEP_S
+        year = Year(ground, period_s)
         print(json.dumps({"rows_of_a_pass": year.rows}), file=sys.stderr, flush=True)
         sizes = [measured.figures(year, spacecraft, stop, rounds)]
-        each = max(round(days * 86_400 / PERIOD_S / QUARTERS), 1)
-        per_pass = []
+        each = max(round(days * 86_400 / period_s / QUARTERS), 1)
         for _ in range(QUARTERS):
             before = database_octets(ground)
             began = time.perf_counter()
             year.copy(each)
-            per_pass.append((database_octets(ground) - before) / each)
+            copying_s = time.perf_counter() - began
+            per_pass = (database_octets(ground) - before) / each
             sizes.append(
                 {
                     **measured.figures(year, spacecraft, stop, rounds),
-                    "database_octets_per_pass": round(per_pass[-1]),
-                    "copying_s": round(time.perf_counter() - began, 1),
+                    "database_octets_per_pass": round(per_pass),
+                    "copying_s": round(copying_s, 1),
                 }
             )
             print(json.dumps(sizes[-1]), file=sys.stderr, flush=True)
-    return {"passes_a_day": round(86_400 / PERIOD_S, 1), "rows_of_a_pass": year.rows, "quarters": sizes}
+    return {"passes_a_day": round(86_400 / period_s, 1), "rows_of_a_pass": year.rows, "quarters": sizes}
 
 
 def main() -> int:
@@ -283,6 +289,7 @@ def main() -> int:
     parser.add_argument(
         "--archive", type=Path, help="archive of the copied pass; default: emulate the scenario"
     )
+    parser.add_argument("--passes-a-day", type=float, default=28.0)
     parser.add_argument("--days", type=float, default=365.25, help="simulated time")
     parser.add_argument("--rounds", type=int, default=20, help="reads of each kind, and ingested files")
     given = parser.parse_args()
@@ -292,7 +299,7 @@ def main() -> int:
             archive = Path(name) / "archive"
             emulate(load_scenario(given.scenario), find_data(os.environ.get("LINNA_DATA") or None), archive)
         with PostgresServer(Path(server_name)) as server:
-            figures = simulate(Path(name), server.url, archive, given.days, given.rounds)
+            figures = simulate(Path(name), server.url, archive, given.passes_a_day, given.days, given.rounds)
     print(json.dumps({"year": figures}, indent=1))
     return 0
 

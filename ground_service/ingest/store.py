@@ -321,21 +321,30 @@ def finish_ingest(connection: Connection, result: IngestResult, now_utc_ns: int)
         error=None,
         vehicle_id=result.vehicle_id,
         finished_utc_ns=now_utc_ns,
-        accounting=result.model_dump(mode="json"),
+        **_accounting(result),
     )
 
 
 def change_result(connection: Connection, result: IngestResult) -> None:
     """Replace the result of an ingest whose file was read again."""
-    repository.change(connection, _INGESTS, result.ingest_id, accounting=result.model_dump(mode="json"))
+    repository.change(connection, _INGESTS, result.ingest_id, **_accounting(result))
 
 
-def results_of_vehicle(connection: Connection, vehicle: int) -> list[tuple[str, int, IngestResult | None]]:
-    """Return hash, octets and result of the ingests that may have packets of a vehicle, ordered by hash."""
+def _accounting(result: IngestResult) -> dict[str, Any]:
+    times = {"first_ticks": result.first_ticks, "last_ticks": result.last_ticks}
+    return {"accounting": result.model_dump(mode="json"), **times}
+
+
+def results_of_vehicle(
+    connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int
+) -> list[tuple[str, int, IngestResult | None]]:
+    """Return hash, octets and result of the ingests that may have packets of a vehicle in a time, ordered by hash."""
     query = (
         select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.accounting)
         .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
         .where(
+            _INGESTS.c.last_ticks.is_(None)
+            | (_INGESTS.c.last_ticks >= start_ticks) & (_INGESTS.c.first_ticks <= stop_ticks),
             (_INGESTS.c.vehicle_id == vehicle)
             | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
             _INGESTS.c.state == "done",

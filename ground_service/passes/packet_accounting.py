@@ -47,7 +47,8 @@ def packet_accounting(
 ) -> PacketAccounting:
     """Return the packet and octet accounting of a pass."""
     headers = telemetry.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
-    raw = _raw_account(files, connection, span)
+    ingested = _raw_files(connection, span)
+    raw = _raw_account(files, get_vehicle(connection, span.vehicle).ccsds_id, ingested, span)
     names = _apid_names()
     by_apid: dict[int, ApidAccounting] = {}
     lost = np.zeros((0, 2), dtype=np.float64)
@@ -85,17 +86,18 @@ def packet_accounting(
         symbols_corrected=None if raw is None else raw.symbols_corrected,
         lost_at_edges=None if edges is None else sum(apid.lost_at_edges or 0 for apid in by_apid.values()),
         octets=None if raw is None else raw.octets,
-        receptions=_receptions(connection, span),
+        receptions=_receptions(ingested),
         by_apid=by_apid,
         completeness=_completeness(record, span, headers["ticks"], lost),
     )
 
 
-def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> RawAccount | None:
+def _raw_account(
+    files: FileArchive, spacecraft: int, ingested: list[_Ingested], span: PassSpan
+) -> RawAccount | None:
     """Return sums over the raw files of the vehicle; None without files, or if one is too large."""
-    spacecraft = get_vehicle(connection, span.vehicle).ccsds_id
     found = []
-    for one in _raw_files(connection, span):
+    for one in ingested:
         if one.octets > RAW_LIMIT_OCTETS:
             return None
         found.append(_raw_file(files, one.sha256, spacecraft, one.sections))
@@ -112,10 +114,10 @@ class _Ingested:
     reception: ReceivedLink | None
 
 
-def _receptions(connection: Connection, span: PassSpan) -> tuple[ReceptionQuality, ...]:
+def _receptions(ingested: list[_Ingested]) -> tuple[ReceptionQuality, ...]:
     """Return the link quality of the files of the pass, by station and hash."""
     names = {one.name for one in fields(ReceptionQuality)}
-    found = [(one.reception, one.sha256) for one in _raw_files(connection, span) if one.reception is not None]
+    found = [(one.reception, one.sha256) for one in ingested if one.reception is not None]
     return tuple(
         ReceptionQuality(
             source=", ".join(sorted({section.source for section in reception.sections})),
@@ -128,12 +130,10 @@ def _receptions(connection: Connection, span: PassSpan) -> tuple[ReceptionQualit
 def _raw_files(connection: Connection, span: PassSpan) -> list[_Ingested]:
     """Return the ingested files that may contain data of the pass, each once, ordered by hash."""
     chosen: dict[str, _Ingested] = {}
-    for sha256, octets, result in results_of_vehicle(connection, span.vehicle):
-        first = last = reception = None
-        if result is not None:
-            first, last, reception = result.first_ticks, result.last_ticks, result.reception
-        if first is None or last is None or (first <= span.stop_ticks and last >= span.start_ticks):
-            chosen[sha256] = _Ingested(sha256, octets, _sections(reception), reception)
+    found = results_of_vehicle(connection, span.vehicle, span.start_ticks, span.stop_ticks)
+    for sha256, octets, result in found:
+        reception = None if result is None else result.reception
+        chosen[sha256] = _Ingested(sha256, octets, _sections(reception), reception)
     return list(chosen.values())
 
 

@@ -112,8 +112,14 @@ INGESTS = Table(
     column("received_utc_ns", BigInteger),
     optional("finished_utc_ns", BigInteger),
     column("accounting", JSON),
+    optional("first_ticks", BigInteger),
+    optional("last_ticks", BigInteger),
+    Index("ix_ingests_extent", "last_ticks", "first_ticks"),
 )
-"""One run of the ingest over one file: what was in it and what of it was new."""
+"""One run of the ingest over one file: what was in it and what of it was new.
+
+`first_ticks` and `last_ticks` are the earliest and the latest on-board time of its packets; NULL: unknown.
+"""
 
 
 PACKETS = Table(

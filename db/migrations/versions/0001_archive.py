@@ -445,10 +445,13 @@ def upgrade() -> None:
         sa.Column("received_utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("finished_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("accounting", sa.JSON(), nullable=False),
+        sa.Column("first_ticks", sa.BigInteger(), nullable=True),
+        sa.Column("last_ticks", sa.BigInteger(), nullable=True),
         sa.ForeignKeyConstraint(["file_sha256"], ["files.sha256"], name=op.f("fk_ingests_file_sha256_files")),
         sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_ingests_vehicle_id_vehicles")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_ingests")),
     )
+    op.create_index("ix_ingests_extent", "ingests", ["last_ticks", "first_ticks"], unique=False)
     op.create_index(op.f("ix_ingests_file_sha256"), "ingests", ["file_sha256"], unique=False)
     op.create_index(op.f("ix_ingests_vehicle_id"), "ingests", ["vehicle_id"], unique=False)
     op.create_table(

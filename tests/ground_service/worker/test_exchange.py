@@ -254,7 +254,7 @@ def test_a_database_before_version_1_is_carried_over(earlier: Path, tmp_path: Pa
         assert row["decoded_version"] is not None
         assert get_ingest(ground, 4).accounting is None  # the earlier one states too little
         with ground.database.reading() as connection:
-            assert [result for _, _, result in results_of_vehicle(connection, 3)] == [None]
+            assert [result for _, _, result in results_of_vehicle(connection, 3, 0, 1)] == [None]
         assert (window["edited_by"], window["decided_by"]) == ("bob", None)
         release_command(ground, 3, actor="eve")
         assert get_command(ground, 3).record.sequence_count == 2  # two had counts: the next is the third
