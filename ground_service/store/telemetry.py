@@ -18,8 +18,9 @@ def packet_headers(
     connection: Connection, vehicle: int, start_ticks: int | None = None, stop_ticks: int | None = None
 ) -> dict[str, IntArray]:
     """APID, on-board time and sequence count of the stored packets of a vehicle, by APID and time."""
+    # With its APIDs stated, the index is read only between the times.
     query = select(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count).where(
-        PACKETS.c.vehicle_id == vehicle
+        PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid.in_(_apids(connection, vehicle))
     )
     if start_ticks is not None:
         query = query.where(PACKETS.c.ticks >= start_ticks)
@@ -28,6 +29,17 @@ def packet_headers(
     query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
     rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 3)
     return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
+
+
+def _apids(connection: Connection, vehicle: int) -> list[int]:
+    """Return the APIDs of the stored packets of a vehicle, each found by one step in the index."""
+    found: list[int] = []
+    least = select(func.min(PACKETS.c.apid)).where(PACKETS.c.vehicle_id == vehicle)
+    while (
+        apid := connection.execute(least.where(PACKETS.c.apid > (found or [-1])[-1])).scalar()
+    ) is not None:
+        found.append(int(apid))
+    return found
 
 
 def packet_octets(
