@@ -57,7 +57,9 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument("--scenario", default="selenita")
     parser.add_argument("--passes", type=int, default=4, help="passes to learn from (default: 4)")
     parser.add_argument("--later", type=int, default=2, help="later passes (default: 2)")
-    parser.add_argument("--later-days", type=float, default=8.0, help="not before so many days (default: 8)")
+    parser.add_argument(
+        "--later-days", type=float, default=0.0, help="days after the last of them (default: 0)"
+    )
     parser.add_argument("--withheld", type=float, default=0.5, help="share of the craters (default: 0.5)")
     parser.add_argument("--latitude-deg", type=float, default=25.0, help="on both sides of the equator")
     parser.add_argument("--seed", type=int, default=1, help="of the withheld craters")
@@ -95,7 +97,7 @@ def learn(arguments: argparse.Namespace, data: DataFolder, work: Path) -> dict[s
             decide_landmark(ground, one.id, accept=True, reason="benchmark", actor="benchmark")
         accepted = _all(ground, "accepted")
         tables = {"withheld": thin, "learned": extended_table(thin, accepted), "all": full}
-        epoch = scenario.epoch_utc_ns + round(arguments.later_days * 86_400e9)
+        epoch = parse_utc(start) + round(arguments.later_days * 86_400e9)
         later = {
             name: _later(
                 ground, scenario, data, table, work, format_utc(epoch), arguments.later, hidden, accepted
@@ -173,19 +175,19 @@ def _later(
 
     for k in range(passes):
         archive = work / f"later-{k}"
-        start = _flown(scenario, data, table, archive, start, "any")
+        start = _flown(scenario, data, table, archive, start, scenario.window.direction)
         _thinned(archive, known)
         pass_id = import_archive(ground, archive)
         summary = pass_summary(ground, pass_id)
-        anchored = summary["navigation"]["anchored"]
+        anchored = summary["navigation"].get("anchored", {})  # absent if the estimator gave no state
         rows.append(
             {
                 "start": json.loads((archive / "manifest.json").read_text())["start_utc"],
                 "frames": summary["frames"],
                 "recall": summary["detector"]["recall"],
                 "precision": summary["detector"]["precision"],
-                "median_3d_m": anchored["median_3d_m"],
-                "p95_3d_m": anchored["p95_3d_m"],
+                "median_3d_m": anchored.get("median_3d_m"),
+                "p95_3d_m": anchored.get("p95_3d_m"),
                 "fixes": _fixes(ground, pass_id),
             }
         )
