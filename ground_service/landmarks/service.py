@@ -190,7 +190,7 @@ def _changed(
     if state not in DECIDED:
         sightings, looks = sum(len(one.sightings) for one in seen), sum(one.looks for one in evidence)
         state = "proposed" if is_persistent(len(seen), sightings, looks) else "seen"
-    store.change_landmark(connection, landmark.id, state, evidence, now, **figures)
+    store.change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
 
 
 def place_of(one: Landmark | PassSightings) -> Place:

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, delete, func, select
 from ground_service.landmarks.model import Landmark, LandmarkDetail, LandmarkState, PassSightings
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft
-from ground_service.store.states import LANDMARK, move
+from ground_service.store.states import LANDMARK, change_if, move
 
 _LANDMARKS, _VEHICLES = repository.LANDMARKS, repository.VEHICLES
 
@@ -77,21 +77,16 @@ def add_landmark(
 def change_landmark(
     connection: Connection,
     landmark_id: int,
+    found: str,
     state: str,
     evidence: Sequence[PassSightings],
     now_utc_ns: int,
     **figures: Any,
 ) -> None:
-    """Replace the sightings of a landmark; the caller holds the lock of its spacecraft."""
-    repository.change(
-        connection,
-        _LANDMARKS,
-        landmark_id,
-        state=state,
-        evidence=_rows(evidence),
-        changed_utc_ns=now_utc_ns,
-        **figures,
-    )
+    """Replace the sightings of a landmark; one that was decided since it was found in a state stays decided."""
+    values = {"evidence": _rows(evidence), "changed_utc_ns": now_utc_ns, **figures}
+    if not change_if(connection, _LANDMARKS, landmark_id, {"state": found}, state=state, **values):
+        repository.change(connection, _LANDMARKS, landmark_id, **values)
 
 
 def delete_landmark(connection: Connection, landmark_id: int) -> None:

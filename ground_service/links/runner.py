@@ -39,6 +39,9 @@ TICK_S = 0.1
 POLL_S = 0.05
 """A station that pauses for this long has sent what it has: the segment is ingested."""
 
+REST_S = 2.0
+"""After this long, octets that show no frame are ingested as well."""
+
 SPOOL_LIMIT_OCTETS = 256 << 20
 LIVE_S = 0.1
 """Shortest segment of a station that does not pause."""
@@ -209,9 +212,13 @@ class LinkRunner:
                 self._progress.empty_utc_ns = before
         octets = self._block
         if octets is None:
-            pause = time.monotonic() - self._last_block_s >= PAUSE_S or not self._down.connected
-            # Less than a frame stays in the segment, to be continued by what comes next.
-            if (self._ingest_is_idle or pause) and self._spool.holds_a_unit():
+            rest_s = time.monotonic() - self._last_block_s
+            pause = rest_s >= PAUSE_S or not self._down.connected
+            # Less than a frame stays in the segment for a while, to be continued by what comes next. A single frame
+            # is not recognised without its neighbours: the ingest joins it to them.
+            if self._spool.size and (
+                rest_s >= REST_S or ((self._ingest_is_idle or pause) and self._spool.holds_a_unit())
+            ):
                 self._cut()
             return
         self._last_block_s = time.monotonic()

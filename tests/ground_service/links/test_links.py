@@ -67,6 +67,10 @@ def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
     return [bytes(get_command(ground, key).record.octets or b"") for key in keys]
 
 
+def received_of(ground: Ground) -> int:
+    return service.get_link(ground, "lab").octets
+
+
 def contact_events(ground: Ground) -> list[str]:
     return [one.kind for one in read_events(ground.database, 0, 10_000) if one.kind.startswith("contact")]
 
@@ -110,6 +114,22 @@ def test_a_station_that_never_pauses_is_ingested_while_it_sends(
         finally:
             reached.set()
             sender.join()
+
+
+def test_octets_that_show_no_frame_are_ingested_after_a_rest_and_joined(
+    ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A single frame may not be recognised as one, and what follows may never come."""
+    monkeypatch.setattr("ground_service.ingest.live._holds_a_unit", lambda octets: len(octets) > CADU)
+    declare(ground, station.link().replace("silence_s = 1.0", "silence_s = 1000.0"))
+    with operated(ground):
+        connection = station.accept()
+        start = 0
+        for stop in (5 * CADU, 6 * CADU, len(stream)):
+            connection.sendall(stream[start:stop])
+            until(lambda stop=stop: received_of(ground) == stop, f"{stop} octets in the archive")
+            start = stop
+    assert hash_of(ground) == expected
 
 
 def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
