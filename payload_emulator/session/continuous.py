@@ -108,7 +108,7 @@ class ContinuousSession:
     holds
         Whether time stands still at the beginning and the end of contacts until the console says `run`.
     stop_utc_ns
-        End of the session, or of the contact in which it lies; None: none.
+        End of the session; None: none.
     checkpoint_file
         Where the state is kept between contacts and at the end.
     snapshot_file
@@ -236,7 +236,7 @@ class ContinuousSession:
         if not self._is_continued:
             self._turn()
         while not self.stopping.is_set():
-            if self._has_ended:
+            if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
                 self._held = self.holds
                 self._send_message({**self._contact_message(), "kind": "finished"})
                 while self._held and not self.stopping.is_set():
@@ -256,12 +256,6 @@ class ContinuousSession:
                 self._until_ns, self.paused = None, True
                 self._send_message({"kind": "paused", "utc": format_utc(self.utc_ns)})
 
-    @property
-    def _has_ended(self) -> bool:
-        """Whether the session is over: after its end, and not in a contact or in the time ordered after one."""
-        over = self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns
-        return over and self.contact is None and self._until_ns is None
-
     def _next_turn_ns(self) -> int:
         """Return the time of the next step: of the payload, of the link, or the longest step there is."""
         step_s = IDLE_STEP_S if self.contact is None else CONTACT_STEP_S
@@ -278,8 +272,7 @@ class ContinuousSession:
             due.append(self._utc_of(ticks))
         elif payload.mode is PayloadMode.observing:
             due.append(self.utc_ns + round(self.scenario.camera.frame_interval_s * _NS))
-        bounds = (self.stop_utc_ns, self._until_ns)
-        due += [bound for bound in bounds if bound is not None and bound > self.utc_ns]
+        due += [bound for bound in (self.stop_utc_ns, self._until_ns) if bound is not None]
         return max(min(due), self.utc_ns + _LEAST_STEP_NS)
 
     def _utc_of(self, ticks: int) -> int:
