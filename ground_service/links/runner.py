@@ -43,9 +43,6 @@ REST_S = 2.0
 """After this long, octets that show no frame are ingested as well."""
 
 SPOOL_LIMIT_OCTETS = 256 << 20
-LIVE_S = 0.1
-"""Shortest segment of a station that does not pause."""
-
 RETRY_S = 1.0
 MISSED_S = 1.0
 INCOMING = "incoming"
@@ -89,7 +86,7 @@ class LinkRunner:
         self._ingest_fault: str | None = None
         self._renewed_s = self._missed_s = self._sent_s = 0.0
         self._acknowledged = 0
-        self._last_block_s = self._segment_s = 0.0
+        self._last_block_s = 0.0
         self._repeated_for: int | None = None
         self.lost = False
 
@@ -222,19 +219,13 @@ class LinkRunner:
                 self._cut()
             return
         self._last_block_s = time.monotonic()
-        if self._spool.size == 0:
-            self._segment_s = self._last_block_s
         self._hear()
         self._keep(octets)
         if self.declared.link.acknowledge:
             self._acknowledged += len(octets)
             self._down.send(ACKNOWLEDGEMENT.pack(self._acknowledged))
-        # A station that never pauses is shown as well: what came is ingested while the ingest has nothing else to do.
-        due = time.monotonic() - self._segment_s >= LIVE_S and self._ingest_is_idle
-        if self._spool.size >= SEGMENT_OCTETS or (due and self._spool.holds_a_unit()):
+        if self._spool.size >= SEGMENT_OCTETS:
             self._cut()
-        elif due:
-            self._segment_s = time.monotonic()
 
     @property
     def _ingest_is_idle(self) -> bool:

@@ -92,30 +92,6 @@ def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
     assert service.get_link(ground, "lab").octets <= len(stream)
 
 
-def test_a_station_that_never_pauses_is_ingested_while_it_sends(
-    ground: Ground, station: Station, stream: bytes
-) -> None:
-    declare(ground, station.link())
-    reached = threading.Event()
-    with operated(ground) as runner:
-        connection = station.accept()
-
-        def send() -> None:
-            at = 0
-            while not reached.is_set():
-                connection.sendall(stream[at : at + 256])
-                at = (at + 256) % (len(stream) - 256)
-                reached.wait(0.005)
-
-        sender = threading.Thread(target=send)
-        sender.start()
-        try:
-            until(lambda: runner.octets_received > 3 * CADU, "the archive during the transmission")
-        finally:
-            reached.set()
-            sender.join()
-
-
 def test_octets_that_show_no_frame_are_ingested_after_a_rest_and_joined(
     ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
