@@ -310,7 +310,7 @@ def test_a_failed_action_skips_those_after_it_and_states_why(
 def test_a_report_that_failed_is_made_later(
     either: Ground, flown: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At once, then by whoever does the recurring work: until then the action is queued and says what is wrong."""
+    """At once, then by the scheduler: until then the action is queued and states what is wrong."""
     attempts = []
 
     def broken(*_: Any, **__: Any) -> Any:
