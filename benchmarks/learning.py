@@ -82,6 +82,11 @@ def learn(arguments: argparse.Namespace, data: DataFolder, work: Path) -> dict[s
     hidden = np.sort(rng.permutation(craters.ids)[: round(arguments.withheld * len(craters))])
     full = onboard_catalogue(scenario, craters)
     thin = full.select(~np.isin(full.ids, hidden))
+    if arguments.later and not len(thin.ids):
+        raise SystemExit(
+            f"{terrain.name}: expected craters with rim heights for the table on board, found none of {len(craters)}; "
+            "use --later 0, which needs no table"
+        )
     with open_ground(work / "home", data=data) as ground:
         start, learned = "", []
         for k in range(arguments.passes):
