@@ -46,6 +46,10 @@ SPOOL_LIMIT_OCTETS = 256 << 20
 RETRY_S = 1.0
 MISSED_S = 1.0
 INCOMING = "incoming"
+LOCK = "lock"
+"""File in the folder of the spool with the name of the owner that holds it."""
+
+OWNER_LIMIT = 200
 
 
 @dataclass(slots=True)
@@ -141,6 +145,8 @@ class LinkRunner:
             self._work.set()
             self._threads[1].join()
             if self._lock is not None:
+                with contextlib.suppress(OSError):
+                    self._lock.truncate(0)
                 self._lock.close()
 
     def _guarded(self, work: Callable[[], None]) -> None:
@@ -467,7 +473,7 @@ class LinkRunner:
             return True
         try:
             make_durable_folder(self._folder)
-            file = (self._folder / "lock").open("a")
+            file = (self._folder / LOCK).open("a")
         except OSError as error:
             raise storage_error(error, self._folder) from None
         try:
@@ -475,8 +481,23 @@ class LinkRunner:
         except OSError:
             file.close()
             return False
+        with contextlib.suppress(OSError):  # without the name, others wait for the end of the lease
+            file.truncate(0)
+            file.write(self._owner)
+            file.flush()
         self._lock = file
         return True
+
+
+def ended_holder(home: Path, name: str) -> str | None:
+    """Return the owner that held the spool of a link and has ended without giving it back; None if not known.
+
+    The kernel ends the lock of a process with the process, so that nobody need wait for the end of its lease.
+    """
+    with contextlib.suppress(OSError), (home / INCOMING / f"link-{name}" / LOCK).open() as file:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return file.read(OWNER_LIMIT) or None
+    return None
 
 
 def _clock_offset_ns(made: IngestResult | None, heard_utc_ns: int | None) -> int | None:

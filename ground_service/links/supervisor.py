@@ -11,7 +11,7 @@ import uuid
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
 from ground_service.links import service
-from ground_service.links.runner import LEASE_NS, LinkRunner
+from ground_service.links.runner import LEASE_NS, LinkRunner, ended_holder
 from ground_service.links.service import DeclaredLink
 
 log = logging.getLogger(__name__)
@@ -67,12 +67,18 @@ class LinkSupervisor:
                 self._end(name)
         for name, one in declared.items():
             wanted = self._names is None or name in self._names
-            if (
-                wanted
-                and name not in self._runners
-                and service.acquire(self._ground, one, self.owner, LEASE_NS)
-            ):
+            if wanted and name not in self._runners and self._acquire(one):
                 self._begin(one)
+
+    def _acquire(self, one: DeclaredLink) -> bool:
+        """Take a link that is free, whose lease has ended, or whose owner on this machine has ended."""
+        if service.acquire(self._ground, one, self.owner, LEASE_NS):
+            return True
+        ended = ended_holder(self._ground.home, one.link.name)
+        if ended is None:
+            return False
+        service.release(self._ground, one.link.name, ended)
+        return service.acquire(self._ground, one, self.owner, LEASE_NS)
 
     def _run(self) -> None:
         while not self._stopping.is_set():

@@ -1,4 +1,4 @@
-"""`linna mission write | check | add | list | show | run`: mission descriptions, and simulated missions."""
+"""`linna mission write | check | add | list | show | run | compare`: mission descriptions, and simulated missions."""
 
 from __future__ import annotations
 
@@ -65,9 +65,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     running.add_argument("--kills", type=int, metavar="N", help="number of kills (default: 4 a day)")
     running.set_defaults(handler=run_mission)
+    comparing = actions.add_parser(
+        "compare",
+        help="compare the closing figures of two mission runs",
+        description="Compare all closing figures of two mission runs except those of processes and the wall clock. "
+        "Exit status 0: identical; 1: not.",
+    )
+    for name in ("first", "second"):
+        comparing.add_argument(
+            name, type=Path, metavar=name.upper(), help="folder of a run, or its report.json"
+        )
+    comparing.set_defaults(handler=compare)
     for action in (adding, listing, showing):
         add_operator_options(action)
-    for action in (writing, checking, adding, listing, showing, running):
+    for action in (writing, checking, adding, listing, showing, running, comparing):
         add_json_flag(action)
 
 
@@ -189,3 +200,11 @@ def run_mission(arguments: argparse.Namespace) -> int:
     )
     emit(arguments, figures, text=text)
     return 0 if windows["processed"] == windows["flown"] and not figures["packets_lost"] else 1
+
+
+def compare(arguments: argparse.Namespace) -> int:
+    from studies.mission_run.comparison import comparison, described
+
+    figures = comparison(arguments.first, arguments.second)
+    emit(arguments, figures, text=described(figures))
+    return 1 if figures["differences"] else 0

@@ -15,7 +15,7 @@ from lunar.timescales import parse_utc
 from payload_emulator.session.flying import SPACECRAFT_ID
 from studies.mission_run.ground import MissionGround
 from studies.mission_run.incidents import find_incidents
-from studies.mission_run.processes import summary
+from studies.mission_run.processes import judged_memory
 
 FLOWN = ("executing", "executed", "downlinked", "processed")
 NEES = "consistency.nees"
@@ -40,6 +40,7 @@ class RunProgress(Protocol):
     contact_stops: list[str]
     processed: dict[str, str]
     memory_mib: dict[str, list[float]]
+    memory_lives: dict[str, list[tuple[float, int]]]
     cpu_s: dict[str, float]
 
 
@@ -94,8 +95,12 @@ def closing_figures(
         "spacecraft_resets": progress.resets,
         "starts": progress.starts,
         "incidents": find_incidents(ground, windows),
-        "memory_mib": {name: summary(samples) for name, samples in progress.memory_mib.items()},
+        "memory_mib": {
+            name: judged_memory(samples, progress.memory_lives[name])
+            for name, samples in progress.memory_mib.items()
+        },
         "memory_series_mib": progress.memory_mib,
+        "memory_lives": progress.memory_lives,
         "cpu_s": progress.cpu_s,
         "wall_s": progress.wall_s,
     }

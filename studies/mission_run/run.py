@@ -108,8 +108,9 @@ class Progress:
         Ends of the contacts, UTC; of stations in succession, the end at the last.
     processed
         Mission time at which a window was first seen as processed, by the id of the window.
-    memory_mib, cpu_s
-        Resident memory at the end of each contact, and processor time, by process.
+    memory_mib, memory_lives, cpu_s
+        Memory at the end of each contact with the mission day and the number of the process, and processor time, by
+        process.
     """
 
     wall_s: float = 0.0
@@ -129,6 +130,7 @@ class Progress:
     contact_stops: list[str] = field(default_factory=list)
     processed: dict[str, str] = field(default_factory=dict)
     memory_mib: dict[str, list[float]] = field(default_factory=dict)
+    memory_lives: dict[str, list[tuple[float, int]]] = field(default_factory=dict)
     cpu_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -344,7 +346,8 @@ class MissionRun:
         before = Progress() if kept is None else _read_progress(kept)
         self._progress = replace(
             before, starts=known.starts, posts=known.posts, request_id=known.request_id,
-            reference_day=known.reference_day, memory_mib=known.memory_mib, cpu_s=known.cpu_s,
+            reference_day=known.reference_day, memory_mib=known.memory_mib, memory_lives=known.memory_lives,
+            cpu_s=known.cpu_s,
         )  # fmt: skip
 
     def _post(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
@@ -399,17 +402,19 @@ class MissionRun:
 
     def _watch(self, ground: MissionGround, spacecraft: SpacecraftProcess, message: dict[str, Any]) -> None:
         progress = self._progress
+        days = (parse_utc(message["utc"]) - self._scenario.epoch_utc_ns) / DAY_NS
         processes = {**ground.processes, SPACECRAFT: spacecraft.process.pid}
         for name, process in processes.items():
             # The processes of the service are children of this one.
-            self._usage.note(name, process, family=self._terms.distributed and process != os.getpid())
+            family = self._terms.distributed and process != os.getpid()
+            self._usage.note(name, process, days, family=family)
         progress.memory_mib, progress.cpu_s = self._usage.memory_mib, self._usage.cpu_s
+        progress.memory_lives = self._usage.memory_lives
         windows = ground.windows()
         for window in windows:
             if window.state == "processed":
                 progress.processed.setdefault(str(window.id), message["utc"])
         self._save()
-        days = (parse_utc(message["utc"]) - self._scenario.epoch_utc_ns) / DAY_NS
         counts = Counter(one.state for one in windows)
         states = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
         self._say(
@@ -463,7 +468,8 @@ class MissionRun:
             kept = self._checkpoints.restore()
             self._progress = Progress() if kept is None else _read_progress(kept)
             self._wall_before_s = self._progress.wall_s
-        self._usage = Usage(dict(self._progress.memory_mib), dict(self._progress.cpu_s))
+        progress = self._progress
+        self._usage = Usage(dict(progress.memory_mib), dict(progress.cpu_s), dict(progress.memory_lives))
         self._say(f"{self._folder}: continues from {self._progress.utc or 'the start'}")
 
     def _save(self) -> None:
@@ -486,7 +492,11 @@ def _next_state(messages: Iterator[dict[str, Any]]) -> dict[str, Any]:
 def _read_progress(path: Path) -> Progress:
     try:
         stated = json.loads(path.read_text())
-        return Progress(**{**stated, "posts": [(first, last) for first, last in stated["posts"]]})
+        lives = {
+            name: [(day, process) for day, process in one] for name, one in stated["memory_lives"].items()
+        }
+        posts = [(first, last) for first, last in stated["posts"]]
+        return Progress(**{**stated, "posts": posts, "memory_lives": lives})
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ScenarioError(
             f"{path}: expected the progress of a run of this version of the program, found another file "

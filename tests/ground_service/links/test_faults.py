@@ -22,8 +22,9 @@ from ground_service.ground import Ground
 from ground_service.ingest.live import SETTLED_S, Spool, WatchedFolder
 from ground_service.links import runner as runners
 from ground_service.links import service, store
-from ground_service.links.runner import LinkRunner
+from ground_service.links.runner import LinkRunner, ended_holder
 from ground_service.links.stream import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Connector
+from ground_service.links.supervisor import LinkSupervisor
 from ground_service.store import repository
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.oem import save_oem
@@ -243,6 +244,37 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         assert first.octets_received == 3 * CADU
         assert second._lock is not None
         second._lock.close()
+
+
+def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_others(
+    ground: Ground, station: Station
+) -> None:
+    declare(ground, station.link())
+    declared = service.declared_links(ground)["lab"]
+    assert service.acquire(ground, declared, "killed", 3_600 * NS)
+    supervisor = LinkSupervisor(ground)
+    folder = ground.home / "incoming" / "link-lab"
+    folder.mkdir(parents=True)
+    held = folder / "lock"
+
+    def is_taken() -> bool:
+        supervisor.look()
+        return "lab" in supervisor.runners
+
+    try:
+        assert not is_taken()  # it never held the spool: it may be about to
+        held.write_text("another")
+        assert not is_taken()
+        held.write_text("killed")
+        with held.open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            assert not is_taken()
+        assert is_taken() and service.get_link(ground, "lab").owner == supervisor.owner
+        until(lambda: held.read_text() == supervisor.owner, "the name of the next owner")
+        assert ended_holder(ground.home, "lab") is None
+    finally:
+        supervisor.stop()
+    assert held.read_text() == ""
 
 
 def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
