@@ -74,6 +74,11 @@ def _add_train(verbs: Any) -> None:
         help="factor by which the network enlarges images, for high altitudes; --crop is in pixels before enlargement",
     )
     train.add_argument(
+        "--visible-labels",
+        action="store_true",
+        help="choose and weigh labels by their visibility in the frame instead of their depth/diameter",
+    )
+    train.add_argument(
         "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
     )
     add_json_flag(train)
@@ -195,6 +200,7 @@ def _train(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         replicas=arguments.replicas,
         enlarge=arguments.enlarge,
+        visible_labels=arguments.visible_labels,
         preparation=Preparation.normalise_first if arguments.normalise_first else Preparation.gray_first,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]

@@ -65,6 +65,8 @@ class Source:
     footprint : "inside" keeps whole footprints in the boxes and clear of those to avoid; "centre" only the point below
         the camera, for footprints wider than a box. Such frames are scored on the ground of their boxes alone.
     label_minimum_px : apparent diameter from which catalogued craters are listed.
+    views, view_step_km : frames that are taken in turn under one Sun, and the distance by which the camera moves north
+        from one to the next: they show how a detector repeats its errors. Without ephemeris.
     """
 
     name: str
@@ -85,6 +87,8 @@ class Source:
     sharpen: bool = True
     footprint: str = "inside"
     label_minimum_px: float = 5.0
+    views: int = 1
+    view_step_km: float = 24.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +125,10 @@ class Recipe:
 
 def _source_dict(source: dict[str, Any]) -> dict[str, Any]:
     """A source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
-    source = _without_defaults(source, {"sharpen": True, "footprint": "inside", "label_minimum_px": 5.0})
+    source = _without_defaults(
+        source,
+        {"sharpen": True, "footprint": "inside", "label_minimum_px": 5.0, "views": 1, "view_step_km": 24.5},
+    )
     if source["ephemeris"]:
         return source | {"ephemeris": Path(source["ephemeris"]).name}
     return {
@@ -227,6 +234,10 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
         if key in values:
             values[key] = [_box(path, f"{where}: {key}", item) for item in values[key]]
     source = _read(path, where, Source, values)
+    if not 1 <= source.views <= 20 or (source.views > 1 and source.ephemeris):
+        raise DatasetError(
+            f"{path}: {where}: views: expected 1 to 20, and 1 along an ephemeris, found {source.views}"
+        )
     if not source.ephemeris:
         return source
     in_folder = path.parent / source.ephemeris

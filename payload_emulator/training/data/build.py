@@ -30,7 +30,13 @@ from payload_emulator.session.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
 from payload_emulator.training.data.frames import describe, find_renderer, take_frame
-from payload_emulator.training.data.shots import Place, draw_box, draw_pose, pose_at
+from payload_emulator.training.data.shots import (
+    Place,
+    draw_box,
+    draw_pose,
+    pose_at,
+    view_position_mcmf_m,
+)
 from payload_emulator.training.data.track import Track, lay_track
 
 _FOLDERS = ("images", "metadata", "shards")
@@ -141,16 +147,30 @@ def make_shard(
     rng = np.random.Generator(np.random.Philox(key=[recipe.seed, shard.number]))
     camera = _camera(recipe)
     place = None if source.ephemeris else Place(draw_box(source, rng))
-    shots, hashes = [], []
+    shots: list[Any] = []
+    hashes = []
     for k, number in enumerate(shard.frame_numbers):
+        view = k % source.views
+        first = shots[k - view] if view else None
 
-        def pose_of(generator: np.random.Generator, k: int = k, number: int = number) -> Any:
-            if place is not None:
+        def pose_of(
+            generator: np.random.Generator,
+            k: int = k,
+            number: int = number,
+            view: int = view,
+            first: Any = first,
+        ) -> Any:
+            if place is not None and first is None:
                 return draw_pose(terrain, camera, source, place, generator)
-            position = np.array(shard.position_mcmf_m[k])
+            position = (
+                np.array(shard.position_mcmf_m[k])
+                if first is None
+                else view_position_mcmf_m(source, first.pose, view)
+            )
             return pose_at(terrain, camera, source, position, f"frame {number}", generator)
 
-        shot = take_frame(terrain, camera, source, pose_of, number, recipe, render, rng)
+        sun_mcmf = None if first is None else first.sun_mcmf
+        shot = take_frame(terrain, camera, source, pose_of, number, recipe, render, rng, sun_mcmf)
         split = shard.split[k] if shard.split else source.split
         utc_ns = shard.utc_ns[k] if shard.utc_ns else None
         document = describe(camera, shot, source, split, terrain, utc_ns)

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import IntArray, OctetArray
+from lunar.arrays import FloatArray, IntArray, OctetArray
 from lunar.catalogue import size_class
-from payload_emulator.flight.vision.preprocess import Preparation
+from payload_emulator.flight.vision.preprocess import Preparation, gray_levels
 from payload_emulator.training.data.augment import AugmentParameters, make_crop
 from payload_emulator.training.data.dataset import LABEL_MINIMUM_DIAMETER_PX, Dataset, Frame, choose_tiers
 from payload_emulator.training.data.targets import Tier, make_targets
+from payload_emulator.training.data.visibility import visibility
 
 LEAST_CROP_DIAMETER_PX = 8.0
 """A labelled crater that a crop shows smaller than this is ignored there."""
@@ -33,6 +34,7 @@ class TrainParameters:
     micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
     preparation : how RGB frames become gray; the paper's order needs a data set in colour.
     soft_labels : the weight of a label grows with its depth/diameter; else all weigh the same.
+    visible_labels : labels are chosen and weighed by their visibility in the frame instead of their depth/diameter.
     backbone, stride_px, enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are
         shorter in the image by the enlargement.
     """
@@ -60,6 +62,7 @@ class TrainParameters:
     stride_px: int = 4
     enlarge: int = 1
     soft_labels: bool = True
+    visible_labels: bool = False
     preparation: Preparation = Preparation.gray_first
     augment: AugmentParameters = field(default_factory=AugmentParameters)
 
@@ -78,7 +81,15 @@ class Feeder:
         self.parameters = parameters
         least_px = LABEL_MINIMUM_DIAMETER_PX / parameters.enlarge
         self.tiers = [
-            choose_tiers(f.craters, d.width_px, d.height_px, f.complete, least_px) for d, f in frames
+            choose_tiers(
+                f.craters,
+                d.width_px,
+                d.height_px,
+                f.complete,
+                least_px,
+                _visibility_of_all(f, image) if parameters.visible_labels else None,
+            )
+            for (d, f), image in zip(frames, images, strict=True)
         ]
 
     def batch(self, first: int, count: int) -> dict[str, NDArray[Any]]:
@@ -141,6 +152,17 @@ class Feeder:
             "regressed": targets.regressed,
             "incomplete": np.array(not frame.complete),
         }
+
+
+def _visibility_of_all(frame: Frame, image: OctetArray) -> FloatArray:
+    """Visibility of all craters of a frame, those without catalogue entry included."""
+    return visibility(
+        image if image.ndim == 2 else gray_levels(image),
+        frame.craters["u_px"],
+        frame.craters["v_px"],
+        frame.craters["diameter_px"],
+        float(np.arctan2(frame.sun_camera[0], -frame.sun_camera[1])),
+    )
 
 
 _orders: dict[tuple[int, int, int], IntArray] = {}

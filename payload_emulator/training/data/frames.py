@@ -68,15 +68,23 @@ def take_frame(
     recipe: Recipe,
     render: Callable[..., Any],
     rng: np.random.Generator,
+    sun_mcmf: FloatArray | None = None,
 ) -> Shot:
-    """A frame whose picture is usable; pose, light, surface and sensor are drawn again where it is not."""
+    """A frame whose picture is usable; pose, light, surface and sensor are drawn again where it is not.
+
+    `sun_mcmf`, (3,), is the direction to the Sun where it is not to be drawn.
+    """
     from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_image
-    from payload_emulator.sim.render.light import sun_direction_mcmf
+    from payload_emulator.sim.render.light import sun_angles, sun_direction_mcmf
 
     for _ in range(_TRIES_OF_LIGHT):
         pose = pose_of(rng)
-        elevation, azimuth = draw_sun(source.light, rng)
-        sun = sun_direction_mcmf(elevation, azimuth, pose.latitude_rad, pose.longitude_rad)
+        if sun_mcmf is None:
+            elevation, azimuth = draw_sun(source.light, rng)
+            sun = sun_direction_mcmf(elevation, azimuth, pose.latitude_rad, pose.longitude_rad)
+        else:
+            sun = sun_mcmf
+            elevation, azimuth = sun_angles(sun, pose.latitude_rad, pose.longitude_rad)
         rendering = render(
             terrain,
             camera,

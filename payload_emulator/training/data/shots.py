@@ -65,26 +65,59 @@ def draw_pose(
         longitude = math.radians(rng.uniform(draw.west_deg, draw.east_deg))
         altitude_m = 1000.0 * rng.uniform(*source.altitude_km)
         turn = draw_pointing(source.vary, rng)
-        position = np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m))
-        rotation = turn @ nadir_camera_from_mcmf(position)
-        ground = footprint_edge(camera, rotation, position, edge)
-        edge_latitude, edge_longitude, _ = spherical_from_mcmf(ground)
-        if source.footprint == "inside" and not allowed(
-            source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)
-        ):
-            continue
-        if not np.all(terrain.covers(edge_latitude, edge_longitude)):
-            continue
-        heights = _heights_in_view(terrain, ground)
-        if not np.isfinite(heights).all() or altitude_m - heights.max() < _LOWEST_FLIGHT_M:
+        poses = [
+            _pose_over(terrain, camera, source, box, place_of_view, altitude_m, turn, edge)
+            for place_of_view in _views(source, latitude, longitude)
+        ]
+        first = poses[0]
+        if first is None or any(pose is None for pose in poses):
             continue
         if place.near is None:
             place.near = _about(box, math.degrees(latitude), math.degrees(longitude))
-        return Pose(latitude, longitude, altitude_m, float(heights.mean()), position, rotation)
+        return first
     raise DatasetError(
         f"data set source {source.name!r}: expected room for a footprint in box {box.west_deg:g}..{box.east_deg:g} E, "
         f"{box.south_deg:g}..{box.north_deg:g} N, found none in {_ATTEMPTS} draws"
     )
+
+
+def view_position_mcmf_m(source: Source, first: Pose, view: int) -> FloatArray:
+    """Place (3,) of a later view of a pose, MCMF m: further north at the same altitude above the map sphere."""
+    latitude, longitude = _views(source, first.latitude_rad, first.longitude_rad)[view]
+    return np.asarray(mcmf_from_spherical(latitude, longitude, first.altitude_m))
+
+
+def _views(source: Source, latitude_rad: float, longitude_rad: float) -> list[tuple[float, float]]:
+    """Latitude and longitude of the views of a place, rad."""
+    step_rad = 1000.0 * source.view_step_km / MOON_RADIUS_M
+    return [(latitude_rad + k * step_rad, longitude_rad) for k in range(source.views)]
+
+
+def _pose_over(
+    terrain: Any,
+    camera: PinholeCamera,
+    source: Source,
+    box: Box,
+    place_rad: tuple[float, float],
+    altitude_m: float,
+    turn: FloatArray,
+    edge: FloatArray,
+) -> Pose | None:
+    """The pose over a latitude and longitude; None where it may not look or is too low."""
+    position = np.asarray(mcmf_from_spherical(*place_rad, altitude_m))
+    rotation = turn @ nadir_camera_from_mcmf(position)
+    ground = footprint_edge(camera, rotation, position, edge)
+    edge_latitude, edge_longitude, _ = spherical_from_mcmf(ground)
+    if source.footprint == "inside" and not allowed(
+        source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)
+    ):
+        return None
+    if not np.all(terrain.covers(edge_latitude, edge_longitude)):
+        return None
+    heights = _heights_in_view(terrain, ground)
+    if not np.isfinite(heights).all() or altitude_m - heights.max() < _LOWEST_FLIGHT_M:
+        return None
+    return Pose(*place_rad, altitude_m, float(heights.mean()), position, rotation)
 
 
 def pose_at(

@@ -25,6 +25,7 @@ from payload_emulator.training.data.dataset import (
     diameter_on_ground_m,
     frame_truth,
     ground_points,
+    with_visibility,
 )
 from payload_emulator.training.data.refits import RefittedRims
 from payload_emulator.training.data.truth import FrameTruth
@@ -159,7 +160,7 @@ def run(
     detect = detect_by_class if paper_classes else detect_with_model
     return Scored(
         frames,
-        [frame_truth(d, f) for d, f in frames],
+        [with_visibility(d, f, frame_truth(d, f)) for d, f in frames],
         [detect(detector, d, f) for d, f in progress(frames)],
         [
             Scene(
@@ -265,6 +266,14 @@ def format_figures(figures: dict[str, Any]) -> str:
         for item in figures["recall_by_degradation"]
     )
     lines.append(f"recall by depth/diameter (craters): {recalls}")
+    seen = ", ".join(
+        f"{item['low']:g}-{item['high']:g}: {item['recall']:.2f} ({item['expected']})"
+        for item in figures["recall_by_visibility"]
+        if item["expected"]
+    )
+    lines.append(f"recall by visibility (craters): {seen}")
+    for name, row in (("5-30", figures["visible"]), ("3-30", figures["visible_3_to_30_km"])):
+        lines.append(_row(f"{name} km visible", row) + f"   of {row['expected']}")
     clear = "; ".join(
         f"above {row['depth_ratio']:g} strict {_share(row['strict'])}, ignore-aware {_share(row['ignore_aware'])}"
         for row in figures["recall_of_clear_craters"]

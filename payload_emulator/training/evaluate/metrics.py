@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.catalogue import CLASS_LIMITS_M
 from payload_emulator.flight.vision.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
 from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.visibility import VISIBILITY_EDGES, VISIBLE
 from payload_emulator.training.evaluate.localisation import (
     bias_by_octant,
     bias_map,
@@ -106,6 +108,7 @@ def score(
         "recall_by_degradation": _recall_by(
             strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
         ),
+        **_by_visibility(truths, found, (strict, wide), threshold),
         "recall_by_third_of_degradation": _recall_by_thirds(strict, threshold),
         "recall_of_clear_craters": [
             {"depth_ratio": low, "strict": _recall_above(strict, low, threshold)}
@@ -201,6 +204,39 @@ def _class(
         "precision_half_radius": near.precision,
         "recall_half_radius": near.recall,
         "paper": PAPER_TABLE_2[k] if k < 3 else None,
+    }
+
+
+def _by_visibility(
+    truths: Sequence[FrameTruth],
+    found: Sequence[FrameDetections],
+    pair: tuple[Tally, Tally],
+    threshold: float,
+) -> dict[str, Any]:
+    """Recall by visibility, and figures of the visible craters, of a strict tally from 5 km and one from 3 km."""
+    names = ("", "_3_to_30_km")
+    recalls = {
+        f"recall_by_visibility{name}": _recall_by(
+            part, part.crater_visibility, VISIBILITY_EDGES, threshold, "visibility"
+        )
+        for name, part in zip(names, pair, strict=True)
+    }
+    return recalls | {
+        f"visible{name}": _visible(truths, found, threshold, low_m)
+        for name, low_m in zip(names, (CLASS_LIMITS_M[0], 3_000.0), strict=True)
+    }
+
+
+def _visible(
+    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], threshold: float, low_m: float
+) -> dict[str, Any]:
+    """Figures with the visible craters as truth; detections of other catalogued craters are not counted."""
+    part = tally(truths, found, low_m=low_m, visible_from=VISIBLE)
+    every = tally(truths, found, low_m=low_m).crater_visibility
+    return {
+        **_with_interval(part, threshold),
+        "visibility": VISIBLE,
+        "unknown": int(np.isnan(every).sum()),
     }
 
 

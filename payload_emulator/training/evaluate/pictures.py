@@ -189,6 +189,7 @@ def tally_pictures(
                 picture.u_px[wanted],
                 picture.v_px[wanted],
                 np.full(wanted.size, number),
+                np.full(wanted.size, np.nan),
             )
         )
     columns = [

@@ -58,6 +58,13 @@ def detector_report(
                 f"depth/diameter {row['low']:g}–{row['high']:g}", row["expected"], float("nan"), row["recall"]
             )
             for row in figures["recall_by_degradation"]
+        )
+        + tuple(
+            NamedScore(
+                f"visibility {row['low']:g}–{row['high']:g}", row["expected"], float("nan"), row["recall"]
+            )
+            for row in figures["recall_by_visibility"]
+            if row["expected"]
         ),
         by_source=_named(figures["by_source"], lambda row: str(row["name"])),
         groups=_groups(figures),
@@ -374,6 +381,12 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
             for row in clear
         )
         + "."
+    )
+    seen = figures["visible"]
+    remarks.append(
+        f"Of the visible craters (visibility of at least {seen['visibility']:g}, {seen['expected']} of 5 to 30 km) "
+        f"{100 * seen['recall']:.0f} % are found, at a precision of {100 * seen['precision']:.0f} %; the visibility of "
+        f"{seen['unknown']} craters at the edge is unknown."
     )
     if "against_rims" in figures:
         fitted, listed = figures["against_rims"]["refitted"], figures["against_rims"]["catalogue"]

@@ -113,9 +113,10 @@ class Tally:
     """Every detection and every wanted crater of a set of frames after matching, for one rule and one truth.
 
     Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
-    crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
-    Places in the image (u, v) and numbers of the frames say where and when; matched_depth_ratio and matched_id are the
-    crater's (NaN, -1: none), detection_depth_ratio what the network says (NaN: it does not).
+    crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never),
+    visibility (NaN: unknown). Places in the image (u, v) and numbers of the frames say where and when;
+    matched_depth_ratio and matched_id are the crater's (NaN, -1: none), detection_depth_ratio what the network says
+    (NaN: it does not).
     """
 
     score: FloatArray
@@ -141,6 +142,7 @@ class Tally:
     crater_u: FloatArray
     crater_v: FloatArray
     crater_frame: IntArray
+    crater_visibility: FloatArray
 
     def select(self, detections: BoolArray, craters: BoolArray) -> Tally:
         """The part of a tally that masks of its detections and craters choose."""
@@ -196,9 +198,13 @@ def tally(
     high_m: float = CLASS_LIMITS_M[3],
     classes: tuple[int, ...] = (),
     ignore_aware: bool = False,
+    visible_from: float = 0.0,
     rule: MatchRule | None = None,
 ) -> Tally:
     """Match frame by frame. `classes` given: detections and craters of those size classes; else by diameter.
+
+    `visible_from` above 0 expects only craters of at least this visibility; detections of other catalogued craters
+    are then not counted.
 
     Detections are matched best first, so the outcome at every threshold is that of the detections above it.
     """
@@ -216,11 +222,14 @@ def tally(
             chosen = (found.diameter_m >= low_m) & (found.diameter_m <= high_m)
         if ignore_aware:
             wanted &= _could_be_seen(truth)
+        if visible_from > 0.0:
+            with np.errstate(invalid="ignore"):
+                wanted &= _visibility(truth) >= visible_from
         w = np.flatnonzero(wanted)
         d = np.flatnonzero(chosen)
         hit = match(found.u_px[d], found.v_px[d], truth.u_px[w], truth.v_px[w], truth.diameter_px[w], rule)
         outcome = (hit >= 0).astype(np.int8)
-        if ignore_aware:
+        if ignore_aware or visible_from > 0.0:
             other = np.flatnonzero(~wanted)
             near = match_any(
                 found.u_px[d],
@@ -233,7 +242,7 @@ def tally(
             outcome[(outcome == 0) & near] = -1
         parts.append(_detection_columns(number, truth, found, w, d, hit, outcome))
         craters.append(_crater_columns(number, truth, found.score[d], w, hit))
-    return Tally(*_columns(parts, 14), *_columns(craters, 9))
+    return Tally(*_columns(parts, 14), *_columns(craters, 10))
 
 
 def _in_frame(truth: FrameTruth) -> BoolArray:
@@ -244,6 +253,11 @@ def _in_frame(truth: FrameTruth) -> BoolArray:
         & (truth.v_px >= -0.5)
         & (truth.v_px <= truth.height_px - 0.5)
     )
+
+
+def _visibility(truth: FrameTruth) -> FloatArray:
+    """Return the visibility of craters, NaN where unknown."""
+    return np.full(truth.u_px.size, np.nan) if truth.visibility is None else truth.visibility
 
 
 def _could_be_seen(truth: FrameTruth) -> BoolArray:
@@ -312,6 +326,7 @@ def _crater_columns(
         truth.u_px[wanted],
         truth.v_px[wanted],
         np.full(wanted.size, number),
+        _visibility(truth)[wanted],
     )
 
 
