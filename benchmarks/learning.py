@@ -41,7 +41,7 @@ from lunar.timescales import format_utc, parse_utc
 from payload_emulator.session.emulator import emulate, file_entries
 from payload_emulator.session.loading import onboard_catalogue
 from payload_emulator.session.scenario import Scenario, load_scenario
-from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.session.world import scenario_terrain
 from tmtc.tables import CatalogueTable, pack_catalogue_table
 
 MARGIN_DEG = 8.0
@@ -76,8 +76,9 @@ def learn(arguments: argparse.Namespace, data: DataFolder, work: Path) -> dict[s
     scenario = load_scenario(arguments.scenario)
     window = replace(scenario.window, latitude_limit_deg=arguments.latitude_deg)
     scenario = replace(scenario, window=window)
-    terrain = open_terrain(scenario.terrain.source, data, scenario.seed)
-    craters = _in_region(terrain.catalogue, scenario)
+    terrain = scenario_terrain(scenario, data)
+    # The list of real craters has no rim heights: they are measured on the terrain, as for the table on board.
+    craters = terrain.measured(_in_region(terrain.catalogue, scenario))
     rng = np.random.default_rng(arguments.seed)
     hidden = np.sort(rng.permutation(craters.ids)[: round(arguments.withheld * len(craters))])
     full = onboard_catalogue(scenario, craters)
@@ -122,7 +123,7 @@ def learn(arguments: argparse.Namespace, data: DataFolder, work: Path) -> dict[s
     }
 
 
-def _in_region(catalogue: CraterCatalogue, scenario: Scenario) -> CraterCatalogue:
+def _in_region(catalogue: CraterCatalogue, scenario: Scenario) -> IntArray:
     window, navigation = scenario.window, scenario.navigation
     west = window.longitude_min_deg - MARGIN_DEG
     width = window.longitude_max_deg - window.longitude_min_deg + 2.0 * MARGIN_DEG
@@ -130,7 +131,7 @@ def _in_region(catalogue: CraterCatalogue, scenario: Scenario) -> CraterCatalogu
     inside &= np.abs(np.degrees(catalogue.latitude_rad)) <= window.latitude_limit_deg + MARGIN_DEG
     inside &= catalogue.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km
     inside &= catalogue.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km
-    return catalogue.select(inside)
+    return np.flatnonzero(inside)
 
 
 def _flown(
