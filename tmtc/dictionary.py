@@ -2,7 +2,7 @@
 
 Everything that crosses the link is defined here and, for optional instruments, in `tmtc.instruments`; the ICD and the
 XTCE export are generated from it. A version only adds packets, so that each version decodes the telemetry of older
-payloads. Versions after the third add the packets of instruments.
+payloads. Versions after the third add the packets of instruments, the sixth the image report.
 """
 
 from __future__ import annotations
@@ -528,6 +528,26 @@ def _third_telemetry() -> tuple[PacketDefinition, ...]:
     )  # fmt: skip
 
 
+def _sixth_telemetry() -> tuple[PacketDefinition, ...]:
+    """Return the packets that version 6 adds: checksums of what the payload was given with each image."""
+    return (
+        PacketDefinition(
+            "image_report", APID_DETECTIONS, 129, 10, "Checksums of one image and of what came with it",
+            (
+                *_FRAME,
+                Field("width_px", "u16", "Columns of the image, 0 without an image", "px"),
+                Field("height_px", "u16", "Rows of the image", "px"),
+                Field("image_crc", "u32", "CRC-32 of the pixels, row by row"),
+                Field(
+                    "inputs_crc", "u32",
+                    "CRC-32 of the attitude message and the samples of instruments, binary64, most significant "
+                    "octet first",
+                ),
+            ),
+        ),
+    )  # fmt: skip
+
+
 DICTIONARY_1 = Dictionary(
     version=1,
     telemetry=_telemetry(EVENTS_1, FAILURES_1, TABLES_1),
@@ -545,16 +565,22 @@ DICTIONARY_3 = Dictionary(
 )
 
 
-def _with_instruments(version: int) -> Dictionary:
+IMAGE_REPORTS_SINCE = 6
+"""Dictionary version that added the image report."""
+
+
+def _later(version: int) -> Dictionary:
     """Return the dictionary of a version after the third: with the packets of the instruments known by then."""
     known = tuple(one.packet for one in instrument_telemetry() if one.since <= version)
+    if version >= IMAGE_REPORTS_SINCE:
+        known += _sixth_telemetry()
     return Dictionary(version, DICTIONARY_3.telemetry + known, DICTIONARY_3.telecommands)
 
 
-_ADDED = sorted({one.since for one in instrument_telemetry()})
+_ADDED = sorted({one.since for one in instrument_telemetry()} | {IMAGE_REPORTS_SINCE})
 _VERSIONS = {
     dictionary.version: dictionary
-    for dictionary in (DICTIONARY_1, DICTIONARY_2, DICTIONARY_3, *map(_with_instruments, _ADDED))
+    for dictionary in (DICTIONARY_1, DICTIONARY_2, DICTIONARY_3, *map(_later, _ADDED))
 }
 DICTIONARY = _VERSIONS[max(_VERSIONS)]
 

@@ -285,6 +285,18 @@ def weakest_evidence(worlds: Sequence[Evidence]) -> str:
     return min(worlds, key=lambda one: order.index(one.level or "1")).text
 
 
+class DeclaredWorld(Section):
+    """Simulated world of an emulated mission, from which images of a pass are rendered again; a real mission has none.
+
+    Attributes
+    ----------
+    scenario
+        Scenario of the emulator (TOML) with all seeds. The ground gives it to the renderer and does not read it.
+    """
+
+    scenario: Annotated[str, Field(max_length=100_000)] | None = None
+
+
 class Requirements(Section):
     """Limits of the verdict; a requirement without a limit is shown without judgement.
 
@@ -510,6 +522,7 @@ class Mission(Section):
     detector: Detector = Detector()
     reference: Reference = Reference()
     evidence: Evidence = Evidence()
+    world: DeclaredWorld = DeclaredWorld()
     requirements: Requirements = Requirements()
     automation: Automation = Automation()
     approval: Approval = Approval()

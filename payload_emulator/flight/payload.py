@@ -30,7 +30,7 @@ from payload_emulator.flight.onboard.settings import Recovery, Settings
 from payload_emulator.flight.onboard.telecommands import check, execute, name_of
 from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
 from payload_emulator.flight.telemetry.packets import Telemetry
-from payload_emulator.flight.telemetry.products import thumbnail_octets
+from payload_emulator.flight.telemetry.products import image_report, thumbnail_octets
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
 from payload_emulator.flight.vision.detections import Detector
 from tmtc.cuc import TICKS_LIMIT, TICKS_PER_SECOND
@@ -95,7 +95,12 @@ class Payload:
         self._first_mode = mode
         self._make_detector = make_detector
         self._model = model_octets if isinstance(model_octets, bytes) else b""
-        values = ParameterStore(defaults={"housekeeping_interval_s": parameters.housekeeping_interval_s})
+        values = ParameterStore(
+            defaults={
+                "housekeeping_interval_s": parameters.housekeeping_interval_s,
+                "image_reports": float(parameters.image_reports),
+            }
+        )
         store = PacketStore(board.store)
         telemetry = Telemetry(store)
         timer = StageTimer(board)
@@ -403,6 +408,9 @@ class Payload:
             machine.monitors.in_streak,
             instruments,
         )
+        if parameters["image_reports"]:
+            frame = {"frame_number": frame_number, "image_ticks": ticks}
+            machine.telemetry.send("image_report", {**frame, **image_report(image, attitude, instruments)})
         machine.timer.detector_max_ms = max(machine.timer.detector_max_ms, observer.detector_ms)
         interval = int(parameters["thumbnail_interval"])
         if machine.thumbnail_wanted or (interval and frame_number % interval == 0):

@@ -15,7 +15,6 @@ service can send its telecommands and finish its work however fast the simulatio
 from __future__ import annotations
 
 import json
-import math
 import selectors
 import struct
 import threading
@@ -62,6 +61,7 @@ from payload_emulator.session.world import (
     clock_ticks,
     expose_at,
     extended_flight,
+    first_utc_ns,
     open_world,
     sample_truth,
 )
@@ -69,7 +69,6 @@ from payload_emulator.sim.board.contact_plan import StationContact, plan_contact
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import Receiver, Transmitter, transmit
 from payload_emulator.sim.orbit.truth import Spliced, Truth
-from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.link import LinkSettings
 
 CHUNK_S = 86_400.0
@@ -276,16 +275,8 @@ class ContinuousSession:
         return max(min(due), self.utc_ns + _LEAST_STEP_NS)
 
     def _utc_of(self, ticks: int) -> int:
-        """Return the time at which the on-board clock reads `ticks`, or just after it."""
-        utc_ns = self.utc_ns
-        for _ in range(4):
-            left = ticks - self._ticks(utc_ns)
-            if left == 0:
-                return utc_ns
-            utc_ns += math.ceil(left * _NS / TICKS_PER_SECOND)
-        while self._ticks(utc_ns) < ticks:
-            utc_ns += _NS // TICKS_PER_SECOND
-        return utc_ns
+        """Return the first time at which the on-board clock reads `ticks`."""
+        return first_utc_ns(self.world, ticks - self.spacecraft.clock_error_ticks)
 
     def _ticks(self, utc_ns: int) -> int:
         return clock_ticks(self.world, utc_ns) + self.spacecraft.clock_error_ticks
@@ -371,7 +362,9 @@ class ContinuousSession:
         link = self.scenario.link
         orders = self._take_orders(seconds) if heard else b""
         ticks = self._ticks(utc_ns)
-        exposure = self._image(utc_ns) if spacecraft.payload.will_look(ticks, orders) else None
+        # The image is that of the tick: what the telemetry says of its time is enough to make it again.
+        will_look = spacecraft.payload.will_look(ticks, orders)
+        exposure = self._image(self._utc_of(ticks)) if will_look else None
         if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
             spacecraft.detector.show(self.world, exposure)
         resets = len(spacecraft.resets)

@@ -152,12 +152,14 @@ def launch_payload(
 ) -> LoadedPayload:
     """Flight software as launched: model, parameters, gravity field and catalogue; other tables are uploaded in flight.
 
+    It reports the checksums of each image, so that the ground can check images that it renders again.
+
     Raises
     ------
     ModelError
         The detector model is missing or no network of this project.
     """
-    build = _build(scenario, camera, data)
+    build = _build(scenario, camera, data, image_reports=True)
     craters = b"" if catalogue is None else _catalogue_octets(scenario, catalogue)
     tables = FlightTables(gravity=_gravity_octets(build.field), catalogue=craters)
     return _loaded(build, tables, {}, IauOrientation())
@@ -173,7 +175,9 @@ class _Build:
     field: GravityField
 
 
-def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder) -> _Build:
+def _build(
+    scenario: Scenario, camera: PinholeCamera, data: DataFolder, image_reports: bool = False
+) -> _Build:
     model_octets = network_octets(scenario.detector.network)
     navigation = scenario.navigation
     field = filter_field(navigation.filter_gravity, navigation.filter_degree, data)
@@ -184,6 +188,7 @@ def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder) -> _Buil
             modes=tuple(Mode[name] for name in navigation.estimators),
             odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
             anchored=AnchoredParameters(gravity_degree=field.degree, errors=_attitude_errors(scenario)),
+            image_reports=image_reports,
             instruments=flight_parameters(scenario),
         ),
     )

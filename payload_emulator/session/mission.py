@@ -26,7 +26,7 @@ from payload_emulator.session.flying import PLAYBACK_CHANNEL, SPACECRAFT_ID
 from payload_emulator.session.loading import detector_parameters, filter_field, network_octets
 from payload_emulator.session.recipe import Box, Source, load_recipe
 from payload_emulator.session.recording import StepInput
-from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario
+from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario, format_scenario
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.board.contact_plan import parse_outage
@@ -163,6 +163,8 @@ def operations_mission_text(
         f"sigma_position_m = {max(scenario.navigation.initial_position_error_m, 1.0)!r}",
         f"sigma_velocity_m_s = {max(scenario.navigation.initial_velocity_error_m_s, 1e-3)!r}",
     ]
+    if scenario.camera.images != "reduced":
+        lines += ["", "[world]", f"scenario = {_toml(format_scenario(scenario))}"]
     for name in link.stations:
         latitude_deg, longitude_deg, height_m = STATIONS[name]
         own = [one for one in map(parse_outage, link.outages) if one.station == name]
@@ -353,6 +355,8 @@ def _requirements(scenario: Scenario) -> dict[str, Value]:
 def _toml(value: Value) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, str) and "\n" in value and "'''" not in value:
+        return f"'''\n{value}'''"
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
         return f'"{escaped}"'

@@ -34,6 +34,7 @@ from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.parameter_file import BuildParameters, parse_parameters
 from payload_emulator.session.recording import (
+    INPUTS,
     PassRecord,
     StepInput,
     check_image,
@@ -343,12 +344,19 @@ def load_detections(archive: Path) -> dict[int, Recorded] | None:
 def complete_archive(
     archive: Path, out: Path, data: DataFolder, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write a copy of an archive that holds all its frames; the new manifest comes back."""
-    from payload_emulator.session.emulator import file_entries
+    """Write a copy of an archive that holds all its frames; the new manifest comes back.
 
-    record, manifest = load_record(archive), _manifest(archive)
+    The archive of a live pass that declares its world gets the inputs of the payload as well, see `reconstruction`.
+    """
+    from payload_emulator.session.emulator import file_entries
+    from payload_emulator.session.reconstruction import reconstruct
+
+    manifest = _manifest(archive)
     if out.exists():
         raise RecordError(f"{out}: expected a new folder, found something there; choose another --out")
+    if manifest.get("scenario_toml") and not (archive / INPUTS).is_file():
+        return reconstruct(archive, out, data, progress)
+    record = load_record(archive)
     shutil.copytree(archive, out)
     absent = set(missing_frames(archive, record.inputs))
     pairs = zip(record.inputs, rendered_images(archive, record, data), strict=True)

@@ -62,6 +62,7 @@ Samples = Mapping[str, FloatArray]
 NO_SAMPLES: Samples = MappingProxyType({})
 _NS = 1_000_000_000
 _MS = 1_000_000
+_TICKS_NS = 200_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
 _BEFORE_JUMP_NS = 10_000
@@ -487,6 +488,19 @@ def clock_ticks(world: World, utc_ns: int) -> int:
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
     return int(ticks_from_utc_ns(utc_ns)) + round(error_s * TICKS_PER_SECOND)
+
+
+def first_utc_ns(world: World, ticks: int) -> int:
+    """Return the first time at which the clock of a scenario reads `ticks`."""
+    utc_ns = int(world.frame_utc_ns[0])
+    for _ in range(4):
+        utc_ns += round((ticks - clock_ticks(world, utc_ns)) * _NS / TICKS_PER_SECOND)
+    # The reading rises by one tick in 15 us; from a time within some ticks of it, the first is found by bisection.
+    low, high = utc_ns - _TICKS_NS, utc_ns + _TICKS_NS
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if clock_ticks(world, middle) >= ticks else (middle, high)
+    return high
 
 
 def _fly_to_windows(

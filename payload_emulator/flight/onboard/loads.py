@@ -56,6 +56,8 @@ class FlightParameters:
         Rules of `anchored`.
     housekeeping_interval_s
         Time between housekeeping packets until it is changed by telecommand.
+    image_reports
+        Whether each image is reported with checksums until it is changed by telecommand.
     instruments
         Parameters of each installed instrument by name.
     """
@@ -65,7 +67,8 @@ class FlightParameters:
     odometry: OdometryParameters = field(default_factory=OdometryParameters)
     anchored: AnchoredParameters = field(default_factory=AnchoredParameters)
     housekeeping_interval_s: float = 60.0
-    # Without instruments the text, and so the hash in telemetry, is that of builds that knew none.
+    # Without reports and instruments the text, and so the hash in telemetry, is that of builds that knew none.
+    image_reports: bool = field(default=False, repr=False)
     instruments: Mapping[str, Any] = field(default_factory=dict, repr=False, hash=False)
 
     @property
@@ -77,6 +80,7 @@ class FlightParameters:
     def sha256(self) -> str:
         """SHA-256 of the parameters as text, hexadecimal."""
         installed = "".join(f"{name}={self.instruments[name]!r}" for name in sorted(self.instruments))
+        installed += "image_reports" if self.image_reports else ""
         return hashlib.sha256((repr(self) + installed).encode()).hexdigest()
 
 

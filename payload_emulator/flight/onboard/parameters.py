@@ -53,6 +53,7 @@ PARAMETERS = (
     Parameter(21, "thumbnail_interval", 0.0, 0.0, 100_000.0, "", "Frames between thumbnails, 0 for none", True),
     Parameter(22, "thumbnail_factor", 8.0, 1.0, 64.0, "", "Pixels averaged along each axis of a thumbnail", True),
     Parameter(23, "large_data_part", 900.0, 16.0, 4096.0, "", "Octets in a part of large data", True),
+    Parameter(24, "image_reports", 0.0, 0.0, 1.0, "", "Whether each image is reported with checksums", True),
 )  # fmt: skip
 
 _BY_NUMBER = {parameter.number: parameter for parameter in PARAMETERS}

@@ -1,4 +1,4 @@
-"""Products in large data: image thumbnails and the map of landmarks that were used.
+"""Products of images: thumbnails, checksums, and the map of landmarks that were used.
 
 Thumbnail: see `tmtc.thumbnails`. Landmark map: for every crater, by identity: identity (u32), frames that used it
 (u16). Big-endian.
@@ -6,12 +6,14 @@ Thumbnail: see `tmtc.thumbnails`. Landmark map: for every crater, by identity: i
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from tmtc.thumbnails import Thumbnail, pack_thumbnail
 
 _LANDMARK = np.dtype([("crater_id", ">u4"), ("frames", ">u2")])
@@ -31,6 +33,23 @@ def thumbnail_octets(image: NDArray[Any], factor: int, frame_number: int, ticks:
         np.nan_to_num(squares.mean(axis=(1, 3)) * (255.0 / full)) if squares.size else squares[:, 0, :, 0]
     )
     return pack_thumbnail(Thumbnail(frame_number, ticks, np.clip(np.rint(levels), 0, 255).astype(np.uint8)))
+
+
+def image_report(
+    image: NDArray[Any], attitude: FloatArray, instruments: Mapping[str, FloatArray]
+) -> dict[str, int]:
+    """Return size and checksums of an image and of what was given with it, as the packet `image_report` has them."""
+    inputs = zlib.crc32(np.ascontiguousarray(attitude, dtype=">f8").tobytes())
+    for name in sorted(instruments):
+        samples = np.ascontiguousarray(instruments[name], dtype=">f8")
+        inputs = zlib.crc32(samples.tobytes(), zlib.crc32(name.encode(), inputs))
+    rows, columns = image.shape[:2] if image.ndim >= 2 and image.size else (0, 0)
+    return {
+        "width_px": columns,
+        "height_px": rows,
+        "image_crc": zlib.crc32(np.ascontiguousarray(image).tobytes()) if image.size else 0,
+        "inputs_crc": inputs,
+    }
 
 
 def map_octets(sightings: Mapping[int, int]) -> bytes:

@@ -1,0 +1,197 @@
+"""Images and inputs of a live pass, made again from the declared world, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lunar.catalogue import load_catalogue, save_catalogue
+from lunar.datafolder import DataFolder
+from payload_emulator.errors import PayloadError, RecordError
+from payload_emulator.flight.payload import FlightParameters
+from payload_emulator.session.loading import launch_payload
+from payload_emulator.session.reconstruction import reconstruct
+from payload_emulator.session.replay import FlightBuild, complete_archive, replay_archive
+from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
+from payload_emulator.session.station_ports import RECORD_HEADER
+from payload_emulator.session.world import clock_ticks, first_utc_ns, open_world
+from tests.payload_emulator.test_continuous import (
+    CADU,
+    EPOCH,
+    HOUR_NS,
+    NS,
+    Ground,
+    flown,
+    scenario,
+)
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import decode
+from tmtc.link import LinkSettings
+
+FRAMES = 4
+WINDOW = EPOCH + 5 * HOUR_NS
+
+
+OUTAGE = 'outages = ["madrid 2029-08-07T04:00:00Z 2029-08-07T06:00:00Z"]\n'
+"""The window is uplinked before it and received after it."""
+
+
+def world(further: str = "") -> Scenario:
+    """The scenario of the continuous session with rendered images, and instruments that are sampled with them."""
+    text = format_scenario(scenario(OUTAGE)).replace('images = "reduced"', 'images = "rendered"')
+    return parse_scenario(text + further)
+
+
+def packets_of(records: bytes) -> bytes:
+    step = RECORD_HEADER.size + CADU
+    cadus = b"".join(records[at + RECORD_HEADER.size : at + step] for at in range(0, len(records), step))
+    result = decode(cadus, settings=LinkSettings())
+    return b"".join(result.cut.packets(result.buffer))
+
+
+def received(folder: Path, described: Scenario) -> Path:
+    """Fly a window and write what the ground has of it: packets, telecommands, catalogue, declared world."""
+    sent: list[bytes] = []
+
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and ground.count == 0:
+            sent.extend(
+                (
+                    ground.at(WINDOW, ground.function("start_observation", FRAMES * 15.0, 15.0)),
+                    ground.at(WINDOW + 90 * NS, ground.function("set_mode", 3.0)),
+                )
+            )
+            ground.send(*sent)
+
+    terrain = open_world(described, DataFolder(None), 3600.0).terrain
+    folder.mkdir()
+    listed = terrain.catalogue.diameter_m
+    some = np.flatnonzero((listed > 5e3) & (listed < 8e3))[:40]
+    save_catalogue(terrain.measured(some), folder / "catalogue.csv")
+    catalogue = load_catalogue(folder / "catalogue.csv")
+    session, ground = flown(described, 6.5, act, catalogue=catalogue)
+    assert session.account.frames == FRAMES
+    (folder / "downlink.packets").write_bytes(packets_of(ground.records))
+    (folder / "telecommands.packets").write_bytes(b"".join(sent))
+    manifest = {"pass_name": "live", "spacecraft_id": 76, "cadence_s": 15.0}
+    (folder / "manifest.json").write_text(
+        json.dumps({**manifest, "scenario_toml": format_scenario(described), "files": {}})
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return received(tmp_path_factory.mktemp("reconstruction") / "pass", world())
+
+
+@pytest.fixture
+def copy(live: Path, tmp_path: Path) -> Path:
+    shutil.copytree(live, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def of_kind(name: str, octets: bytes) -> list[dict[str, Any]]:
+    """Values of the packets of one kind in the order of the images, without the number of the frame since boot."""
+    found = []
+    decoded = decode(octets)
+    for packet in decoded.cut.packets(decoded.buffer):
+        kind, values = DICTIONARY.unpack(packet)
+        if kind == name:
+            del values["frame_number"]
+            found.append(json.loads(json.dumps(values, default=lambda value: value.tolist())))
+    return found
+
+
+def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(
+    live: Path, tmp_path: Path
+) -> None:
+    """The detector looked at the same pixels: its reports have the same octets, and so have those of the images."""
+    whole = tmp_path / "whole"
+    manifest = complete_archive(live, whole, DataFolder(None))
+    assert sum(name.startswith("frames/") for name in manifest["files"]) == FRAMES
+    replay_archive(whole, FlightBuild(), tmp_path / "out")
+    before, again = (live / "downlink.packets").read_bytes(), (tmp_path / "out/downlink.cadu").read_bytes()
+    for name in ("image_report", "detections"):
+        assert of_kind(name, again) == of_kind(name, before), name
+        assert len(of_kind(name, before)) == FRAMES
+    assert any(one["items"]["u_px"] for one in of_kind("detections", before))
+
+
+def test_the_first_time_of_a_tick_is_the_same_from_everywhere() -> None:
+    moon = open_world(world(), DataFolder(None), 3600.0)
+    for seconds in (0.0, 1.0, 3333.333, 2_592_000.25):
+        ticks = clock_ticks(moon, EPOCH + round(seconds * NS))
+        first = first_utc_ns(moon, ticks)
+        assert clock_ticks(moon, first) == ticks and clock_ticks(moon, first - 1) == ticks - 1
+        assert abs(first - EPOCH - seconds * NS) < 16_000
+
+
+def in_world(old: str, new: str) -> Callable[[Path], None]:
+    def changed(folder: Path) -> None:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        assert old in manifest["scenario_toml"]
+        manifest["scenario_toml"] = manifest["scenario_toml"].replace(old, new)
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+
+    return changed
+
+
+def without_reports(folder: Path) -> None:
+    decoded = decode((folder / "downlink.packets").read_bytes())
+    kept = [one for one in decoded.cut.packets(decoded.buffer) if DICTIONARY.unpack(one)[0] != "image_report"]
+    (folder / "downlink.packets").write_bytes(b"".join(kept))
+
+
+def with_another_catalogue(folder: Path) -> None:
+    lines = (folder / "catalogue.csv").read_text().splitlines(keepends=True)
+    (folder / "catalogue.csv").write_text("".join(lines[:20]))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (in_world("elevation_min_deg = 5.0", "elevation_min_deg = 6.0"), "image 0 of .* expected image_crc"),
+        (in_world("read_noise_e = 15.0", "read_noise_e = 15.5"), "expected image_crc"),
+        (in_world("drift_ppm = 5.0", "drift_ppm = 6.0"), "image 0 of the declared world"),
+        (in_world("read_noise_e", "read_nose_e"), "read_noise_e"),
+        (with_another_catalogue, "catalogue_hash of the declared payload: expected [0-9A-F]{8} as in telemetry"),
+        (without_reports, "expected image reports in telemetry, found none"),
+        (lambda folder: (folder / "telecommands.packets").unlink(), "expected telecommands that were sent"),
+    ],
+)  # fmt: skip
+def test_what_telemetry_does_not_confirm_is_refused(
+    change: Callable[[Path], None], said: str, copy: Path, tmp_path: Path
+) -> None:
+    change(copy)
+    with pytest.raises(PayloadError, match=said):
+        reconstruct(copy, tmp_path / "out", DataFolder(None))
+
+
+def test_a_session_without_images_cannot_be_made_again(copy: Path, tmp_path: Path) -> None:
+    in_world('images = "rendered"', 'images = "reduced"')(copy)
+    with pytest.raises(RecordError, match="expected a world with rendered images"):
+        reconstruct(copy, tmp_path / "out", DataFolder(None))
+    assert not (tmp_path / "out").exists()
+
+
+def test_only_a_payload_as_launched_reports_images(tmp_path: Path) -> None:
+    described = world()
+    opened = open_world(described, DataFolder(None), 3600.0)
+    launched = launch_payload(described, opened.camera, DataFolder(None)).parameters.flight
+    assert launched.image_reports and not replace(launched, image_reports=False).image_reports
+    assert launched.hash != replace(launched, image_reports=False).hash
+    assert (
+        replace(launched, image_reports=False).hash
+        == replace(
+            FlightParameters(),
+            **{name: getattr(launched, name) for name in ("camera", "modes", "odometry", "anchored")},
+        ).hash
+    )
