@@ -200,13 +200,17 @@ class Camera(Section):
 class Catalogue(Section):
     """Crater catalogue and its registration to the terrain.
 
-    `sha256` names a catalogue that the ground holds; without it, `source` is the name of a public product.
+    `sha256` names a catalogue that the ground holds; without it, `source` is the name of a public product. The
+    registration is the mean shift from the listed craters to the terrain near the frames, with its standard deviation
+    per axis and the number of rims that it was fitted to; it is contained in the positions of an archive's catalogue.
     """
 
     source: str | None = None
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
     registration_north_m: float | None = None
     registration_east_m: float | None = None
+    registration_sigma_m: NotNegative | None = None
+    registration_rims: Annotated[int, Field(ge=0)] | None = None
 
 
 class Detector(Section):

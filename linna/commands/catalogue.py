@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
 from linna.commands._ground import add_operator_options, ground_client
+from linna.commands._region import parse_region
 from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
     from lunar.arrays import FloatArray
-    from payload_emulator.sim.terrain.curation import Region
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +32,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         commands.add_parser(
             "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
         )
+    )
+    from linna.commands._catalogue_register import configure as configure_register
+
+    configure_register(
+        commands.add_parser("register", help="fit the registration of a crater list to terrain, by place")
     )
     adding = commands.add_parser(
         "add", help="have the ground service hold a catalogue, which a mission description names by its hash"
@@ -138,7 +143,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
     from payload_emulator.sim.terrain.curation import CurationRules, RasterHeights, curate
     from tmtc.tables import pack_catalogue_table, table_hash
 
-    region = _region(arguments.region)
+    region = parse_region(arguments.region)
     if not 0.5 <= arguments.min_diameter < arguments.max_diameter <= 200.0:
         raise UsageError(
             f"--min-diameter, --max-diameter: expected 0.5 to 200 km in this order, "
@@ -170,8 +175,9 @@ def run_curate(arguments: argparse.Namespace) -> int:
     figures = {
         "kept": len(table),
         "dropped": curation.dropped,
-        "offset_removed_m": {"east": curation.offset_m[0], "north": curation.offset_m[1]},
-        "offset_sigma_m": curation.offset_sigma_m,
+        "registration_m": {"east": curation.offset_m[0], "north": curation.offset_m[1]},
+        "registration_rims": int(curation.registration.rims.sum()),
+        "registration_sigma_m": curation.offset_sigma_m,
         "height_correction_m": curation.height_correction_m,
         "pixels_per_degree": heights.pixels_per_degree,
         "median_shift_m": float(np.median(shift_m)) if len(table) else None,
@@ -181,29 +187,16 @@ def run_curate(arguments: argparse.Namespace) -> int:
         "out": str(arguments.out),
         "data": [f"crater catalogue {listed.source}", *sorted({path.name.split("_")[0] for path in paths})],
     }
-    emit(
-        arguments,
-        figures,
-        text=f"{len(table)} craters kept of {len(table) + sum(curation.dropped.values())}; dropped: "
-        + ", ".join(f"{reason} {count}" for reason, count in curation.dropped.items())
-        + f"\ncommon offset removed: {curation.offset_m[0]:.0f} m east, {curation.offset_m[1]:.0f} m north "
-        f"(+- {curation.offset_sigma_m:.0f} m); {heights.pixels_per_degree:g} px/deg, rim heights raised by "
-        f"{curation.height_correction_m:.0f} m\n{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
-    )
+    lines = [
+        f"{len(table)} craters kept of {len(table) + sum(curation.dropped.values())}; dropped: "
+        + ", ".join(f"{reason} {count}" for reason, count in curation.dropped.items()),
+        f"rims lie {curation.offset_m[0]:.0f} m east, {curation.offset_m[1]:.0f} m north of the list on average "
+        f"(+- {curation.offset_sigma_m:.0f} m, by place from {curation.registration.rims.sum()} rims); "
+        f"{heights.pixels_per_degree:g} px/deg, rim heights raised by {curation.height_correction_m:.0f} m",
+        f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
+    ]
+    emit(arguments, figures, text="\n".join(lines))
     return 0
-
-
-def _region(text: str) -> Region:
-    from linna.errors import UsageError
-    from payload_emulator.sim.terrain.curation import Region
-
-    try:
-        west, east, south, north = (float(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(f"--region: expected four numbers W,E,S,N in degrees, found {text!r}") from None
-    if not (-90.0 <= south < north <= 90.0 and 0.0 < east - west <= 360.0):
-        raise UsageError(f"--region: expected west before east and south before north, found {text!r}")
-    return Region(west, east, south, north)
 
 
 def _range(values: FloatArray) -> dict[str, float]:

@@ -114,8 +114,7 @@ def mission_text(world: World, data: DataFolder) -> str:
         },
         "catalogue": {
             "source": world.terrain.catalogue.source,
-            "registration_north_m": world.terrain.registration_north_m,
-            "registration_east_m": world.terrain.registration_east_m,
+            **_registration(world),
         },
         "detector": _detector(scenario),
         "reference": _reference(scenario),
@@ -128,6 +127,24 @@ def mission_text(world: World, data: DataFolder) -> str:
         if stated:
             lines += ["", f"[{name}]", *stated]
     return "\n".join(lines) + "\n"
+
+
+def _registration(world: World) -> dict[str, float | int]:
+    """Shift of the catalogue to the terrain near the frames; empty where none is known."""
+    registration = world.terrain.registration
+    if registration is None:
+        return {}
+    latitude, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
+    shift, sigma = registration.at(latitude, longitude)
+    known = np.isfinite(sigma)
+    if not known.any():
+        return {}
+    return {
+        "registration_north_m": round(float(shift[known, 1].mean()), 1),
+        "registration_east_m": round(float(shift[known, 0].mean()), 1),
+        "registration_sigma_m": round(float(sigma[known].mean()), 1),
+        "registration_rims": registration.rims_near(latitude, longitude),
+    }
 
 
 def operations_mission_text(

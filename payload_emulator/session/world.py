@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -52,6 +53,8 @@ from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.renderer import render
 from payload_emulator.sim.render.sensor import Picture, take_picture
 from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.sim.terrain.raster import RasterTerrain
+from payload_emulator.sim.terrain.registering import fitted
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
@@ -69,6 +72,8 @@ _BEFORE_JUMP_NS = 10_000
 _EDGE_NS = 1_000
 _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
+# Rims within this of the frames tell the registration where no product does: a 15 degree tile.
+_REGISTERED_DEG = 7.5
 # What stands for an image where none is rendered.
 _REDUCED_PX = 8
 # No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
@@ -167,6 +172,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
             f"{_degrees(scenario.window.latitude_band_deg)}"
         )
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
+    _register(terrain, truth, frame_utc_ns)
     require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
     return World(scenario, truth, terrain, model, burns, frame_utc_ns, _names(terrain, model))
 
@@ -182,6 +188,7 @@ def _external_world(
             f"{external.ephemeris}: expected states from {format_utc(first)} to {format_utc(last)}, found "
             f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
         )
+    _register(terrain, truth, external.utc_ns)
     require_above_ground(truth, external.utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
     names = (f"external images {external.files[0].parent.name}", *_names(terrain, model))
     return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
@@ -219,6 +226,22 @@ def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
         photographs=section.photographs,
         heights=section.heights,
     )
+
+
+def _register(terrain: TiledTerrain, truth: Truth, frame_utc_ns: IntArray) -> None:
+    """Register the catalogue to rasters for which no product was made, from the rims near the frames."""
+    if not isinstance(terrain, RasterTerrain) or terrain.registration is not None:
+        return
+    latitude, longitude, _ = spherical_from_mcmf(truth.positions_mcmf(frame_utc_ns))
+    craters, reach_m = terrain.catalogue, math.radians(_REGISTERED_DEG) * MOON_RADIUS_M
+    every = max(1, latitude.size // 200)
+    near = [
+        craters.near(float(north), float(east), reach_m)
+        for north, east in zip(latitude[::every], longitude[::every], strict=True)
+    ]
+    registration = fitted(craters.select(np.unique(np.concatenate(near))), terrain.height_files)
+    if registration is not None:
+        terrain.register(registration)
 
 
 def _names(terrain: TiledTerrain, model: ForceModel) -> tuple[str, ...]:

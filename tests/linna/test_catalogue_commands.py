@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,12 @@ import pytest
 
 from linna.cli import run
 from lunar.catalogue import make_catalogue, save_catalogue
+from payload_emulator.sim.terrain.registration import parse_registration
+from tests.payload_emulator.sim.rasters import write_raster
 from tmtc.dictionary import DICTIONARY
 from tmtc.tables import CatalogueTable, pack_catalogue_table
+
+METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 
 
 def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> bytes:
@@ -81,9 +87,44 @@ def test_tracking_identification_is_measured_on_an_anchoring_table(
     assert figures["level"].startswith("level 1-2")
 
 
+def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    latitude, longitude = (
+        part.ravel() for part in np.meshgrid(np.arange(1.5, 9, 1.5), np.arange(301.5, 309, 1.5))
+    )
+
+    def bowls(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
+        height = np.zeros(np.broadcast_shapes(lat.shape, lon.shape))
+        for north, east in zip(latitude, longitude, strict=True):
+            level = np.cos(np.radians(north))
+            # Radius 5 km, rim 200 m, depth 1,000 m.
+            r = np.hypot(lat - north, (lon - east) * level) * METRES_PER_DEG / 5_000.0
+            height += np.where(
+                r < 1.0, 1_000.0 * np.minimum(r, 1.0) ** 2 - 800.0, 200.0 * np.maximum(r, 1.0) ** -4.0
+            )
+        return height
+
+    raster = write_raster(tmp_path / "bowls.tif", 300.0, 9.0, 9.0, bowls, ppd=128)
+    listed = make_catalogue(
+        np.radians(latitude - 50.0 / METRES_PER_DEG), np.radians(longitude), [10_000.0] * 25, source="one"
+    )
+    path, out = tmp_path / "list.csv", tmp_path / "made" / "registration.json"
+    save_catalogue(listed, path)
+    words = ["catalogue", "register", str(path), "--terrain", str(raster), "--out", str(out), "--json"]
+    assert run(words) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert (figures["rims"], figures["out"]) == (25, str(out))
+    made = parse_registration(out.read_text(), "made")
+    shift, sigma = made.at(np.radians([5.0]), np.radians([305.0]))
+    assert shift[0] == pytest.approx([0.0, 50.0], abs=8.0) and sigma[0] < 20.0
+    assert made.terrain == {"bowls.tif": hashlib.sha256(raster.read_bytes()).hexdigest()}
+    assert made.catalogue == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        (["catalogue", "register"], "CATALOGUE: expected a crater list"),
+        (["catalogue", "register", "none.csv"], "--terrain: expected height rasters"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
         (["catalogue", "minimum", "--shares", "2"], "--shares"),

@@ -9,12 +9,13 @@ import pytest
 
 from ground_service.missions.model import parse_mission
 from lunar.datafolder import DataFolder
-from lunar.frames import mcmf_from_spherical
+from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.session.mission import mission_text, seen_in_training, unseen_share
 from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.world import build_world
+from payload_emulator.sim.terrain.registration import Rims, fit_registration
 
 SCENARIO = """
 name = "small"
@@ -69,11 +70,18 @@ def test_the_network_and_the_threshold_in_force_are_stated(world) -> None:
 def test_the_registration_of_the_terrain_is_stated(world) -> None:
     text = mission_text(world, DataFolder())
     assert parse_mission(text).catalogue.registration_north_m is None
-    shifted = SimpleNamespace(
-        catalogue=world.terrain.catalogue, is_real=False, registration_north_m=-46.0, registration_east_m=13.0
-    )
+    latitude, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
+    # A rim every half degree around the frames, all 40 m north and 20 m west of the list.
+    beside = np.radians(np.stack(np.meshgrid(np.arange(-5.0, 5.1, 0.5), np.arange(-5.0, 5.1, 0.5))))
+    places = beside.reshape(2, -1) + np.array([[latitude[0]], [longitude[0]]])
+    same = np.ones(places.shape[1])
+    registration = fit_registration(Rims(*places, -20.0 * same, 40.0 * same, 60.0 * same))
+    shifted = SimpleNamespace(catalogue=world.terrain.catalogue, is_real=False, registration=registration)
     stated = parse_mission(mission_text(replace(world, terrain=shifted), DataFolder())).catalogue
-    assert (stated.registration_north_m, stated.registration_east_m) == (-46.0, 13.0)
+    assert stated.registration_north_m == pytest.approx(40.0, abs=3.0)
+    assert stated.registration_east_m == pytest.approx(-20.0, abs=3.0)
+    assert 10.0 <= stated.registration_sigma_m < 20.0
+    assert 0 < stated.registration_rims <= same.size
 
 
 def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> None:

@@ -3,10 +3,10 @@
 Each crater is looked up on a height raster. Profiles from its centre outwards give the rim azimuth by azimuth; a
 circle through those points gives centre and radius, their scatter the uncertainty, heights along the circle the rim
 height. Craters without a rim worth the name are dropped, and so are those with a neighbour that could be taken for
-them. List and raster are registered to each other no better than some tens of metres: the common part of all shifts
-is removed, so that the result stays in the frame of the list.
+them. List and raster differ by some tens of metres that change slowly from place to place (`registration`): centres lie
+where the raster shows the rims, and a rim counts as that of a listed crater if it lies near the registered centre.
 
-Frame: mean-Earth (ME). Heights are metres above the sphere of the maps.
+Frame: mean-Earth (ME), as the raster is georeferenced. Heights are metres above the sphere of the maps.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
+from payload_emulator.sim.terrain.registration import Registration, Rims, clear_rims, fit_registration
 from tmtc.tables import MAGIC, CatalogueTable, table_hash, unpack_catalogue_table
 
 Mask = BoolArray
@@ -34,6 +35,10 @@ REASONS = ("size", "no_terrain", "shallow", "no_rim", "moved", "confusable")
 # 106 m at 4 px/deg (measured on GLD100); taken as linear in the logarithm of the resolution, zero from 64 px/deg on.
 _FULL_RESOLUTION_PPD = 64.0
 _LOW_RIM_M_PER_HALVING = 20.0
+REGISTERED_M = (4_000.0, 16_000.0)
+"""Diameters of craters that a registration is fitted to: smaller ones are soft on rasters of 128 px/deg, and listed
+centres of larger ones are 500 m off."""
+
 _BLOCK_DEG = 5.0
 _AZIMUTHS = 48
 _FLOOR = (0.1, 0.22, 0.34)
@@ -84,12 +89,12 @@ class CurationRules:
     rim_scatter
         Largest scatter of rim points about the circle, over its radius.
     shift_ratio
-        Largest shift of the centre over the radius, after the common part: more means another crater was fitted.
+        Largest shift of the centre from the registered one over the radius: more means another crater was fitted.
     confusable_distance, confusable_log_diameter
         A neighbour closer than this share of the diameter and of a size within this factor could be taken for it;
         the deeper of the two stays.
-    registration_sigma_m
-        Left in every place after the common offset was removed.
+    centre_sigma_m
+        Least uncertainty of a centre: a twelfth of a pixel of 128 px/deg.
     height_sigma_m
         Least uncertainty of a rim height.
     """
@@ -102,7 +107,7 @@ class CurationRules:
     shift_ratio: float = 0.35
     confusable_distance: float = 0.6
     confusable_log_diameter: float = 0.4
-    registration_sigma_m: float = 20.0
+    centre_sigma_m: float = 20.0
     height_sigma_m: float = 20.0
 
 
@@ -118,12 +123,12 @@ class Curation:
         Measured depths of the kept, shape (n,).
     dropped
         Number by reason.
-    offset_m
-        Common shift east, north of the raster's rims from the list, removed from every centre.
-    offset_sigma_m
-        Standard error of that shift.
+    registration
+        Shift from the list to the raster, by place.
+    offset_m, offset_sigma_m
+        Mean of that shift over the kept craters, east and north, and of its standard deviation; zero without any.
     shift_m
-        Shift of each kept centre from the list's, after removal, east and north, shape (n, 2).
+        Shift of each kept centre from the registered one, east and north, shape (n, 2).
     height_correction_m
         Added to every rim height for the raster's resolution.
     """
@@ -131,6 +136,7 @@ class Curation:
     table: CatalogueTable
     depth_m: FloatArray
     dropped: dict[str, int]
+    registration: Registration
     offset_m: tuple[float, float]
     offset_sigma_m: float
     shift_m: FloatArray
@@ -200,20 +206,21 @@ def curate(
     for reason, passed in tests:
         dropped[reason] = int(np.count_nonzero(keep & ~passed))
         keep = keep & passed
-    offset, offset_sigma_m = _common_shift(fit.east_m[keep], fit.north_m[keep], fit.radius_m[keep])
-    east, north = fit.east_m - offset[0], fit.north_m - offset[1]
+    registration = fit_registration(_clear(craters, fit))
+    expected, expected_sigma_m = registration.at(craters.latitude_rad, craters.longitude_rad)
+    east, north = fit.east_m - expected[:, 0], fit.north_m - expected[:, 1]
     near = np.hypot(east, north) <= rules.shift_ratio * fit.radius_m
     dropped["moved"] = int(np.count_nonzero(keep & ~near))
     keep = keep & near
-    latitude = craters.latitude_rad + north / MOON_RADIUS_M
-    longitude = craters.longitude_rad + east / (MOON_RADIUS_M * np.cos(craters.latitude_rad))
+    latitude = craters.latitude_rad + fit.north_m / MOON_RADIUS_M
+    longitude = craters.longitude_rad + fit.east_m / (MOON_RADIUS_M * np.cos(craters.latitude_rad))
     rows = np.flatnonzero(keep)
     clear = _unmistakable(latitude[rows], longitude[rows], diameter_m[rows], fit.depth_m[rows], rules)
     dropped["confusable"] = int(np.count_nonzero(~clear))
     rows = rows[clear]
     correction_m = _low_rim_m(heights.pixels_per_degree)
     centre_sigma = fit.scatter_m[rows] * math.sqrt(2.0 / _INDEPENDENT)
-    centre_sigma = np.hypot(centre_sigma, rules.registration_sigma_m)
+    centre_sigma = np.hypot(centre_sigma, rules.centre_sigma_m)
     up_sigma = np.hypot(fit.sigma_rim_m[rows], rules.height_sigma_m + 0.5 * correction_m)
     table = CatalogueTable(
         craters.ids[rows],
@@ -227,11 +234,24 @@ def curate(
         table,
         fit.depth_m[rows],
         dropped,
-        offset,
-        offset_sigma_m,
+        registration,
+        (float(expected[rows, 0].mean()), float(expected[rows, 1].mean())) if rows.size else (0.0, 0.0),
+        float(np.nanmean(expected_sigma_m[rows])) if rows.size else 0.0,
         np.stack([east[rows], north[rows]], axis=1),
         correction_m,
     )
+
+
+def measured_rims(catalogue: CraterCatalogue, heights: Heights, region: Region) -> Rims:
+    """Return the clear rims of a region beside the listed craters, of the sizes whose centres are known best."""
+    chosen = region.holds(catalogue.latitude_rad, catalogue.longitude_rad)
+    chosen &= (catalogue.diameter_m >= REGISTERED_M[0]) & (catalogue.diameter_m <= REGISTERED_M[1])
+    craters = catalogue.select(chosen)
+    return _clear(craters, _measured(craters, heights))
+
+
+def _clear(craters: CraterCatalogue, fit: _Fit) -> Rims:
+    return clear_rims(craters, fit.east_m, fit.north_m, fit.radius_m, fit.depth_m, fit.scatter_m, fit.share)
 
 
 def _measured(craters: CraterCatalogue, heights: Heights) -> _Fit:
@@ -355,19 +375,6 @@ def _circle(
     return answer[:, 0], answer[:, 1], answer[:, 2], scatter, share
 
 
-def _common_shift(
-    east_m: FloatArray, north_m: FloatArray, radius_m: FloatArray
-) -> tuple[tuple[float, float], float]:
-    """Return the median shift of small craters (whose centres are known best) and its standard error."""
-    if not east_m.size:
-        return (0.0, 0.0), 0.0
-    small = radius_m <= np.percentile(radius_m, 70.0)
-    east, north = float(np.median(east_m[small])), float(np.median(north_m[small]))
-    spread = np.median(np.abs(np.concatenate([east_m[small] - east, north_m[small] - north])))
-    # The median's standard error is 1.25 times that of the mean.
-    return (east, north), float(1.25 * 1.4826 * spread / math.sqrt(max(int(np.count_nonzero(small)), 1)))
-
-
 def _unmistakable(
     latitude: FloatArray, longitude: FloatArray, diameter: FloatArray, depth: FloatArray, rules: CurationRules
 ) -> Mask:
@@ -420,6 +427,7 @@ class RasterHeights:
         # Most craters must lie on one resolution, or heights would jump: that with most files.
         self._layer = max(layers, key=lambda layer: (len(layer.files), layer.pixels_per_degree))
         self.pixels_per_degree = float(self._layer.pixels_per_degree)
+        self.files = tuple(file.path for file in self._layer.files)
         self._smoothing = smoothing_pixels
 
     def window(self, south: float, north: float, west: float, east: float) -> tuple[FloatArray, float, float]:
@@ -430,8 +438,10 @@ class RasterHeights:
         rows = math.ceil((north - south) * ppd) + 2
         columns = math.ceil((east - west) * ppd) + 2
         values = np.asarray(layer.read(top, left, rows, columns), dtype=np.float64)
+        if np.isfinite(values).any():
+            values = _smoothed(values, self._smoothing)
         return (
-            _smoothed(values, self._smoothing),
+            values,
             90.0 - (top + 0.5 + layer.north_offset) / ppd,
             (left + 0.5 + layer.west_offset) / ppd,
         )

@@ -33,7 +33,9 @@ def open_terrain(
     the data allow it, else the second; ``catalogue``: the craters of the data folder's catalogue on a procedural base.
     ``photograph``: the light of georeferenced photographs over height rasters; both are files of the data folder, or
     absolute paths. Without `heights`, the rasters of the data folder are used.
-    `registration_north_east_m` shifts height rasters instead of the shift that belongs to them.
+    The catalogue is registered to height rasters by the product that was made of the same files: that of the data
+    folder, or the one shipped for the tiles and the catalogue of the project. `registration_north_east_m` moves the
+    rasters on the ground, away from the catalogue.
     Of the height models SLDEM2015 is preferred to GLD100, of the albedos georeferenced mosaics to pictures.
 
     Raises
@@ -67,14 +69,14 @@ def open_terrain(
         return ProceduralTerrain(seed, **options)  # type: ignore[arg-type]
     from lunar.catalogue import load_catalogue
     from payload_emulator.sim.terrain.raster import RasterTerrain
+    from payload_emulator.sim.terrain.registering import find_registration
 
     assert catalogue_path is not None
     chosen: dict[str, object] = {"name": "LROC WAC GLD100"}
     if data.dem_sldem:
-        # The shift and the smoothing are GLD100's; nothing is known against SLDEM2015 as it stands.
+        # The smoothing is GLD100's; nothing is known against SLDEM2015 as it stands.
         chosen = {
             "name": "SLDEM2015",
-            "registration_north_m": 0.0,
             "smoothing_pixels": 0.0,
             "effective_resolution_m": SLDEM_RESOLUTION_M,
         }
@@ -82,7 +84,7 @@ def open_terrain(
         north_m, east_m = registration_north_east_m
         chosen |= {"registration_north_m": north_m, "registration_east_m": east_m}
     albedo = data.albedo_tiles or ((data.albedo,) if data.albedo else ())
-    return RasterTerrain(
+    terrain = RasterTerrain(
         tiles,
         load_catalogue(catalogue_path),
         coarse_paths=(data.dem_global,) if data.dem_global else (),
@@ -91,6 +93,10 @@ def open_terrain(
         seed=seed,
         **(chosen | options),  # type: ignore[arg-type]
     )
+    registration = find_registration(data, catalogue_path, tiles)
+    if registration is not None:
+        terrain.register(registration)
+    return terrain
 
 
 def _open_photograph(
@@ -102,6 +108,7 @@ def _open_photograph(
 ) -> TiledTerrain:
     from lunar.catalogue import load_catalogue
     from payload_emulator.sim.terrain.photograph import PhotographTerrain
+    from payload_emulator.sim.terrain.registering import find_registration
 
     pictures = [_found(name, data, "photograph") for name in photographs]
     rasters = [_found(name, data, "height raster") for name in heights] or list(data.dem_tiles)
@@ -115,7 +122,7 @@ def _open_photograph(
         north_m, east_m = registration_north_east_m
         shift = {"registration_north_m": north_m, "registration_east_m": east_m}
     names = ", ".join(path.name for path in pictures)
-    return PhotographTerrain(
+    terrain = PhotographTerrain(
         rasters,
         pictures,
         load_catalogue(catalogue_path),
@@ -132,6 +139,10 @@ def _open_photograph(
         ),
         **shift,
     )
+    registration = find_registration(data, catalogue_path, rasters)
+    if registration is not None:
+        terrain.register(registration)
+    return terrain
 
 
 def _found(name: str, data: DataFolder, what: str) -> Path:

@@ -36,13 +36,6 @@ from payload_emulator.sim.terrain.tiles import (
 SMOOTHING_PIXELS = 1.0
 """GLD100 is quantised to 1 m, which shows as a weave under a low Sun; one pixel of smoothing removes it."""
 
-REGISTRATION_NORTH_M = -59.0
-"""Default shift of GLD100 to the north: half a pixel of 256 px/deg to the south.
-
-Rims fitted on the raster as georeferenced lie 46 to 71 m north of the crater catalogue LU1319381; which of the two is
-wrong is not known.  The shift makes them agree; give 0 for the raster as it is.
-"""
-
 FEATHER_DEG = 0.12
 ROUGHNESS_WAVES_KM = ((1.7, 3.6), (0.85, 2.3), (0.42, 1.4), (0.26, 0.8))
 """Wavelength in km and rms in m added below the raster's effective resolution, on ground of average slope."""
@@ -76,7 +69,7 @@ class RasterTerrain(TiledTerrain):
         data_names: tuple[str, ...] = (),
         seed: int = 0,
         sharpen: bool = True,
-        registration_north_m: float = REGISTRATION_NORTH_M,
+        registration_north_m: float = 0.0,
         registration_east_m: float = 0.0,
         smoothing_pixels: float = SMOOTHING_PIXELS,
         effective_resolution_m: float = EFFECTIVE_RESOLUTION_M,
@@ -86,7 +79,9 @@ class RasterTerrain(TiledTerrain):
         """``coarse_paths`` fill in around ``paths`` (under shadows and at edges) and do not count as covered.
 
         ``sharpen`` adds seeded craters and roughness below ``effective_resolution_m``, the size of what the rasters
-        still show, whatever their pixels; ``registration_*`` shift the rasters on the ground.
+        still show, whatever their pixels; ``registration_*`` shift the rasters on the ground, for
+        studies of a wrong map. Rasters of 128 and 256 px/deg agree to 2 m as georeferenced; it is the catalogue that is
+        registered to them (`registration`).
         """
         if not paths:
             raise TerrainError("terrain rasters: expected at least one height raster, found none")
@@ -96,6 +91,7 @@ class RasterTerrain(TiledTerrain):
         self._layers.sort(key=lambda layer: layer.pixels_per_degree)
         self.registration_north_m = registration_north_m
         self.registration_east_m = registration_east_m
+        self.height_files = tuple(Path(path) for path in paths)
         self._shift_north_deg = math.degrees(registration_north_m / MOON_RADIUS_M)
         self._shift_east_m = registration_east_m
         self._smoothing = smoothing_pixels

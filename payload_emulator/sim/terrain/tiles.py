@@ -24,6 +24,7 @@ from payload_emulator.errors import TerrainError
 
 if TYPE_CHECKING:
     from payload_emulator.sim.terrain.craters import CraterShapes, SmallCraters
+    from payload_emulator.sim.terrain.registration import Registration
 
 Heights = npt.NDArray[np.float32]
 
@@ -138,9 +139,8 @@ class TiledTerrain(ABC):
 
     is_real: bool = False
     """Whether the heights are those of the Moon."""
-    registration_north_m: float | None = None
-    registration_east_m: float | None = None
-    """Shift that registers the heights to the catalogue; None where it does not apply."""
+    registration: Registration | None = None
+    """How the catalogue was registered to the heights; None where that does not apply or is not known."""
 
     _small: SmallCraters | None = None
     """Craters below the catalogue's limit, where the source draws any."""
@@ -176,6 +176,14 @@ class TiledTerrain(ABC):
         self._rim_tilt_m = np.zeros((len(catalogue), 2))
         self._measured = np.zeros(len(catalogue), dtype=bool)
         self._owner: int | None = None
+
+    def register(self, registration: Registration) -> None:
+        """Move the craters of the catalogue to where the heights show them; before any of them is measured."""
+        from payload_emulator.sim.terrain.registration import registered
+
+        assert not self._measured.any()
+        self.catalogue = registered(self.catalogue, registration)
+        self.registration = registration
 
     @abstractmethod
     def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:

@@ -134,7 +134,7 @@ def test_files_are_named_in_the_data_folder(tmp_path):
     terrain = open_terrain("photograph", data, 1, photographs=("p.tif",), heights=("h.tif",))
     assert terrain.name == "photograph p.tif"
     assert terrain.data_names[:2] == ("photograph p.tif", "height raster h.tif")
-    assert terrain.registration_north_m == -59.0
+    assert terrain.registration_north_m == 0.0 and terrain.registration is None
     with pytest.raises(TerrainError, match=r"expected the photograph .*none\.tif, found none"):
         open_terrain("photograph", data, 1, photographs=("none.tif",), heights=("h.tif",))
     with pytest.raises(TerrainError, match="found 1 photographs, 0 rasters and a catalogue"):

@@ -1,0 +1,95 @@
+"""`linna catalogue register`: by how much the rims on a terrain lie beside the craters of a list, by place."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from linna.commands._region import parse_region
+from linna.output import add_json_flag, emit
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "catalogue",
+        nargs="?",
+        type=Path,
+        metavar="CATALOGUE",
+        help="crater list (CSV, plain or gzip; default: that of the data folder)",
+    )
+    parser.add_argument(
+        "--terrain",
+        nargs="+",
+        type=Path,
+        metavar="F",
+        help="height rasters in longitude and latitude (default: those of the data folder)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="F",
+        help="product to write (default: registration.json in the data folder, which terrain is then opened with)",
+    )
+    parser.add_argument(
+        "--region",
+        default="0,360,-80,80",
+        metavar="W,E,S,N",
+        help="degrees, longitude east (default: 0,360,-80,80)",
+    )
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from datetime import UTC, datetime
+
+    from linna.data import data_directory, data_folder
+    from linna.errors import UsageError
+    from payload_emulator.sim.terrain.registering import PRODUCT, register, save_registration
+    from payload_emulator.sim.terrain.registration import by_tile
+
+    data = data_folder()
+    catalogue = arguments.catalogue or data.catalogue_lu or data.catalogue_composite or data.catalogue_robbins
+    terrain = arguments.terrain or list(data.dem_sldem or data.dem_tiles)
+    if catalogue is None or not terrain:
+        missing = "--terrain: expected height rasters" if catalogue else "CATALOGUE: expected a crater list"
+        raise UsageError(f"{missing}, found none named and none in the data folder")
+    made = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    registration = register(catalogue, terrain, made, parse_region(arguments.region))
+    out = arguments.out or data_directory() / PRODUCT
+    save_registration(out, registration)
+    tiles = by_tile(registration)
+    figures = {
+        "tiles": [
+            {
+                "south_deg": tile.south_deg,
+                "west_deg": tile.west_deg,
+                "east_m": tile.east_m,
+                "north_m": tile.north_m,
+                "sigma_m": tile.sigma_m,
+                "rims": tile.rims,
+            }
+            for tile in tiles
+        ],
+        "nodes": int(registration.row.size),
+        "rims": int(registration.rims.sum()),
+        "out": str(out),
+        "data": [f"crater catalogue {catalogue.name}", f"{len(terrain)} height rasters"],
+    }
+    lines = [
+        f"{tile.south_deg:6.1f} {tile.west_deg:6.1f}: {tile.east_m:5.0f} m east, {tile.north_m:5.0f} m north, "
+        f"+- {tile.sigma_m:.0f} m, {tile.rims} rims"
+        for tile in tiles
+    ]
+    emit(
+        arguments,
+        figures,
+        text="\n".join(
+            [
+                "rims on the terrain beside the list; south and west edge of tiles of 15 degrees:",
+                *lines,
+                f"{out}: {registration.row.size} nodes, {registration.rims.sum()} rims",
+            ]
+        ),
+    )
+    return 0

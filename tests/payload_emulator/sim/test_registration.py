@@ -1,0 +1,224 @@
+"""Registration of a catalogue to terrain: fit from rims, product, use when a terrain is opened."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lunar.catalogue import make_catalogue, save_catalogue
+from lunar.datafolder import DataFolder, find_data
+from payload_emulator.errors import TerrainError
+from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.sim.terrain.registering import (
+    PRODUCT,
+    file_sha256,
+    find_registration,
+    save_registration,
+)
+from payload_emulator.sim.terrain.registration import (
+    FLOOR_SIGMA_M,
+    LATTICE_DEG,
+    PROCESS_SIGMA_M,
+    Registration,
+    Rims,
+    by_tile,
+    fit_registration,
+    format_registration,
+    parse_registration,
+    registered,
+)
+from tests.payload_emulator.sim.rasters import write_raster
+
+RADIUS_M = 1_737_400.0
+
+
+def rims(
+    count: int, shift_m: tuple[float, float], noise_m: float, seed: int = 1, size_deg: float = 15.0
+) -> Rims:
+    """Rims spread over a square about 300 E, 10 N, with a constant shift and normal errors."""
+    rng = np.random.default_rng(seed)
+    latitude, longitude = rng.uniform(-0.5, 0.5, (2, count)) * size_deg
+    east, north = noise_m * rng.standard_normal((2, count))
+    return Rims(
+        np.radians(10.0 + latitude),
+        np.radians(300.0 + longitude),
+        shift_m[0] + east,
+        shift_m[1] + north,
+        np.full(count, noise_m),
+    )
+
+
+def middle(registration: Registration) -> tuple[np.ndarray, float]:
+    shift, sigma = registration.at(np.radians([10.0]), np.radians([300.0]))
+    return shift[0], float(sigma[0])
+
+
+def test_many_rims_give_the_shift_to_a_few_metres() -> None:
+    shift, sigma = middle(fit_registration(rims(600, (-30.0, 70.0), 60.0)))
+    # 60 m / sqrt(600) is 2.4 m; the shift may change by 21 m over ten degrees, and the floor is 10 m.
+    assert shift == pytest.approx([-30.0, 70.0], abs=8.0)
+    assert FLOOR_SIGMA_M <= sigma < 20.0
+
+
+def test_few_rims_are_not_believed_and_none_change_nothing() -> None:
+    shift, sigma = middle(fit_registration(rims(2, (300.0, 0.0), 400.0)))
+    assert 0.0 <= shift[0] < 30.0 and sigma > 0.95 * PROCESS_SIGMA_M
+    far = fit_registration(rims(50, (30.0, 0.0), 60.0))
+    away, unknown = far.at(np.radians([-50.0]), np.radians([100.0]))
+    assert away.tolist() == [[0.0, 0.0]] and np.isnan(unknown).all()
+
+
+def test_a_tenth_of_wrong_rims_does_not_move_the_shift() -> None:
+    good = rims(400, (-30.0, 70.0), 60.0)
+    wrong = np.arange(400) % 10 == 3
+    spoilt = replace(good, north_m=np.where(wrong, 1_500.0, good.north_m))
+    clean, _ = middle(fit_registration(good))
+    robust, _ = middle(fit_registration(spoilt))
+    # A mean would move by 143 m.
+    assert np.abs(robust - clean).max() < 8.0
+
+
+def test_the_stated_uncertainty_is_that_of_the_errors() -> None:
+    errors, sigmas = [], []
+    for seed in range(40):
+        shift, sigma = middle(fit_registration(rims(30, (0.0, 0.0), 150.0, seed)))
+        errors.append(shift)
+        sigmas.append(sigma)
+    # Zero is the mean of the process, so shrinking makes the errors smaller than those of another truth would be.
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas) < 1.2
+
+
+def test_the_shift_follows_the_place_without_steps() -> None:
+    latitude, longitude = np.meshgrid(
+        np.radians(np.arange(-30.0, 30.1, 0.5)), np.radians(np.arange(290.0, 310.1, 0.5))
+    )
+    latitude, longitude = latitude.ravel(), longitude.ravel()
+    slope = Rims(latitude, longitude, 0.0 * latitude, np.degrees(latitude), np.full(latitude.size, 30.0))
+    registration = fit_registration(slope)
+    track = np.radians(np.arange(-25.0, 25.0, 0.1))
+    shift, _ = registration.at(track, np.full(track.size, np.radians(300.0)))
+    assert shift[:, 1] == pytest.approx(np.degrees(track), abs=6.0)
+    assert np.abs(np.diff(shift[:, 1])).max() < 0.5
+
+
+def test_a_catalogue_is_moved_by_its_place_also_over_the_zero_meridian() -> None:
+    row, column = (part.ravel() for part in np.meshgrid([0, 1], [47, 48, 49]))
+    same = np.ones(row.size)
+    registration = Registration(row, column % 48, 50.0 * same, -20.0 * same, 12.0 * same, 9 * row)
+    craters = make_catalogue(np.radians([3.0, 3.0]), np.radians([358.0, 2.0]), [5e3, 6e3], source="x")
+    moved = registered(craters, registration)
+    assert (moved.latitude_rad - craters.latitude_rad) * RADIUS_M == pytest.approx([-20.0, -20.0])
+    east = (moved.longitude_rad - craters.longitude_rad) * RADIUS_M * math.cos(math.radians(3.0))
+    assert east == pytest.approx([50.0, 50.0])
+    assert registered(craters, None) is craters
+
+
+def test_tiles_are_summed_up() -> None:
+    tiles = by_tile(fit_registration(rims(300, (-30.0, 70.0), 60.0)))
+    (tile,) = [one for one in tiles if (one.south_deg, one.west_deg) == (0.0, 300.0)]
+    assert tile.east_m == pytest.approx(-30.0, abs=10.0) and tile.north_m == pytest.approx(70.0, abs=10.0)
+    assert 50 < tile.rims <= 300
+
+
+def test_a_product_is_read_as_it_was_written() -> None:
+    made = replace(
+        fit_registration(rims(100, (-30.0, 70.0), 60.0)),
+        catalogue="ab",
+        terrain={"a.tif": "cd"},
+        made_utc="2026-11-23T00:00:00Z",
+    )
+    read = parse_registration(format_registration(made), "x")
+    for name in ("row", "column", "rims"):
+        assert np.array_equal(getattr(read, name), getattr(made, name))
+    for name in ("east_m", "north_m", "sigma_m"):
+        assert getattr(read, name) == pytest.approx(getattr(made, name), abs=0.051)
+    assert (read.catalogue, read.terrain, read.made_utc) == (made.catalogue, made.terrain, made.made_utc)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 9}, "expected version 1, found 9"),
+        ({"kind": "x"}, "expected a registration made by linna catalogue register"),
+        ({"lattice_deg": 5.0}, "expected lattice_deg 7.5, found 5.0"),
+        ({"nodes": [[0.0, 1.0]]}, "expected nodes of 6 numbers"),
+        ({"nodes": [[0.0, 7.5, 1.0, 1.0, 0.0, 3]]}, "positive sigma_m"),
+    ],
+)
+def test_another_product_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
+    text = format_registration(fit_registration(rims(20, (0.0, 0.0), 60.0)))
+    with pytest.raises(TerrainError, match=words) as refused:
+        parse_registration(json.dumps(json.loads(text) | change), "made.json")
+    assert str(refused.value).startswith("made.json: ") and "\n" not in str(refused.value)
+    with pytest.raises(TerrainError, match=r"expected a registration \(JSON\)"):
+        parse_registration(text[:40], "made.json")
+
+
+def folder_of(root: Path) -> DataFolder:
+    """A data folder with a raster, a list of one crater and the registration of the list to the raster."""
+    (root / "dem").mkdir()
+    raster = write_raster(root / "dem/flat_128ppd_000E_+15.tif", 10.0, 20.0, 8.0, lambda lat, _: 0.0 * lat)
+    catalogue = root / "craters.csv"
+    save_catalogue(make_catalogue([math.radians(15.0)], [math.radians(14.0)], [8e3], source="x"), catalogue)
+    made = rims(100, (-30.0, 70.0), 60.0)
+    made = replace(made, longitude_rad=made.longitude_rad - math.radians(286.0))
+    save_registration(
+        root / PRODUCT,
+        replace(
+            fit_registration(made),
+            catalogue=file_sha256(catalogue),
+            terrain={raster.name: file_sha256(raster)},
+        ),
+    )
+    return DataFolder(root=root, dem_tiles=(raster,), catalogue_lu=catalogue)
+
+
+def test_terrain_is_opened_with_its_catalogue_registered(tmp_path: Path) -> None:
+    data = folder_of(tmp_path)
+    terrain = open_terrain("raster", data, 1)
+    assert terrain.registration is not None
+    north_m = (terrain.catalogue.latitude_rad[0] - math.radians(15.0)) * RADIUS_M
+    assert north_m == pytest.approx(70.0, abs=15.0)
+    (tmp_path / PRODUCT).unlink()
+    plain = open_terrain("raster", data, 1)
+    assert plain.registration is None
+    assert plain.catalogue.latitude_rad[0] == pytest.approx(math.radians(15.0), abs=1e-12)
+
+
+def test_a_registration_of_other_files_is_refused(tmp_path: Path) -> None:
+    data = folder_of(tmp_path)
+    assert data.catalogue_lu is not None
+    with data.catalogue_lu.open("a") as file:
+        file.write("\n")
+    with pytest.raises(
+        TerrainError, match=r"registration.json: expected a catalogue with SHA-256 .*make it again"
+    ):
+        find_registration(data, data.catalogue_lu, data.dem_tiles)
+
+
+def test_a_registration_of_another_raster_is_refused(tmp_path: Path) -> None:
+    data = folder_of(tmp_path)
+    assert data.catalogue_lu is not None
+    with data.dem_tiles[0].open("ab") as file:
+        file.write(b"\0")
+    with pytest.raises(TerrainError, match=r"flat_128ppd_000E_\+15.tif with SHA-256 .* found another file"):
+        find_registration(data, data.catalogue_lu, data.dem_tiles)
+
+
+@pytest.mark.real_data
+def test_the_shipped_registration_is_of_the_tiles_of_the_project(data_path: Path) -> None:
+    data = find_data(data_path)
+    assert data.catalogue_lu is not None
+    found = find_registration(data, data.catalogue_lu, data.dem_tiles)
+    assert found is not None and found.rims.sum() > 8_000
+    # Fresh craters of the strip from 285 to 300 E, 15 to 30 N lie 79 m north (32 rims, +- 19 m); south of the equator
+    # none of its tiles differs by more than 30 m (medians of rims, 70 to 140 to a tile).
+    shift, _ = found.at(np.radians([22.5, -22.5]), np.radians([292.5, 292.5]))
+    assert shift[0, 1] == pytest.approx(79.0, abs=30.0) and abs(shift[1, 1]) < 30.0
+    assert np.all(np.abs(shift[:, 0]) < 45.0)
+    assert found.row.size * LATTICE_DEG**2 > 60 * 15.0**2
