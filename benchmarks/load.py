@@ -28,36 +28,12 @@ from benchmarks.ground import START, STEP_NS, mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from lunar.timescales import format_utc
-from studies.mission_run.parts import descendants
+from studies.mission_run.processes import family_cpu_s, family_mib
 
 ROUND_S = 60
 EACH_USER_S = 2.0
 MEMORY_S = 10.0
 WARM_UP_S = 5.0
-
-
-def resident_mib(pid: int) -> float:
-    """Return the proportional resident memory of a process and its descendants, MiB."""
-    octets = 0
-    for one in (pid, *descendants(pid)):
-        try:
-            text = Path(f"/proc/{one}/smaps_rollup").read_text()
-        except OSError:
-            continue
-        octets += int(next(line for line in text.splitlines() if line.startswith("Pss:")).split()[1]) << 10
-    return octets / 2**20
-
-
-def processor_s(pid: int) -> float:
-    """Return the processor time of a process and its descendants so far, s."""
-    ticks = 0
-    for one in (pid, *descendants(pid)):
-        try:
-            fields = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 class Run:
@@ -120,7 +96,7 @@ class Run:
     async def _watch(self, begin: float, seconds: float) -> None:
         while (now := time.perf_counter()) < begin + seconds:
             for name, part in self._service.parts.items():
-                self.memory[name].append((now - begin, resident_mib(part.pid)))
+                self.memory[name].append((now - begin, family_mib(part.pid) or 0.0))
             await asyncio.sleep(MEMORY_S)
 
 
@@ -160,9 +136,12 @@ def measure(folder: Path, seconds: float, users: int, rate: int) -> dict[str, An
         with httpx.Client(base_url=f"{service.api}/api/v1", headers=run._headers, timeout=60.0) as client:
             client.post("/telemetry?spacecraft_id=76", content=run._pieces[0]).raise_for_status()
             client.post("/passes", json=definition).raise_for_status()
-            spent = {name: processor_s(part.pid) for name, part in service.parts.items()}
+            spent = {name: family_cpu_s(part.pid) or 0.0 for name, part in service.parts.items()}
             asyncio.run(run.go(seconds))
-            spent = {name: processor_s(service.parts[name].pid) - before for name, before in spent.items()}
+            spent = {
+                name: (family_cpu_s(service.parts[name].pid) or 0.0) - before
+                for name, before in spent.items()
+            }
             load = os.getloadavg()
             began = time.monotonic()
             while client.get(f"/jobs/{run.last_job}").json()["state"] not in ("done", "failed"):

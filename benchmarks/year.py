@@ -2,7 +2,8 @@
 
 One pass of a scenario is emulated, imported and reported by the service. The database then copies the rows of this
 pass, as passes of one spacecraft (28 a day), with times, ids, counts and hashes of their own. Before the
-first copy and after each quarter, the service itself reads, ingests and reports; this is timed. Files are not copied.
+first copy and after each quarter, the service itself reads, ingests and reports; this is timed, by the clock and as
+processor time of the service and of PostgreSQL, which other work on the machine changes less. Files are not copied.
 Of roll-ups that several passes share, copies do not add to the values. PostgreSQL runs without `fsync`.
 """
 
@@ -17,7 +18,8 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,8 @@ from ground_service.worker.jobs import run_job
 from lunar.datafolder import find_data
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.scenario import load_scenario
-from studies.mission_run.parts import PostgresServer
+from studies.mission_run.parts import Part, PostgresServer
+from studies.mission_run.processes import family_cpu_s
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -177,12 +180,30 @@ def _milliseconds(work: Callable[[], object]) -> float:
     return 1e3 * (time.perf_counter() - began)
 
 
+class Processor:
+    """Processor time of this process and of the database server per item, ms."""
+
+    def __init__(self, server: Part) -> None:
+        self._server = server
+
+    @contextmanager
+    def per_item(self, items: int, into: dict[str, float]) -> Iterator[None]:
+        """Note the processor time of a block that does `items` things."""
+        service, database = time.process_time(), family_cpu_s(self._server.pid) or 0.0
+        yield
+        into["service_cpu_ms"] = round(1e3 * (time.process_time() - service) / items, 2)
+        into["database_cpu_ms"] = round(1e3 * ((family_cpu_s(self._server.pid) or 0.0) - database) / items, 2)
+
+
 def _p95(values: list[float]) -> float:
     return round(float(np.percentile(values, 95)), 1)
 
 
-def read_times(settings: Settings, token: str, spacecraft: int, rounds: int) -> dict[str, list[float]]:
-    """Return the times of the reads in ms; each round reads another pass."""
+def read_times(
+    settings: Settings, token: str, spacecraft: int, rounds: int, processor: Processor
+) -> tuple[dict[str, list[float]], dict[str, float]]:
+    """Return the times of the reads in ms, and the processor time of a read; each round reads another pass."""
+    spent: dict[str, float] = {}
     times: dict[str, list[float]] = {path: [] for path in READS}
     headers = {"Authorization": f"Bearer {token}"}
     app = create_app(settings, inline_jobs=True)
@@ -190,19 +211,27 @@ def read_times(settings: Settings, token: str, spacecraft: int, rounds: int) -> 
         newest = client.get("/api/v1/passes?limit=200&instance=flight").raise_for_status().json()["items"]
         found = [one["id"] for one in newest]
         chosen = random.Random(1)
-        for turn in range(rounds + 1):
-            for path in READS:
-                url = "/api/v1" + path.format_map({"pass": chosen.choice(found), "spacecraft": spacecraft})
-                took = _milliseconds(lambda url=url: client.get(url).raise_for_status())
-                if turn:  # the first round loads and compiles
-                    times[path].append(took)
-    return times
+
+        def read(path: str) -> float:
+            url = "/api/v1" + path.format_map({"pass": chosen.choice(found), "spacecraft": spacecraft})
+            return _milliseconds(lambda: client.get(url).raise_for_status())
+
+        for path in READS:  # loads and compiles
+            read(path)
+        with processor.per_item(rounds * len(READS), spent):
+            for _ in range(rounds):
+                for path in READS:
+                    times[path].append(read(path))
+    return times, spent
 
 
 class Measured:
     """Work of the service on the growing database."""
 
-    def __init__(self, ground: Ground, settings: Settings, archive: Path, folder: Path) -> None:
+    def __init__(
+        self, ground: Ground, settings: Settings, archive: Path, folder: Path, processor: Processor
+    ) -> None:
+        self._processor = processor
         self._ground, self._settings, self._archive, self._folder = ground, settings, archive, folder
         self._token = add_user(ground, "ann", "operator")
         self._done = 0
@@ -217,45 +246,58 @@ class Measured:
         shutil.rmtree(copy)
         return time.perf_counter() - began
 
-    def ingest_times(self, spacecraft: int, after_utc_ns: int, files: int) -> list[float]:
-        """Return the times in ms in which new packets of the spacecraft are ingested."""
-        times = []
-        path = self._folder / "new.cadu"
-        for number in range(files):
+    def ingest_times(
+        self, spacecraft: int, after_utc_ns: int, files: int
+    ) -> tuple[list[float], dict[str, float]]:
+        """Return the times in ms in which new packets are ingested, and the processor time of a file."""
+        spent: dict[str, float] = {}
+        paths = [self._folder / f"new-{number}.cadu" for number in range(files)]
+        for number, path in enumerate(paths):
             path.write_bytes(mixed_downlink(1_440, after_utc_ns + number * 60 * S))
-            times.append(_milliseconds(lambda: ingest_file(self._ground, path, spacecraft_id=spacecraft)))
-        return times
+        with self._processor.per_item(files, spent):
+            times = [
+                _milliseconds(lambda path=path: ingest_file(self._ground, path, spacecraft_id=spacecraft))
+                for path in paths
+            ]
+        for path in paths:
+            path.unlink()
+        return times, spent
 
     def figures(self, year: Year, spacecraft: int, stop_utc_ns: int, rounds: int) -> dict[str, Any]:
         """Return the figures of the database at its present size."""
         after = stop_utc_ns + year.span_ns + 300 * S
-        ingest = self.ingest_times(spacecraft, after, rounds)
-        whole = [self.whole_pass() for _ in range(2)]
-        reads = read_times(self._settings, self._token, spacecraft, rounds)
+        ingest, ingest_cpu = self.ingest_times(spacecraft, after, rounds)
+        pass_cpu: dict[str, float] = {}
+        with self._processor.per_item(2, pass_cpu):
+            whole = [self.whole_pass() for _ in range(2)]
+        reads, read_cpu = read_times(self._settings, self._token, spacecraft, rounds, self._processor)
         slowest = max(reads, key=lambda path: float(np.median(reads[path])))
         return {
             "passes": year.passes,
             "database_gb": round(database_octets(self._ground) / 1e9, 2),
             "reads_p50_ms": round(float(np.median([one for times in reads.values() for one in times])), 1),
             "reads_p95_ms": _p95([one for times in reads.values() for one in times]),
+            **{f"read_{name}": value for name, value in read_cpu.items()},
             "slowest_read": f"{slowest}: {np.median(reads[slowest]):.1f} ms",
             "ingest_p50_ms": round(float(np.median(ingest)), 1),
             "ingest_p95_ms": _p95(ingest),
+            **{f"ingest_{name}": value for name, value in ingest_cpu.items()},
             "import_and_report_s": round(float(np.mean(whole)), 2),
+            **{f"import_and_report_{name}": value for name, value in pass_cpu.items()},
             "load_average": round(os.getloadavg()[0], 1),
         }
 
 
 def simulate(
-    folder: Path, url: str, archive: Path, passes_a_day: float, days: float, rounds: int
+    folder: Path, server: PostgresServer, archive: Path, passes_a_day: float, days: float, rounds: int
 ) -> dict[str, Any]:
     """Fill a database with passes; return the figures before the first copy and after each quarter."""
     data = find_data(os.environ.get("LINNA_DATA") or None)
-    home = folder / "home"
+    home, url = folder / "home", server.url
     prepare_database(url, upgrade=True).engine.dispose()
     settings = Settings(home=home, database_url=url, data=data.root, allow_database_owner=True)
     with open_ground(home, data, database_url=url) as ground:
-        measured = Measured(ground, settings, archive, folder)
+        measured = Measured(ground, settings, archive, folder, Processor(server.part))
         measured.whole_pass()
         with ground.database.reading() as connection:
             spacecraft = _number(connection, "SELECT ccsds_id FROM vehicles")
@@ -264,6 +306,7 @@ def simulate(
         year = Year(ground, period_s)
         print(json.dumps({"rows_of_a_pass": year.rows}), file=sys.stderr, flush=True)
         sizes = [measured.figures(year, spacecraft, stop, rounds)]
+        print(json.dumps(sizes[-1]), file=sys.stderr, flush=True)
         each = max(round(days * 86_400 / period_s / QUARTERS), 1)
         for _ in range(QUARTERS):
             before = database_octets(ground)
@@ -299,7 +342,7 @@ def main() -> int:
             archive = Path(name) / "archive"
             emulate(load_scenario(given.scenario), find_data(os.environ.get("LINNA_DATA") or None), archive)
         with PostgresServer(Path(server_name)) as server:
-            figures = simulate(Path(name), server.url, archive, given.passes_a_day, given.days, given.rounds)
+            figures = simulate(Path(name), server, archive, given.passes_a_day, given.days, given.rounds)
     print(json.dumps({"year": figures}, indent=1))
     return 0
 

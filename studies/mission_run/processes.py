@@ -39,7 +39,7 @@ def cpu_s(process: int) -> float | None:
     """Return the processor time of a running process in s; None if it is not known."""
     try:
         words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-        return round((int(words[11]) + int(words[12])) / _TICKS_PER_SECOND, 1)
+        return (int(words[11]) + int(words[12])) / _TICKS_PER_SECOND
     except (OSError, ValueError, IndexError):
         return None
 
@@ -57,7 +57,7 @@ def family_mib(process: int) -> float | None:
 def family_cpu_s(process: int) -> float | None:
     """Return the processor time of a process and its running descendants in s; None if it is not known."""
     known = [one for one in map(cpu_s, (process, *descendants(process))) if one is not None]
-    return round(sum(known), 1) if known else None
+    return sum(known) if known else None
 
 
 @dataclass(slots=True)
