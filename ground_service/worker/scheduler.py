@@ -26,8 +26,8 @@ from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
 log = logging.getLogger(__name__)
 
 LEASE = "scheduler"
-LEASE_NS = 12_000_000_000
-TICK_S = 3.0
+LEASE_NS = 8_000_000_000
+TICK_S = 2.0
 """Interval of the work; the work of a killed process is continued after `LEASE_NS` and at most one interval."""
 
 NIGHT_NS = 1_800_000_000_000
