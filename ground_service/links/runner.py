@@ -44,6 +44,9 @@ REST_S = 2.0
 
 SPOOL_LIMIT_OCTETS = 256 << 20
 RETRY_S = 1.0
+REFUSED_S = 0.5
+"""Time after which a station that has refused a transmission is asked again."""
+
 MISSED_S = 1.0
 INCOMING = "incoming"
 LOCK = "lock"
@@ -88,7 +91,7 @@ class LinkRunner:
         self._contact: ContactRow | None = None
         self._shown: tuple[str, str | None] | None = None
         self._ingest_fault: str | None = None
-        self._renewed_s = self._missed_s = self._sent_s = 0.0
+        self._renewed_s = self._missed_s = self._sent_s = self._refused_until_s = 0.0
         self._acknowledged = 0
         self._last_block_s = 0.0
         self._repeated_for: int | None = None
@@ -291,21 +294,46 @@ class LinkRunner:
         if time.monotonic() - self._sent_s < TICK_S:
             return
         self._sent_s = time.monotonic()
-        requested, number = service.send_due(self._ground, self._name)
+        due = service.send_due(self._ground, self._name)
         automatic = self.declared.link.send == "automatic" and self._contact is not None
-        if not (automatic or requested):
+        may_take = automatic or due.requested
+        # A station that confirms can say at any time whether it has sent a transmission.
+        if not (may_take or (due.pending and self.declared.link.confirm)):
             return
-        if not self._up.connect() or not self._up.discard_input():
+        if time.monotonic() < self._refused_until_s or not self._up.connect() or not self._up.discard_input():
             return
         if self._contact is not None and self._repeated_for != self._contact.id and self._progress.ingested:
             service.repeat_unconfirmed(self._ground, self.declared, self._contact)
             self._repeated_for = self._contact.id
-        for one in service.take_transmissions(self._ground, self.declared, self._owner):
-            if not self._transmit(self._up, one):
+        transmissions = (
+            service.take_transmissions(self._ground, self.declared, self._owner)
+            if may_take
+            else service.pending_transmissions(self._ground, self._name)
+        )
+        for one in transmissions:
+            if self._transmit(self._up, one):
+                self._note_transmitted(one)
+            elif not self._is_handed_over(self._up, one):
                 return
-            self._note_transmitted(one)
-        if requested:
-            service.note_sent_request(self._ground, self._name, self._owner, number)
+        if due.requested:
+            service.note_sent_request(self._ground, self._name, self._owner, due.request)
+
+    def _is_handed_over(self, up: Connector, transmission: TransmissionRow) -> bool:
+        """Give a transmission that the station has refused to the link in contact; return whether there is one.
+
+        A contact ends for this link after a silence only: until then it can take telecommands that another station
+        has to send.
+        """
+        if not (self.declared.link.confirm and up.connected):
+            return False  # the station did not refuse it, and may have sent it
+        other = service.hand_over(self._ground, self.declared, transmission)
+        if other is None:
+            self._refused_until_s = time.monotonic() + REFUSED_S
+            return False
+        log.info(
+            "link %s: telecommands %s given to link %s", self._name, list(transmission.telecommands), other
+        )
+        return True
 
     def _transmit(self, up: Connector, transmission: TransmissionRow) -> bool:
         """Send a transmission; return whether it is on the wire, or at a station that confirms it.
@@ -350,13 +378,13 @@ class LinkRunner:
                 service.end_contact(self._ground, self._contact.id, self._name, mission_now_ns())
                 self._contact = None
         if link.uplink is not None:
-            requested, number = service.send_due(self._ground, self._name)
-            if link.send == "automatic" or requested:
+            due = service.send_due(self._ground, self._name)
+            if link.send == "automatic" or due.requested:
                 for one in service.take_transmissions(self._ground, self.declared, self._owner):
                     _write_transmission(Path(link.uplink), one, link.format)
                     self._note_transmitted(one)
-                if requested:
-                    service.note_sent_request(self._ground, self._name, self._owner, number)
+                if due.requested:
+                    service.note_sent_request(self._ground, self._name, self._owner, due.request)
         self._show("connected", self._ingest_fault)
         self._stopping.wait(TICK_S * 5)
 

@@ -3,7 +3,8 @@
 A transmission is taken in one transaction with the state "sent" of its telecommands, and marked when its octets are on
 the wire. A process that ends between the two leaves a pending transmission, which the next owner of the link sends.
 Telecommands of which nothing was heard by the next contact are transmitted again: the payload refuses the second copy
-of a command that it has accepted.
+of a command that it has accepted. A transmission that its station refuses, because another one has the contact now, is
+given to the link of that station.
 """
 
 from __future__ import annotations
@@ -59,6 +60,15 @@ class DeclaredLink:
     def station(self) -> str:
         """Name of the station; that of the link if it is not stated."""
         return self.link.station or self.link.name
+
+
+@dataclass(frozen=True, slots=True)
+class SendDue:
+    """Whether a transmission was requested, the number of the request, and whether transmissions are pending."""
+
+    requested: bool
+    request: int
+    pending: bool
 
 
 def declared_links(ground: Ground) -> dict[str, DeclaredLink]:
@@ -344,13 +354,14 @@ def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: 
     return len(missed)
 
 
-def send_due(ground: Ground, name: str) -> tuple[bool, int]:
-    """Return whether a transmission was requested, and the number of the request."""
+def send_due(ground: Ground, name: str) -> SendDue:
+    """Return what is to be sent over a link."""
     with ground.database.reading() as connection:
         found = store.find_link(connection, name)
+        pending = bool(store.pending_transmissions(connection, name))
     if found is None:
-        return False, 0
-    return found.send_requested > found.send_done, found.send_requested
+        return SendDue(requested=False, request=0, pending=pending)
+    return SendDue(found.send_requested > found.send_done, found.send_requested, pending)
 
 
 def note_sent_request(ground: Ground, name: str, owner: str, number: int) -> None:
@@ -391,6 +402,27 @@ def take_transmissions(ground: Ground, declared: DeclaredLink, owner: str) -> li
                 taken_utc_ns=mission_now_ns(),
             )
         return store.pending_transmissions(connection, name)
+
+
+def pending_transmissions(ground: Ground, name: str) -> list[TransmissionRow]:
+    """Return the transmissions of a link that may not be on the wire, in order."""
+    with ground.database.reading() as connection:
+        return store.pending_transmissions(connection, name)
+
+
+def hand_over(ground: Ground, declared: DeclaredLink, transmission: TransmissionRow) -> str | None:
+    """Give a transmission that the station of a link has refused to the link that has the contact; its name.
+
+    None: no other link of the spacecraft has a contact now and sends by itself in the same format.
+    """
+    name = declared.link.name
+    with ground.database.writing() as connection:
+        other = _other_in_contact(connection, declared)
+        if other is None or not store.hand_over(connection, transmission.id, name, other):
+            return None
+        detail = {"telecommands": list(transmission.telecommands), "from": name, "to": other}
+        audit(connection, ACTOR, "hand over transmission", str(transmission.id), detail)
+    return other
 
 
 def note_transmitted(ground: Ground, transmission: TransmissionRow, contact_id: int | None) -> None:
@@ -583,6 +615,20 @@ def _of_other_links(
         for row in rows
         if row.link in names and row.state != "missed"
     ]
+
+
+def _other_in_contact(connection: Connection, declared: DeclaredLink) -> str | None:
+    """Return the operated link of the same spacecraft whose contact began last, other than this link."""
+    found: list[tuple[int, str]] = []
+    for name, one in _declared(connection).items():
+        same = (one.spacecraft_id, one.link.instance) == (declared.spacecraft_id, declared.link.instance)
+        sends = one.link.uplink is not None and one.link.send == "automatic"
+        if name == declared.link.name or not same or not sends or one.link.format != declared.link.format:
+            continue
+        row, contact = store.find_link(connection, name), store.open_contact(connection, name)
+        if contact is not None and row is not None and row.owner and row.lease_utc_ns >= utc_now_ns():
+            found.append((contact.start_utc_ns, name))
+    return max(found)[1] if found else None
 
 
 def _is_unheard(contact: PredictedContact, elsewhere: Sequence[core.Span]) -> bool:

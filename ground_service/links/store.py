@@ -246,6 +246,12 @@ def repeat_transmission(connection: Connection, transmission_id: int, link: str,
     return change_if(connection, _TRANSMISSIONS, transmission_id, found, transmitted_utc_ns=None, link=link)
 
 
+def hand_over(connection: Connection, transmission_id: int, link: str, other: str) -> bool:
+    """Give a transmission that is not on the wire from one link to another; return whether this call did it."""
+    found = {"transmitted_utc_ns": None, "link": link}
+    return change_if(connection, _TRANSMISSIONS, transmission_id, found, link=other)
+
+
 def note_transmitted(
     connection: Connection, transmission_id: int, contact_id: int | None, utc_ns: int
 ) -> None:

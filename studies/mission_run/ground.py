@@ -85,7 +85,13 @@ class MissionGround:
 
         def is_sent() -> bool:
             declared = links.declared_links(self.ground).values()
-            return not any(links.unsent(self.ground, one) for one in declared if one.station == station)
+            vehicles = {(one.spacecraft_id, one.link.instance) for one in declared if one.station == station}
+            # A link whose contact has ended may have taken some, which it gives to the link in contact.
+            return not any(
+                links.unsent(self.ground, one)
+                for one in declared
+                if (one.spacecraft_id, one.link.instance) in vehicles
+            )
 
         self._wait(is_sent, "telecommands sent")
 

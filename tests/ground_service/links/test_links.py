@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select
 
 from ground_service.clock import mission_now_ns, set_mission_clock, utc_now_ns
 from ground_service.commanding.service import enter_command, get_command, release_command
@@ -534,6 +535,83 @@ def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_i
         assert packets_of(octets[-1]) == octets_of(either, keys)
     finally:
         station.close()
+
+
+def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
+    either: Ground, stream: bytes
+) -> None:
+    """At a handover the link of the first station does not know yet that its contact has ended."""
+    first, second = Confirming(*[0] * 1000), Confirming()
+    try:
+        declare(
+            either,
+            first.link("confirm = true")
+            + second.link("confirm = true")
+            .replace('"lab"', '"other"')
+            .replace("silence_s = 1.0", "silence_s = 60.0"),
+        )
+        declared = service.declared_links(either)["other"]
+        assert service.acquire(either, declared, "there", 15_000_000_000)
+        other = LinkRunner(either, declared, "there")
+        with operated(either) as runner:
+            other.start()
+            try:
+                first.accept().sendall(stream[: 2 * CADU])
+                until(lambda: service.find_open_contact(either, "lab"), "the first contact")
+                keys = released(either, 2)
+                until(lambda: first.transmissions, "the refused transmission")
+                # Also when its contact has ended, the station is asked.
+                until(
+                    lambda: service.find_open_contact(either, "lab") is None, "the end of the first contact"
+                )
+                assert not second.transmissions and runner.commands_unsent == 2
+                second.accept().sendall(stream[2 * CADU : 4 * CADU])
+                until(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
+            finally:
+                other.stop()
+        ((_, octets),) = second.transmissions
+        assert packets_of(octets) == octets_of(either, keys)
+        assert len({number for number, _ in first.transmissions + second.transmissions}) == 1
+        with either.database.reading() as connection:
+            query = select(repository.AUDIT.c.detail).where(
+                repository.AUDIT.c.action == "hand over transmission"
+            )
+            (detail,) = connection.execute(query).scalars()
+        assert detail == {"telecommands": keys, "from": "lab", "to": "other"}
+    finally:
+        first.close()
+        second.close()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ('format = "packets"', ""),
+        ('send = "manual"', ""),
+        ('instance = "twin"', ""),
+        ("", "released"),
+        ("", "ended"),
+    ],
+)
+def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
+    either: Ground, station: Station, change: tuple[str, str]
+) -> None:
+    section, event = change
+    declare(either, station.link() + station.link(section).replace('"lab"', '"other"'))
+    lab, other = (service.declared_links(either)[name] for name in ("lab", "other"))
+    released(either)
+    for one in (lab, other):
+        assert service.acquire(either, one, "here", 15_000_000_000)
+        assert service.start_contact(either, one, utc_now_ns()) is not None
+    (transmission,) = service.take_transmissions(either, lab, "here")
+    if event == "released":
+        service.release(either, "other", "here")
+    elif event == "ended":
+        contact = service.find_open_contact(either, "other")
+        assert contact is not None
+        service.end_contact(either, contact.id, "other", utc_now_ns())
+    assert service.hand_over(either, lab, transmission) is None
+    assert [one.id for one in service.pending_transmissions(either, "lab")] == [transmission.id]
 
 
 def test_the_next_owner_knows_when_a_contact_was_heard_last(
