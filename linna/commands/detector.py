@@ -22,6 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     _add_train(verbs)
     _add_export(verbs)
+    _add_calibrate(verbs)
     _add_evaluate(verbs)
     _detector_studies.configure(verbs)
     _detector_make.configure(verbs)
@@ -123,6 +124,31 @@ def _add_export(verbs: Any) -> None:
     )
     add_json_flag(export)
     export.set_defaults(handler=_export)
+
+
+def _add_calibrate(verbs: Any) -> None:
+    from linna.output import add_json_flag
+    from payload_emulator.flight.vision.calibration import PARTS
+
+    calibrate = verbs.add_parser(
+        "calibrate",
+        help="fit scores by size, position errors and the pull of the Sun on validation frames, and store them",
+    )
+    add_model(calibrate)
+    calibrate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    calibrate.add_argument("--out", type=Path, required=True, metavar="M.onnx")
+    calibrate.add_argument(
+        "--parts", nargs="*", choices=PARTS, default=list(PARTS), help="what is stored (default: all)"
+    )
+    calibrate.add_argument(
+        "--probability",
+        type=float,
+        default=0.5,
+        metavar="P",
+        help="on board a detection is used from this probability of being a catalogued crater (default: 0.5)",
+    )
+    add_json_flag(calibrate)
+    calibrate.set_defaults(handler=_calibrate)
 
 
 def _add_evaluate(verbs: Any) -> None:
@@ -241,6 +267,27 @@ def _export(arguments: argparse.Namespace) -> int:
         test=arguments.test,
     )
     emit(arguments, figures)
+    return 0
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit, progress
+    from payload_emulator.training.data.dataset import Dataset, write_whole
+    from payload_emulator.training.model.fit_calibration import fit_calibration, format_calibration_figures
+
+    if not 0.0 < arguments.probability < 1.0:
+        raise UsageError(f"--probability: expected a value between 0 and 1, found {arguments.probability:g}")
+    octets, document = fit_calibration(
+        model_octets(arguments.model),
+        [Dataset(folder) for folder in arguments.dataset],
+        arguments.parts,
+        arguments.probability,
+        lambda frames: progress(frames, len(frames), "calibrate", "frames"),
+    )
+    sha256 = write_whole(arguments.out, octets)
+    document = {"model": str(arguments.out), "sha256": sha256, **document}
+    emit(arguments, document, format_calibration_figures(document))
     return 0
 
 

@@ -225,3 +225,17 @@ def test_making_from_no_recipe_is_refused(tmp_path, capsys):
     pytest.importorskip("torch")
     assert run(["detector", "make", str(tmp_path / "r.toml"), "--out", str(tmp_path)]) == 2
     assert "expected a TOML file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("probability", ["0", "1", "-0.5", "nan"])
+def test_a_probability_outside_zero_and_one_is_refused_before_any_work(capsys, tmp_path, probability):
+    command = ["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(tmp_path / "m.onnx")]
+    assert run([*command, f"--probability={probability}"]) == 2
+    assert "expected a value between 0 and 1" in capsys.readouterr().err
+
+
+def test_a_calibration_without_a_data_set_leaves_no_file(capsys, tmp_path):
+    out = tmp_path / "m.onnx"
+    assert run(["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(out)]) == 2
+    assert "expected a data set" in capsys.readouterr().err
+    assert not out.exists()

@@ -91,7 +91,7 @@ class AnchoredParameters:
         Sigma per axis of a detection if the detector gives none; smallest accepted sigma; factor on the detector's
         sigma.
     detection_persistence
-        Share of a detection's variance that is common to all frames of a crater.
+        Share of a detection's variance that is common to all frames of a crater, where the detector does not state it.
     tracking_limit_m
         Largest position sigma with which the search uses a linear prediction; above it, the search uses votes. It is
         valid at mission altitudes and grows above them (`ground_scale`).

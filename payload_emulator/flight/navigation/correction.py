@@ -63,7 +63,8 @@ def correct(
     index = sighting.index[identification.sighted]
     uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
     variance = variance[identification.detection]
-    sigma_m = crater_sigma_m(landmarks.sigma_m[index], variance, altitude_m, camera, parameters)
+    persistence = detection_persistence(found, parameters)[identification.detection]
+    sigma_m = crater_sigma_m(landmarks.sigma_m[index], variance * persistence, altitude_m, camera, parameters)
     update = kalman.update(
         prior.with_craters(index, sigma_m),
         pose.camera_from_icrf,
@@ -71,7 +72,7 @@ def correct(
         landmarks,
         index,
         uv,
-        fresh_variance_px2(variance, parameters),
+        fresh_variance_px2(variance * (1.0 - persistence), parameters),
         camera,
         parameters.errors,
     )
@@ -85,7 +86,7 @@ def correct(
 
 def crater_sigma_m(
     catalogue_sigma_m: FloatArray,
-    variance_px2: FloatArray,
+    lasting_variance_px2: FloatArray,
     altitude_m: float,
     camera: PinholeCamera,
     parameters: AnchoredParameters,
@@ -95,16 +96,22 @@ def crater_sigma_m(
     It is that of the catalogue (n, 3) and the part of the detector's error that is the same in every frame.
     """
     altitude_m = max(altitude_m, parameters.limits.lowest_altitude_m)
-    lasting_px = np.sqrt(variance_px2 * parameters.detection_persistence)
+    lasting_px = np.sqrt(lasting_variance_px2)
     sigma_m = catalogue_sigma_m.copy()
     sigma_m[:, :2] = np.hypot(sigma_m[:, :2], (lasting_px * altitude_m / camera.focal_px)[:, None])
     return sigma_m
 
 
+def detection_persistence(found: Detections, parameters: AnchoredParameters) -> FloatArray:
+    """Return the share of each detection's variance that is the same in every frame of its crater, shape (n,)."""
+    if found.persistence is None:
+        return np.full(len(found), parameters.detection_persistence)
+    return found.persistence
+
+
 def fresh_variance_px2(variance_px2: FloatArray, parameters: AnchoredParameters) -> FloatArray:
-    """Return the part of each detection's variance that is new in every frame, shape (n,)."""
-    fresh = variance_px2 * (1.0 - parameters.detection_persistence)
-    return np.maximum(fresh, parameters.limits.smallest_variance_px2)
+    """Return variances (n,) that are new in every frame, not below the repeatability of any detector."""
+    return np.maximum(variance_px2, parameters.limits.smallest_variance_px2)
 
 
 def is_plausible(prior: FilterState, posterior: FilterState, limits: AnchoredLimits) -> bool:

@@ -34,9 +34,11 @@ class Detections:
     score
         Confidence, 0 to 1.
     sigma_px
-        Standard deviation of the centre along each axis.
+        Standard deviation of the centre along each axis, errors of the catalogue not included.
     depth_ratio
         Depth over diameter as it looks: about 0.2 fresh, under `DEGRADED_DEPTH_RATIO` worn down.
+    persistence
+        Share of the variance `sigma_px**2` that is the same in every frame of the crater; None where it is not known.
     size_class, diameter_m
         Of a detector that gives classes and no sizes: the class (0, 1, 2), and as a prior of the size the median
         diameter of that class; None otherwise. Its `diameter_px` is NaN until `with_prior_sizes`.
@@ -50,6 +52,7 @@ class Detections:
     depth_ratio: FloatArray | None = None
     size_class: IntArray | None = None
     diameter_m: FloatArray | None = None
+    persistence: FloatArray | None = None
 
     def __len__(self) -> int:
         return int(self.u_px.shape[0])
@@ -64,7 +67,7 @@ class Detections:
             self.sigma_px[which],
             *(
                 None if values is None else values[which]
-                for values in (self.depth_ratio, self.size_class, self.diameter_m)
+                for values in (self.depth_ratio, self.size_class, self.diameter_m, self.persistence)
             ),
         )
 

@@ -95,8 +95,9 @@ def search_picture(
     found = detector.search(upright)
     if two_scales:
         found = _merge(found, _search_enlarged(detector, upright), detector)
-    u_px, v_px = turn_back(found.u_px, found.v_px, turns, *prepared.gray.shape)
-    found = detector.to_rim_plane(replace(found, u_px=u_px, v_px=v_px), *prepared.gray.shape)
+    height_px, width_px = prepared.gray.shape
+    u_px, v_px = turn_back(found.u_px, found.v_px, turns, height_px, width_px)
+    found = detector.corrected(replace(found, u_px=u_px, v_px=v_px), height_px, width_px, sun_in_camera)
     return PictureSearch(ImageQuality.OK, found, estimate)
 
 
@@ -106,7 +107,9 @@ def find_sun(detector: OnnxDetector, gray: NDArray[np.float32]) -> SunEstimate |
     evidence = np.zeros(4)
     found: list[list[Detections]] = []
     for turns in range(4):
-        found.append([detector.search(np.rot90(square, turns), EVIDENCE_SCORE) for square in squares])
+        found.append(
+            [detector.search(np.rot90(square, turns), EVIDENCE_SCORE, calibrated=False) for square in squares]
+        )
         evidence[turns] = sum(float((part.score**EVIDENCE_POWER).sum()) for part in found[-1])
     if not evidence.any():
         return None

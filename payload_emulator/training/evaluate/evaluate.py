@@ -168,8 +168,9 @@ def run(
                 f.values["sun_elevation_deg"],
                 f.values["ground_m"],
                 f.source,
+                (f.values["altitude_m"] - f.values["ground_m"]) / d.focal_px,
             )
-            for _, f in frames
+            for d, f in frames
         ],
         thresholds,
     )
@@ -339,6 +340,16 @@ def _bias_lines(figures: dict[str, Any]) -> list[str]:
         for row in figures["bias_px_by_sun_octant"]
         if row["pairs"]
     ]
+    alone = figures.get("bias_px_registered")
+    if alone is not None:
+        lengths = ", ".join(
+            f"{row['length_px']:.2f} ({row['noise_px']:.2f})"
+            for row in figures["bias_px_by_sun_octant_registered"]
+        )
+        lines.append(
+            f"bias without registration: longest by Sun octant {alone['worst_octant_px']:.2f} px "
+            f"(noise {alone['worst_octant_noise_px']:.2f}); by octant (noise) {lengths}"
+        )
     rims = figures.get("against_rims")
     if rims is not None:
         lines.append(

@@ -23,6 +23,7 @@ FEWEST_PAIRS = 20
 
 _BIAS_CELLS = 4  # per side of the bias map: finer cells hold too few craters for a tenth of a pixel
 _ROUNDS = 400
+_ALTERNATIONS = 12
 
 
 def right(tallied: Tally, threshold: float) -> BoolArray:
@@ -115,6 +116,50 @@ def _resampled_means(errors: FloatArray, frame: IntArray) -> FloatArray:
     drawn = np.random.default_rng(0).integers(0, count.size, (_ROUNDS, count.size))
     means: FloatArray = sums[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None]
     return means
+
+
+def without_registration(
+    tallied: Tally, threshold: float, m_per_px: FloatArray
+) -> tuple[Tally, list[dict[str, float | int]]]:
+    """A tally whose errors lack the displacement of the catalogue from the ground, and that displacement by block.
+
+    Terrain and catalogue differ by tens of metres that are the same for all frames of a block of ground, whatever the
+    Sun. Their mean over the block is estimated together with the means of the octants, whose own mean is taken as zero:
+    a shift of all octants in the image is thus counted as registration. `m_per_px` (frames,) is the ground that a pixel
+    covers. Detections of blocks with fewer than twice `FEWEST_PAIRS` right ones are left out.
+    """
+    hit = right(tallied, threshold)
+    blocks, place = np.unique(tallied.detection_block, return_inverse=True)
+    pairs = np.bincount(place[hit], minlength=blocks.size)
+    judged = pairs[place] >= 2 * FEWEST_PAIRS if blocks.size else np.zeros(0, dtype=bool)
+    error = np.stack([tallied.error_u, tallied.error_v], axis=1)
+    step = 1.0 / m_per_px[tallied.detection_frame.astype(int)]
+    used = np.flatnonzero(hit & judged)
+    offset, octants = np.zeros((blocks.size, 2)), np.zeros((8, 2))
+    for _ in range(_ALTERNATIONS):
+        rest = error[used] - octants[tallied.detection_octant[used].astype(int)]
+        square = np.bincount(place[used], weights=step[used] ** 2, minlength=blocks.size)
+        for axis in range(2):
+            moment = np.bincount(place[used], weights=step[used] * rest[:, axis], minlength=blocks.size)
+            offset[:, axis] = moment / np.where(square > 0.0, square, 1.0)
+        rest = error[used] - offset[place[used]] * step[used, None]
+        octant = tallied.detection_octant[used].astype(int)
+        count = np.maximum(np.bincount(octant, minlength=8), 1)
+        for axis in range(2):
+            octants[:, axis] = np.bincount(octant, weights=rest[:, axis], minlength=8) / count
+        octants -= octants[np.bincount(octant, minlength=8) > 0].mean(axis=0) if used.size else 0.0
+    moved = error - offset[place] * step[:, None]
+    rows: list[dict[str, float | int]] = [
+        {
+            "block": int(blocks[k]),
+            "pairs": int(pairs[k]),
+            "east_m": float(offset[k, 0]),
+            "north_m": float(-offset[k, 1]),
+        }
+        for k in np.flatnonzero(pairs >= 2 * FEWEST_PAIRS)
+    ]
+    left = replace(tallied, error_u=moved[:, 0], error_v=moved[:, 1])
+    return left.select(judged, np.ones(tallied.crater_id.size, dtype=bool)), rows
 
 
 def bias_map(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> list[dict[str, Any]]:

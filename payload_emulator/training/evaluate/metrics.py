@@ -21,6 +21,7 @@ from payload_emulator.training.evaluate.localisation import (
     middle,
     radial_scale,
     right,
+    without_registration,
 )
 from payload_emulator.training.evaluate.scoring import (
     DEGRADATION_EDGES,
@@ -54,6 +55,7 @@ class Scene:
     sun_elevation_deg: float
     ground_m: float
     source: str
+    m_per_px: float = float("nan")  # ground that a pixel covers below the camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +140,7 @@ def score(
         "by_image_radius_px": _by_radius(pair, threshold, truths),
         "bias_px_by_sun_octant": octants,
         "bias_px": bias_overall(strict, threshold, truths, octants),
+        **_registered_bias(strict, threshold, truths, scenes),
         "bias_map": bias_map(strict, threshold, truths),
         "radial_scale": radial_scale(fair, threshold, truths),
         "sigma_calibration": {
@@ -237,6 +240,22 @@ def _visible(
         **_with_interval(part, threshold),
         "visibility": VISIBLE,
         "unknown": int(np.isnan(every).sum()),
+    }
+
+
+def _registered_bias(
+    strict: Tally, threshold: float, truths: Sequence[FrameTruth], scenes: Sequence[Scene]
+) -> dict[str, Any]:
+    """Bias by octant of the Sun without the displacement of the catalogue from the ground, which is no detector's."""
+    m_per_px = np.array([scene.m_per_px for scene in scenes])
+    if not np.isfinite(m_per_px).all():
+        return {}
+    moved, registration = without_registration(strict, threshold, m_per_px)
+    octants = bias_by_octant(moved, threshold, truths)
+    return {
+        "bias_px_by_sun_octant_registered": octants,
+        "bias_px_registered": bias_overall(moved, threshold, truths, octants),
+        "registration_m": registration,
     }
 
 

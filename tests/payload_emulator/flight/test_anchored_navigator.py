@@ -216,15 +216,18 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit: Orbit) -> None
     variance = association.detection_variance_px2(replace(found, sigma_px=sigma), parameters)
     # Unknown: 1.5 px; given: twice what it says; never below 0.5 px.
     np.testing.assert_allclose(variance[:3], [9.0, 4.0, 0.25])
-    np.testing.assert_allclose(correction.fresh_variance_px2(variance, parameters)[:3], [6.3, 2.8, 0.175])
-    np.testing.assert_allclose(correction.fresh_variance_px2(np.array([0.05]), parameters), [0.04])
+    share = correction.detection_persistence(found, parameters)
+    np.testing.assert_allclose(share, 0.3)
+    fresh = correction.fresh_variance_px2(variance * (1.0 - share), parameters)
+    np.testing.assert_allclose(fresh[:3], [6.3, 2.8, 0.175])
+    np.testing.assert_allclose(correction.fresh_variance_px2(np.array([0.035]), parameters), [0.04])
     index = np.array([3, 8])
     altitude_m, low_m = 30_000.0, 400.0
     catalogue_m = navigator.state.landmarks.sigma_m[index]
     lasting = correction.crater_sigma_m(
-        catalogue_m, np.array([4.0, 9.0]), altitude_m, orbit.case.camera, parameters
+        catalogue_m, np.array([1.2, 2.7]), altitude_m, orbit.case.camera, parameters
     )
-    low = correction.crater_sigma_m(catalogue_m, np.array([4.0, 9.0]), low_m, orbit.case.camera, parameters)
+    low = correction.crater_sigma_m(catalogue_m, np.array([1.2, 2.7]), low_m, orbit.case.camera, parameters)
     focal_px = 256.0 / np.tan(np.radians(60.0))
     for row, px2 in enumerate((4.0, 9.0)):
         across = np.hypot(60.0, np.sqrt(0.3 * px2) * altitude_m / focal_px)
@@ -234,6 +237,14 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit: Orbit) -> None
         np.testing.assert_allclose(low[row], [across, across, 60.0], rtol=1e-12)
     # The map itself is left alone.
     np.testing.assert_allclose(navigator.state.landmarks.sigma_m[index], 60.0)
+
+
+def test_a_share_that_the_detector_states_replaces_the_parameter(orbit: Orbit) -> None:
+    navigator = orbit.navigator(detection_persistence=0.3)
+    found = orbit.detections(0)
+    stated = np.linspace(0.0, 0.95, len(found))
+    share = correction.detection_persistence(replace(found, persistence=stated), navigator.setup.parameters)
+    np.testing.assert_allclose(share, stated)
 
 
 def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_so_often(orbit: Orbit) -> None:

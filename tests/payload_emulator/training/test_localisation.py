@@ -7,7 +7,12 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.training.data.dataset import Frame, frame_truth
 from payload_emulator.training.data.refits import load_refitted, refitted_frame
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.localisation import against_rims, bias_by_octant, bias_overall
+from payload_emulator.training.evaluate.localisation import (
+    against_rims,
+    bias_by_octant,
+    bias_overall,
+    without_registration,
+)
 from payload_emulator.training.evaluate.scoring import FrameDetections, tally
 from tmtc.tables import CatalogueTable, pack_catalogue_table
 
@@ -148,3 +153,71 @@ def test_a_file_that_is_no_table_of_rims_is_refused(tmp_path):
     path.write_text("id,lat,lon\n")
     with pytest.raises(DatasetError, match="expected a table of rims"):
         load_refitted(path)
+
+
+def test_registration_is_taken_out_and_the_pull_of_the_sun_stays():
+    rng = np.random.default_rng(4)
+    frames, m_per_px = [], []
+    for number in range(240):
+        azimuth = rng.uniform(-np.pi, np.pi)
+        scale = rng.uniform(80.0, 300.0)
+        u, v = (
+            part.ravel() for part in np.meshgrid(np.arange(60.0, 480.0, 100.0), np.arange(60.0, 480.0, 100.0))
+        )
+        n = u.size
+        truth = FrameTruth(
+            u,
+            v,
+            np.full(n, 30.0),
+            np.full(n, 7e3),
+            np.full(n, 0.1),
+            np.arange(n),
+            512,
+            512,
+            azimuth,
+            number % 3,
+        )
+        # 60 m east and 90 m south in one block, the reverse in another; 0.4 px toward the Sun everywhere.
+        east, south = ((60.0, 90.0), (-60.0, -90.0), (0.0, 0.0))[number % 3]
+        moved_u = u + east / scale + 0.4 * np.sin(azimuth) + rng.normal(0.0, 0.3, n)
+        moved_v = v + south / scale - 0.4 * np.cos(azimuth) + rng.normal(0.0, 0.3, n)
+        found = FrameDetections(
+            moved_u, moved_v, np.full(n, 30.0), np.full(n, 7e3), np.full(n, 0.9), np.ones(n)
+        )
+        frames.append((truth, found))
+        m_per_px.append(scale)
+    tallied = tally([truth for truth, _ in frames], [found for _, found in frames])
+    moved, rows = without_registration(tallied, 0.5, np.array(m_per_px))
+    assert [row["block"] for row in rows] == [0, 1, 2]
+    for row, (east, south) in zip(rows, ((60.0, 90.0), (-60.0, -90.0), (0.0, 0.0)), strict=True):
+        assert row["east_m"] == pytest.approx(east, abs=6.0)
+        assert row["north_m"] == pytest.approx(-south, abs=6.0)
+    octants = bias_by_octant(moved, 0.5, [truth for truth, _ in frames])
+    # The mean of a vector of 0.4 px over an octant is 0.39 px long.
+    assert [row["length_px"] for row in octants] == pytest.approx([0.39] * 8, abs=0.06)
+    assert [row["toward_sun_px"] for row in octants] == pytest.approx([0.4] * 8, abs=0.06)
+
+
+def test_blocks_of_few_pairs_are_left_out_without_registration():
+    truth = FrameTruth(
+        np.array([100.0]),
+        np.array([100.0]),
+        np.array([30.0]),
+        np.array([7e3]),
+        np.array([0.1]),
+        np.array([1]),
+        512,
+        512,
+        0.0,
+        5,
+    )
+    found = FrameDetections(
+        np.array([101.0]),
+        np.array([100.0]),
+        np.array([30.0]),
+        np.array([7e3]),
+        np.array([0.9]),
+        np.array([1.0]),
+    )
+    moved, rows = without_registration(tally([truth], [found]), 0.5, np.array([200.0]))
+    assert rows == [] and moved.score.size == 0 and moved.crater_id.size == 1
