@@ -24,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_export(verbs)
     _add_calibrate(verbs)
     _add_evaluate(verbs)
+    _add_compare(verbs)
     _detector_studies.configure(verbs)
     _detector_make.configure(verbs)
     _detector_domain.configure(verbs)
@@ -189,6 +190,26 @@ def _add_evaluate(verbs: Any) -> None:
     evaluate.set_defaults(handler=_evaluate)
 
 
+def _add_compare(verbs: Any) -> None:
+    from linna.output import add_json_flag
+
+    compare = verbs.add_parser("compare", help="two networks on the same frames, with paired intervals")
+    compare.add_argument("model", type=Path, metavar="M.onnx", help="ONNX file or name of a shipped network")
+    compare.add_argument("reference", type=Path, metavar="REFERENCE.onnx")
+    compare.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    compare.add_argument("--split", choices=("train", "val", "test"), default="val")
+    compare.add_argument("--source", default="", help="only the frames of this source")
+    compare.add_argument(
+        "--picture",
+        type=Path,
+        default=None,
+        metavar="F.png",
+        help="draw both networks' detections on some frames",
+    )
+    add_json_flag(compare)
+    compare.set_defaults(handler=_compare)
+
+
 def _add_bench_and_info(verbs: Any) -> None:
     from linna.output import add_json_flag
 
@@ -321,6 +342,24 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         report = detector_report(detector, scored, figures, arguments.run)
         write_text(arguments.report, render_html(report))
     emit(arguments, figures, format_figures(figures))
+    return 0
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, progress
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.evaluate.compare import compare, draw_comparison, format_comparison
+
+    document, pair = compare(
+        (model_octets(arguments.model), model_octets(arguments.reference)),
+        [Dataset(folder) for folder in arguments.dataset],
+        arguments.split,
+        arguments.source,
+        lambda frames: progress(frames, len(frames), "compare", "frames"),
+    )
+    if arguments.picture is not None:
+        draw_comparison(pair, arguments.picture)
+    emit(arguments, document, format_comparison(document))
     return 0
 
 

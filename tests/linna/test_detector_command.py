@@ -239,3 +239,8 @@ def test_a_calibration_without_a_data_set_leaves_no_file(capsys, tmp_path):
     assert run(["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(out)]) == 2
     assert "expected a data set" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_comparison_without_a_data_set_is_refused(capsys, tmp_path):
+    assert run(["detector", "compare", "craters", "craters", "--dataset", str(tmp_path)]) == 2
+    assert "expected a data set" in capsys.readouterr().err

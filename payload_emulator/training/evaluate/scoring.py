@@ -406,12 +406,24 @@ def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 
 
 
 def bootstrap_f1_difference(
-    tallied: Tally, reference: Tally, threshold: float, seed: int = 0, rounds: int = 400
+    tallied: Tally,
+    reference: Tally,
+    threshold: float,
+    seed: int = 0,
+    rounds: int = 400,
+    *,
+    reference_threshold: float | None = None,
 ) -> tuple[float, float]:
-    """95 % interval of F1 less the reference's, both of the same frames, over the same resampled blocks of ground."""
+    """95 % interval of F1 less the reference's, both of the same frames, over the same resampled blocks of ground.
+
+    `reference_threshold` None takes the same threshold for both.
+    """
     both = (tallied, reference)
     blocks = np.unique(np.concatenate([c for t in both for c in (t.crater_block, t.detection_block)]))
-    one, other = (_resampled_f1(t, threshold, blocks, seed, rounds) for t in both)
+    limits = (threshold, threshold if reference_threshold is None else reference_threshold)
+    one, other = (
+        _resampled_f1(t, limit, blocks, seed, rounds) for t, limit in zip(both, limits, strict=True)
+    )
     return float(np.percentile(one - other, 2.5)), float(np.percentile(one - other, 97.5))
 
 
