@@ -107,7 +107,7 @@ def contents(ground: Ground) -> tuple[str, list[bytes]]:
 def commands_of(ground: Ground, ledger: Ledger) -> tuple[int, Counter[str]]:
     """Return the number of telecommands, and the differences between the archive and the acknowledgements."""
     lines = []
-    with ground.database.reading() as connection:
+    with ground.database.snapshot() as connection:
         rows = [dict(row) for row in connection.execute(select(repository.TELECOMMANDS)).mappings()]
         for action, target, actor in connection.execute(
             select(repository.AUDIT.c.action, repository.AUDIT.c.target, repository.AUDIT.c.actor)

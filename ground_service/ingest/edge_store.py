@@ -11,12 +11,21 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, insert, select, update
+from sqlalchemy import Connection, and_, bindparam, func, insert, select, true, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.ingest.edges import MIDDLE, OPENER, UNKNOWN, Edge
 from ground_service.ingest.stream import BARE, Link
-from ground_service.store.repository import GOOD_LINKS, KNOWN_LINKS, PIECES, STREAM_EDGES, VEHICLES
+from ground_service.store.repository import (
+    GOOD_LINKS,
+    KNOWN_LINKS,
+    MISSIONS,
+    PACKET_DECODINGS,
+    PASSES,
+    PIECES,
+    STREAM_EDGES,
+    VEHICLES,
+)
 from tmtc.link import LinkSettings
 
 DIGEST_OCTETS = 16
@@ -53,6 +62,27 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
+class Surroundings:
+    """State of the archive before a piece is read.
+
+    Attributes
+    ----------
+    revision
+        Changes when a link, good settings, a mission description or the pass of an archive is added.
+    waits
+        Whether a piece waits for more links, octets of the same file wait for others, or declared packets are decoded.
+    vehicle_id, decoded_version, redecoding_version
+        Vehicle of the spacecraft of the piece; None if there is none.
+    """
+
+    revision: tuple[int, ...]
+    waits: bool
+    vehicle_id: int | None
+    decoded_version: int | None
+    redecoding_version: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class StoredEdge:
     """Stored edge, waiting or used."""
 
@@ -71,16 +101,87 @@ class Part:
     stop: int
 
 
-def add_piece(connection: Connection, piece: Piece) -> None:
-    """Add a piece."""
-    connection.execute(insert(PIECES).values(**asdict(piece)))
+def add_piece(connection: Connection, piece: Piece, packets: int = 0, samples: int = 0) -> None:
+    """Add a piece, and what its ingest has stored."""
+    stored = {"packets_stored": packets, "samples_stored": samples}
+    connection.execute(insert(PIECES).values(**asdict(piece), **stored))
 
 
 def piece_of(connection: Connection, ingest_id: int) -> Piece:
     """Return the piece of an ingest."""
+    found = find_piece(connection, ingest_id)
+    assert found is not None
+    return found
+
+
+def find_piece(connection: Connection, ingest_id: int) -> Piece | None:
+    """Return the piece of an ingest; None if there is no such ingest."""
     columns = [PIECES.c[field.name] for field in fields(Piece)]
-    row = connection.execute(select(*columns).where(PIECES.c.ingest_id == ingest_id)).mappings().one()
-    return Piece(**row)
+    row = connection.execute(select(*columns).where(PIECES.c.ingest_id == ingest_id)).mappings().first()
+    return None if row is None else Piece(**row)
+
+
+def surroundings(connection: Connection, piece: Piece) -> Surroundings:
+    """Return the state of the archive before a piece is read, with one query."""
+    values = {"scope": piece.scope, "spacecraft_id": piece.spacecraft_id, "file_sha256": piece.file_sha256}
+    row = connection.execute(_SURROUNDINGS, values).one()
+    (*revision, waiting, edges, decodings, vehicle, decoded, redecoding) = row
+    return Surroundings(
+        tuple(int(one or 0) for one in revision),
+        bool(waiting or edges or decodings),
+        None if vehicle is None else int(vehicle),
+        decoded,
+        redecoding,
+    )
+
+
+def _surroundings_query() -> Any:
+    """Return the query of `surroundings`: aggregates of one row each, beside the vehicle if it exists."""
+    scope: Any = bindparam("scope")
+    links = select(
+        func.count().label("links"), func.coalesce(func.max(KNOWN_LINKS.c.id), 0).label("last_link")
+    ).where(KNOWN_LINKS.c.scope == scope)
+    good = select(func.max(GOOD_LINKS.c.id).label("last_good"))
+    missions = select(func.count().label("missions"), func.max(MISSIONS.c.id).label("last_mission"))
+    vehicles = VEHICLES.alias()
+    archived = (
+        select(
+            func.count().label("archived"),
+            func.sum(PASSES.c.id).label("archives"),
+            func.sum(PASSES.c.id * PASSES.c.mission_id).label("their_missions"),
+        )
+        .join(vehicles, vehicles.c.id == PASSES.c.vehicle_id)
+        .where(
+            vehicles.c.instance == scope,
+            PASSES.c.archive_digest.is_not(None),
+            PASSES.c.mission_id.is_not(None),
+        )
+    )
+    counts = [one.subquery() for one in (links, good, missions, archived)]
+    vehicle = and_(VEHICLES.c.ccsds_id == bindparam("spacecraft_id"), VEHICLES.c.instance == scope)
+    waiting = select(PIECES.c.ingest_id).where(
+        PIECES.c.scope == scope, PIECES.c.links_tried < counts[0].c.links
+    )
+    edges = select(STREAM_EDGES.c.id).where(STREAM_EDGES.c.file_sha256 == bindparam("file_sha256"))
+    decodings = select(PACKET_DECODINGS.c.vehicle_id).where(PACKET_DECODINGS.c.vehicle_id == VEHICLES.c.id)
+    return select(
+        *(column for one in counts for column in one.c),
+        waiting.exists(),
+        edges.exists(),
+        decodings.exists(),
+        VEHICLES.c.id,
+        VEHICLES.c.decoded_version,
+        VEHICLES.c.redecoding_version,
+    ).select_from(
+        counts[0]
+        .join(counts[1], true())
+        .join(counts[2], true())
+        .join(counts[3], true())
+        .join(VEHICLES, vehicle, isouter=True)
+    )
+
+
+_SURROUNDINGS = _surroundings_query()
 
 
 def count_stored(connection: Connection, ingest_id: int, packets: int, samples: int, *, joined: bool) -> None:
@@ -96,6 +197,18 @@ def count_stored(connection: Connection, ingest_id: int, packets: int, samples: 
         .where(PIECES.c.ingest_id == ingest_id)
         .values({name: PIECES.c[name] + number for name, number in added.items()})
     )
+
+
+def finish_piece(connection: Connection, ingest_id: int, packets: int, samples: int) -> tuple[int, int, int]:
+    """Record that a piece has been read and add to its totals; return them as `stored_by` does."""
+    added = {"packets_stored": packets, "samples_stored": samples}
+    row = connection.execute(
+        update(PIECES)
+        .where(PIECES.c.ingest_id == ingest_id)
+        .values(links_tried=None, **{name: PIECES.c[name] + number for name, number in added.items()})
+        .returning(PIECES.c.packets_stored, PIECES.c.packets_joined, PIECES.c.samples_stored)
+    ).one()
+    return int(row[0]), int(row[1]), int(row[2])
 
 
 def stored_by(connection: Connection, ingest_id: int) -> tuple[int, int, int]:

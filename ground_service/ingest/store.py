@@ -20,10 +20,13 @@ from ground_service.store.codec import pack_detections, pack_filter_states, pack
 from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
 from ground_service.store.rollups import add_to_rollups, forget_rollups
 from lunar.arrays import IntArray
+from tmtc.dictionary import DICTIONARY
 
 RANGE_GAP_TICKS = 600 << 16
 """Stored packets are looked up by ranges of on-board time; a silence of ten minutes splits a range, so that a batch
 with one stray packet of another year does not read the years between."""
+
+FEW_PACKETS = 64
 
 _TABLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
 _PACKETS: Any = PACKETS
@@ -205,9 +208,13 @@ def store_samples(
 
 
 def _new_packets(connection: Connection, vehicle_id: int, batch: Batch) -> IntArray:
-    """Indices of packets that are neither stored nor earlier in the same batch, in the order of their key."""
+    """Indices of packets that are neither stored nor earlier in the same batch, in the order of their key.
+
+    Stored packets of a small batch are left to the insert of PostgreSQL, which skips them.
+    """
     stored: set[bytes] = set()
-    for apid, first, last in _time_ranges(batch.apid, batch.ticks):
+    few = connection.dialect.name == "postgresql" and len(batch.octets) <= FEW_PACKETS
+    for apid, first, last in () if few else _time_ranges(batch.apid, batch.ticks):
         found = connection.execute(
             _IN_RANGE, {"vehicle_id": vehicle_id, "apid": apid, "first": first, "last": last}
         )
@@ -281,6 +288,25 @@ def add_ingest(
     )
 
 
+def add_finished(
+    connection: Connection, sha256: str, result: IngestResult, received_utc_ns: int, now_utc_ns: int
+) -> int:
+    """Add an ingest that is done; return its id."""
+    return int(
+        repository.add(
+            connection,
+            _INGESTS,
+            vehicle_id=result.vehicle_id,
+            file_sha256=sha256,
+            state="done",
+            dictionary_version=DICTIONARY.version,
+            received_utc_ns=received_utc_ns,
+            finished_utc_ns=now_utc_ns,
+            **_accounting(result),
+        )
+    )
+
+
 def get_ingest(connection: Connection, ingest_id: int) -> Ingest:
     """Return an ingest.
 
@@ -332,7 +358,7 @@ def change_result(connection: Connection, result: IngestResult) -> None:
 
 def _accounting(result: IngestResult) -> dict[str, Any]:
     times = {"first_ticks": result.first_ticks, "last_ticks": result.last_ticks}
-    return {"accounting": result.model_dump(mode="json"), **times}
+    return {"accounting": result.model_dump(mode="json", exclude={"ingest_id"}), **times}
 
 
 def results_of_vehicle(
@@ -340,7 +366,7 @@ def results_of_vehicle(
 ) -> list[tuple[str, int, IngestResult | None]]:
     """Return hash, octets and result of the ingests that may have packets of a vehicle in a time, ordered by hash."""
     query = (
-        select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.accounting)
+        select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.id, _INGESTS.c.accounting)
         .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
         .where(
             _INGESTS.c.last_ticks.is_(None)
@@ -352,7 +378,8 @@ def results_of_vehicle(
         .order_by(_INGESTS.c.file_sha256)
     )
     found = (
-        (sha256, int(octets), _result(accounting)) for sha256, octets, accounting in connection.execute(query)
+        (sha256, int(octets), _result(ingest_id, accounting))
+        for sha256, octets, ingest_id, accounting in connection.execute(query)
     )
     return [one for one in found if one[2] is None or vehicle in one[2].vehicle_ids]
 
@@ -382,12 +409,12 @@ def packets_between(
 
 
 def _ingest(row: Mapping[str, Any]) -> Ingest:
-    return Ingest.of(row, sha256=row["file_sha256"], accounting=_result(row["accounting"]))
+    return Ingest.of(row, sha256=row["file_sha256"], accounting=_result(row["id"], row["accounting"]))
 
 
-def _result(accounting: dict[str, Any]) -> IngestResult | None:
+def _result(ingest_id: int, accounting: dict[str, Any]) -> IngestResult | None:
     """Return a stored result; None without one, and for one of an earlier version."""
     try:
-        return IngestResult.model_validate(accounting)
+        return IngestResult.model_validate({**accounting, "ingest_id": ingest_id})
     except ValidationError:
         return None

@@ -12,6 +12,7 @@ import errno
 import functools
 import json
 import logging
+import math
 import os
 import re
 import sqlite3
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
 from sqlalchemy.engine import ExceptionContext
-from sqlalchemy.exc import DataError, DBAPIError, SQLAlchemyError
+from sqlalchemy.exc import DataError, DBAPIError, InvalidatePoolError, SQLAlchemyError
 
 import ground_service
 from ground_service.errors import (
@@ -44,10 +45,14 @@ from ground_service.store.files import make_durable_folder
 
 if TYPE_CHECKING:
     from alembic.config import Config
+    from sqlalchemy.pool import ConnectionPoolEntry
 
 log = logging.getLogger(__name__)
 
 BUSY_TIMEOUT_MS = 30_000
+
+_USED = "linna_used"
+"""Key of the time at which a pooled connection was last given back."""
 
 _REVISION = re.compile(r"^(revision|down_revision) = (.+)$", re.MULTILINE)
 
@@ -75,6 +80,9 @@ LOST_HOST = {
 }
 """Options of libpq with which a connection to a host that no longer answers fails within half a minute."""
 
+IDLE_S = 1.0
+"""A pooled connection that was unused for this long is tested before it is used."""
+
 SAFE_COMMITS = ("on", "remote_apply")
 """Values of synchronous_commit with which a commit is on the disk of the server, and of a synchronous standby."""
 
@@ -85,6 +93,12 @@ class Database:
 
     engine: Engine
     listeners: events.Listeners = field(default_factory=events.Listeners, compare=False, repr=False)
+    _readers: Engine = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        server = self.engine.dialect.name == "postgresql"
+        readers = self.engine.execution_options(isolation_level="AUTOCOMMIT") if server else self.engine
+        object.__setattr__(self, "_readers", readers)
 
     @property
     def dialect(self) -> str:
@@ -98,8 +112,12 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection to read with."""
-        with self._translated(), self.engine.connect() as connection:
+        """Yield a connection to read with.
+
+        On PostgreSQL each statement sees what is committed when it begins, without the messages that begin and end a
+        transaction; server-side cursors need `snapshot`.
+        """
+        with self._translated(), self._readers.connect() as connection:
             yield connection
 
     @contextmanager
@@ -193,13 +211,14 @@ def open_database(url: str) -> Database:
         engine = create_engine(
             parsed,
             connect_args={name: value for name, value in LOST_HOST.items() if name not in parsed.query},
-            pool_pre_ping=True,
             pool_size=10,
             max_overflow=20,
             json_serializer=_json_text,
         )
         event.listen(engine, "handle_error", _refuse_values)
         event.listen(engine, "connect", _prepare_postgresql)
+        event.listen(engine, "checkin", _note_use)
+        event.listen(engine, "checkout", functools.partial(_test_idle, engine))
         return Database(engine)
     except (SQLAlchemyError, ImportError) as error:
         raise DatabaseUnavailable(parsed.render_as_string(), str(error).splitlines()[0]) from None
@@ -401,6 +420,26 @@ def _prepare_postgresql(connection: Any, _record: object) -> None:
         if cursor.fetchone()[0] not in SAFE_COMMITS:
             cursor.execute("SET synchronous_commit = on")
     connection.commit()
+
+
+def _note_use(_connection: Any, record: ConnectionPoolEntry) -> None:
+    record.info[_USED] = time.monotonic()
+
+
+def _test_idle(engine: Engine, connection: Any, record: ConnectionPoolEntry, _proxy: object) -> None:
+    """Test a connection that was unused for a while.
+
+    Raises
+    ------
+    InvalidatePoolError
+        The server has closed it: the pool opens new connections.
+    """
+    if time.monotonic() - record.info.get(_USED, math.inf) < IDLE_S:
+        return
+    try:
+        engine.dialect.do_ping(connection)
+    except engine.dialect.loaded_dbapi.Error as error:
+        raise InvalidatePoolError from error
 
 
 def _warn_of_unsafe_server(database: Database) -> None:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, select, text, update
+from sqlalchemy import Connection, bindparam, func, insert, select, text, update
 
 from ground_service.clock import utc_now_ns
 from ground_service.store.models import EVENT_LOG, EVENT_POSITIONS
@@ -25,6 +25,15 @@ LOCK = 7602
 
 _EVENTS = EVENT_LOG
 _POSITIONS = EVENT_POSITIONS
+
+_APPEND = insert(_EVENTS).from_select(
+    ["id", "utc_ns", "kind", "payload"],
+    select(
+        func.coalesce(func.max(_EVENTS.c.id), 0) + 1,
+        *(bindparam(name, type_=_EVENTS.c[name].type) for name in ("utc_ns", "kind", "payload")),
+    ),
+)
+"""Insert one event with the next number."""
 
 Notify = Callable[[frozenset[str]], None]
 """Function that is called with the kinds of the events of a committed transaction."""
@@ -96,7 +105,12 @@ def append_pending(connection: Connection) -> frozenset[str]:
         return frozenset()
     if connection.dialect.name == "postgresql":
         connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": LOCK})
-    number, now = last_number(connection), utc_now_ns()
+    now = utc_now_ns()
+    if len(pending) == 1:
+        kind, payload = pending[0]
+        connection.execute(_APPEND, {"utc_ns": now, "kind": kind, "payload": payload})
+        return frozenset((kind,))
+    number = last_number(connection)
     connection.execute(
         insert(_EVENTS),
         [

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, LargeBinary, and_, bindparam, delete, func, or_, select
 
-from ground_service.store.bulk import insert_columns
+from ground_service.store.bulk import FEW_ROWS, insert_columns
 from ground_service.store.counters import hold
 from ground_service.store.models import ROLLUPS, SAMPLE_TABLES
 from lunar.arrays import FloatArray, IntArray
@@ -331,9 +331,10 @@ def _store(connection: Connection, found: Sequence[tuple[Mapping[str, int], _Lev
             of_key = {f"of_{name}": value for name, value in key.items()}
             replaced += [{**of_key, "of_bucket": int(row[0])} for row in stored]
         merged.append((key, (number, first, last, rows, statistics)))
-    if replaced:
-        connection.execute(_DELETED, replaced)
     sizes = [len(level[0]) for _, level in merged]
+    is_small = sum(sizes) <= FEW_ROWS
+    if replaced and not is_small:
+        connection.execute(_DELETED, replaced)
     insert_columns(
         connection,
         _TABLE,
@@ -347,4 +348,5 @@ def _store(connection: Connection, found: Sequence[tuple[Mapping[str, int], _Lev
                 one.tobytes() for _, level in merged for one in np.ascontiguousarray(level[4], dtype="<f8")
             ],
         },
+        replace=is_small,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from sqlalchemy import Connection, select
-from sqlalchemy.exc import IntegrityError
 
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
@@ -11,21 +10,15 @@ from ground_service.store.files import StoredFile
 
 def register_file(connection: Connection, stored: StoredFile, kind: str, name: str, now_utc_ns: int) -> None:
     """Enter a file of the archive into the database; entering it again changes nothing."""
-    if repository.find(connection, repository.FILES, sha256=stored.sha256) is not None:
-        return
-    try:
-        with connection.begin_nested():
-            repository.add(
-                connection,
-                repository.FILES,
-                sha256=stored.sha256,
-                kind=kind,
-                name=name,
-                octets=stored.octets,
-                received_utc_ns=now_utc_ns,
-            )
-    except IntegrityError:
-        pass  # another process entered the same octets at the same time
+    repository.add_new(
+        connection,
+        repository.FILES,
+        sha256=stored.sha256,
+        kind=kind,
+        name=name,
+        octets=stored.octets,
+        received_utc_ns=now_utc_ns,
+    )
 
 
 def file_names(connection: Connection) -> list[str]:

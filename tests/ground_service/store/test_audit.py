@@ -28,7 +28,7 @@ def add(database: Database, *actions: str, detail: dict[str, Any] | None = None)
 
 
 def broken(database: Database) -> list[audit.BrokenEntry]:
-    with database.reading() as connection:
+    with database.snapshot() as connection:
         return list(audit.broken_entries(connection))
 
 

@@ -175,7 +175,7 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
     with open_ground(tmp_path / "home", database_url=server.url) as ground:
         until = time.monotonic() + 120.0
         while True:
-            with ground.database.reading() as connection:
+            with ground.database.snapshot() as connection:
                 if not connection.execute(text("SELECT pg_is_in_recovery()")).scalar():
                     break
             assert time.monotonic() < until
