@@ -39,7 +39,7 @@ TICK_S = 0.1
 POLL_S = 0.05
 """A station that pauses for this long has sent what it has: the segment is ingested."""
 
-REST_S = 2.0
+REST_S = 0.6
 """After this long, octets that show no frame are ingested as well."""
 
 SPOOL_LIMIT_OCTETS = 256 << 20

@@ -348,7 +348,7 @@ class _Keyed:
         return isinstance(other, _Keyed) and self.key == other.key
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=16)
 def _spans_of(keyed: _Keyed, constraints: Constraints, start: int, stop: int) -> tuple[tuple[int, int], ...]:
     try:
         return tuple(keyed.planner.spans(constraints, start, stop))

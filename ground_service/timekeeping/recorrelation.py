@@ -19,6 +19,7 @@ from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
+from ground_service.ephemerides.model import Ephemeris
 from ground_service.ephemerides.store import covering_ephemerides
 from ground_service.errors import InvalidInput
 from ground_service.events import CorrelationChanged, ReceptionsEntered, publish
@@ -34,15 +35,18 @@ from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_corr
 from ground_service.timekeeping.model import Correlation, TimeReport
 from lunar.arrays import IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
-from lunar.ephemeris import Ephemeris
+from lunar.ephemeris import Ephemeris as States
 from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
-from lunar.visibility import link
+from lunar.visibility import GroundStation, link
 
 AUTOMATIC = "time reports, light time"
 """Method of correlations that are fitted again by themselves."""
+
+_BLOCK_NS = 86_400 * 10**9
+"""Receptions whose light times are kept together."""
 
 _LINE = (
     "start_ticks",
@@ -278,14 +282,14 @@ def _light_time_ns(
     if mission is not None:
         known |= {station.name: station for station in stations_of(mission.link)}
     names = np.array(stations)
-    for ephemeris in _references(ground, connection, vehicle, earth_utc_ns):
-        covered = (earth_utc_ns - 2 * 10**9 >= ephemeris.start_utc_ns) & (
-            earth_utc_ns <= ephemeris.stop_utc_ns
-        )
+    for row in _references(connection, vehicle, earth_utc_ns):
+        covered = (earth_utc_ns - 2 * 10**9 >= row.start.utc_ns) & (earth_utc_ns <= row.stop.utc_ns)
         for name in sorted(set(stations)):
             here = np.flatnonzero(covered & np.isnan(light_s) & (names == name))
-            if len(here):
-                light_s[here] = link(ephemeris, earth_utc_ns[here], known.get(name)).light_time_s
+            for block in np.unique(earth_utc_ns[here] // _BLOCK_NS):
+                mine = here[earth_utc_ns[here] // _BLOCK_NS == block]
+                times = tuple(earth_utc_ns[mine].tolist())
+                light_s[mine] = _light_times_s(ground.files.path(row.sha256), known.get(name), times)
     unknown = np.isnan(light_s)
     if unknown.all():
         away = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(earth_utc_ns))))
@@ -293,18 +297,27 @@ def _light_time_ns(
     return np.where(unknown, -1, np.rint(np.where(unknown, 0.0, light_s) * 1e9)).astype(np.int64)
 
 
-def _references(
-    ground: Ground, connection: Connection, vehicle: int, earth_utc_ns: IntArray
-) -> list[Ephemeris]:
+def _references(connection: Connection, vehicle: int, earth_utc_ns: IntArray) -> list[Ephemeris]:
     """Reference ephemerides to take light times from: those of the vehicle's passes first, then by precedence."""
     mine = store.ephemerides_of_passes(connection, vehicle)
     rows = covering_ephemerides(connection, int(earth_utc_ns.min()), int(earth_utc_ns.max()))
     if mine:
         rows = [row for row in rows if row.id in mine]
-    return [_load(ground.files.path(row.sha256)) for row in rows]
+    return rows
 
 
-@functools.lru_cache(maxsize=64)
-def _load(path: Path) -> Ephemeris:
-    """Return the ephemeris in a stored file, whose name is its SHA-256."""
+@functools.lru_cache(maxsize=1024)
+def _light_times_s(
+    path: Path, station: GroundStation | None, earth_utc_ns: tuple[int, ...]
+) -> tuple[float, ...]:
+    """Return the light times at receptions of a block by an ephemeris file, whose name is its SHA-256.
+
+    Every correlation needs those of all receptions. They are kept, so that the files need not be.
+    """
+    found = link(_load(path), np.array(earth_utc_ns, dtype=np.int64), station).light_time_s
+    return tuple(np.asarray(found, dtype=np.float64).tolist())
+
+
+@functools.lru_cache(maxsize=2)
+def _load(path: Path) -> States:
     return load_ephemeris(path)
