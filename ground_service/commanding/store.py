@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, cast, func, or_, select, update
+from sqlalchemy import BigInteger, Connection, and_, cast, func, or_, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.commanding.core import SentCommand, VerificationReport, fate_of
@@ -199,6 +199,37 @@ def carriers_of_window(connection: Connection, window_id: int) -> list[int]:
         TELECOMMANDS.c.state != "rejected",
     )
     return [int(key) for key in connection.execute(query.order_by(TELECOMMANDS.c.id)).scalars()]
+
+
+def sent_for_pass(connection: Connection, pass_id: int) -> bytes:
+    """Return the telecommand packets that were sent for the window of a pass, in order of release.
+
+    Parameters that were changed by telecommand before are in force in the pass: those packets come first.
+    """
+    windows = repository.WINDOWS
+    window = connection.execute(
+        select(windows.c.id, windows.c.vehicle_id).where(windows.c.pass_id == pass_id)
+    )
+    found = window.first()
+    if found is None:
+        return b""
+    query = (
+        select(TELECOMMANDS.c.octets, TELECOMMANDS.c.window_id)
+        .where(
+            TELECOMMANDS.c.vehicle_id == found.vehicle_id,
+            or_(
+                TELECOMMANDS.c.window_id == found.id,
+                and_(TELECOMMANDS.c.window_id.is_(None), TELECOMMANDS.c.name == "set_parameter"),
+            ),
+            TELECOMMANDS.c.carrier_id.is_(None),
+            TELECOMMANDS.c.sent_utc_ns.is_not(None),
+            TELECOMMANDS.c.octets.is_not(None),
+        )
+        .order_by(TELECOMMANDS.c.decided_utc_ns, TELECOMMANDS.c.id)
+    )
+    rows = connection.execute(query).all()
+    last = max((number for number, row in enumerate(rows) if row.window_id is not None), default=-1)
+    return b"".join(row.octets for row in rows[: last + 1])
 
 
 def states_of_window(connection: Connection, window_id: int) -> set[str]:

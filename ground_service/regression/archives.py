@@ -277,6 +277,7 @@ def restock_archive(ground: Ground, record: ArchiveRecord, archive: PassArchive)
             connection,
             record,
             manifest_sha256=stored[MANIFEST].sha256,
+            frames=archive.frames,
             frames_stored=archive.frames_stored,
             state=archive.state,
             reason=archive.reason,

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection
 
+from ground_service.commanding.store import sent_for_pass
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.evaluation.inputs import reference_of
 from ground_service.ground import Ground
@@ -29,23 +31,31 @@ from ground_service.regression.archives import (
     store_archive,
     working_folder,
 )
-from ground_service.regression.model import TELEMETRY_ONLY, KeptArchive
+from ground_service.regression.model import TELEMETRY_ONLY, TO_RENDER, KeptArchive
+from ground_service.regression.rendering import LIVE_BEGINNING
 from ground_service.store.vehicles import get_vehicle
 from lunar.timescales import format_utc
 from tmtc.dictionary import DICTIONARY
 
 LIVE = (
-    "the pass was received live: telemetry does not contain the images and inputs of the payload, and the mission "
-    "description declares no scenario to render them from"
+    f"{LIVE_BEGINNING}: telemetry does not contain the images and inputs of the payload, and the mission "
+    "description declares no world to render them from"
 )
+LACKING = LIVE_BEGINNING + ", and its frames cannot be rendered: expected {}, found none"
+_RENDERED_FROM = {
+    "telecommands.packets": "telecommands of its window",
+    "reference.oem": "a reference ephemeris",
+    "catalogue.csv": "a crater catalogue",
+}
 NO_INPUTS = "the archive of the pass does not contain the inputs of the payload"
 
 
 def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArchive:
     """Keep the regression archive of a pass; keeping it again changes nothing unless new data were received.
 
-    An imported pass gives the archive that it was imported from. Frames that were not stored are rendered at the first
-    use. A live pass gives its received packets, mission description, reference and catalogue, without frames.
+    An imported pass gives the archive that it was imported from. A live pass gives its received packets, the sent
+    telecommands, mission description, reference and catalogue. Frames that are not stored are rendered at the first
+    use: those of a live pass if the mission description declares the simulated world and telemetry confirms them.
 
     Raises
     ------
@@ -131,6 +141,9 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
     vehicle = get_vehicle(connection, record.vehicle_id)
     reference = reference_of(connection, record)
     (folder / "downlink.packets").write_bytes(octets)
+    telecommands = sent_for_pass(connection, record.id)
+    if telecommands:
+        (folder / "telecommands.packets").write_bytes(telecommands)
     if record.mission_id is not None:
         (folder / "mission.toml").write_text(detail(connection, record.mission_id).text, encoding="utf-8")
     for name, sha256 in (
@@ -151,6 +164,7 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
         "frames_expected": record.manifest.get("frames_expected"),
         "camera": {"width_px": camera.width_px, "height_px": camera.height_px, "fov_deg": camera.fov_deg},
         "dictionary": {"version": span.dictionary_version},
+        **({} if mission.world.scenario is None else {"scenario_toml": mission.world.scenario}),
         "start_state": record.manifest.get("start_state"),
         "data_sources": list(record.manifest.get("data_sources", ())),
         "files": {
@@ -164,4 +178,16 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
     text = json.dumps(manifest, indent=2).encode() + b"\n"
     (folder / MANIFEST).write_bytes(text)
     digest = hashlib.sha256(text).hexdigest()
-    return PassArchive(folder, digest, manifest, frames, 0, TELEMETRY_ONLY, LIVE)
+    reason = _unrenderable(manifest)
+    state = TELEMETRY_ONLY if reason else TO_RENDER
+    return PassArchive(folder, digest, manifest, frames, 0, state, reason)
+
+
+def _unrenderable(manifest: Mapping[str, Any]) -> str:
+    """Return why the frames of a live pass cannot be rendered; empty if that can be tried."""
+    if "scenario_toml" not in manifest:
+        return LIVE
+    for name, what in _RENDERED_FROM.items():
+        if name not in manifest["files"]:
+            return LACKING.format(what)
+    return ""

@@ -62,6 +62,9 @@ RENDER_OCTETS = 8 << 30
 
 RENDERED_FILE_OCTETS = 1 << 30
 REASON_LIMIT = 300
+LIVE_BEGINNING = "the pass was received live"
+"""Beginning of the reason of an archive of a live pass that has no inputs of the payload."""
+
 NO_DETECTIONS = "; no received detections: "
 """Part of the reason of an archive whose downlink has no detections that can be decoded."""
 
@@ -119,7 +122,7 @@ def settle_archive(ground: Ground, digest: str, *, again: bool = False) -> KeptA
         manifest = archive_of(ground, record, Path()).manifest
         renders = record.state == TO_RENDER or (again and bool(manifest.get("scenario_toml")))
         settled = DETECTIONS in manifest["files"] or NO_DETECTIONS in record.reason
-        if INPUTS in manifest["files"] and (renders or not settled):
+        if renders or (INPUTS in manifest["files"] and not settled):
             with working_folder(ground) as folder:
                 archive = check_out(ground, digest, folder / "archive")
                 restock_archive(ground, record, _settled(ground, archive, folder / "complete", renders))
@@ -138,6 +141,8 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
         if whole.state == COMPLETE:
             return replace(whole, digest=archive.digest)
         reason = whole.reason or "the renderer left out frames"
+    if INPUTS not in archive.manifest["files"]:
+        return replace(archive, state=TELEMETRY_ONLY, reason=f"{LIVE_BEGINNING}, and {reason}")
     archive = replace(archive, state=TELEMETRY_ONLY, reason=reason)
     try:
         return with_detections(archive)

@@ -61,8 +61,8 @@ from ground_service.regression.outcome import (
     PassVerdict,
     RegressionOutcome,
 )
-from ground_service.regression.pass_archives import LIVE, NO_INPUTS
-from ground_service.regression.rendering import settle_archive
+from ground_service.regression.pass_archives import NO_INPUTS
+from ground_service.regression.rendering import LIVE_BEGINNING, settle_archive
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store.stored_files import register_file
@@ -336,7 +336,7 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
 
 def may_be_replayed(archive: KeptArchive) -> bool:
     """Return whether a kept archive has frames, or inputs of the payload from which it can be replayed."""
-    return archive.state != TELEMETRY_ONLY or archive.reason not in (LIVE, NO_INPUTS)
+    return archive.state != TELEMETRY_ONLY or not archive.reason.startswith((LIVE_BEGINNING, NO_INPUTS))
 
 
 def _settled(ground: Ground, digest: str, path: Path) -> PassArchive:

@@ -23,6 +23,7 @@ from lunar.catalogue import load_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.commanding import Refusal, parse_commands
+from payload_emulator.flight.onboard.parameters import find_parameter
 from payload_emulator.flight.ports import UNLIMITED, ResetCause
 from payload_emulator.flight.telemetry.products import image_report
 from payload_emulator.session.emulator import file_entries
@@ -99,7 +100,7 @@ def reconstruct(
     catalogue = load_catalogue(archive / "catalogue.csv")
     world = open_world(scenario, data, CHUNK_S)
     loaded = launch_payload(scenario, world.camera, data, catalogue)
-    _check_loads(archive, telemetry.get("housekeeping"), loaded)
+    _check_loads(archive, telemetry.get("housekeeping"), loaded, telecommands)
     world = flown_until(world, first_utc_ns(world, reports[-1].ticks))
     shutil.copytree(archive, out)
     steps: dict[int, StepInput] = {}
@@ -190,13 +191,26 @@ def _check_image(archive: Path, number: int, report: ImageReport, exposure: Expo
             )
 
 
-def _check_loads(archive: Path, table: Table | None, loaded: LoadedPayload) -> None:
+def _parameters_hash(loaded: LoadedPayload, telecommands: bytes) -> int:
+    """Return the hash of the parameters with those that telecommands change, as housekeeping reports it."""
+    changed = {}
+    for command in parse_commands(telecommands):
+        if not isinstance(command, Refusal) and command.name == "set_parameter":
+            parameter = find_parameter(int(command.values["parameter_id"]))
+            if parameter is not None:
+                changed[parameter.name] = float(command.values["value"])
+    if not changed:
+        return loaded.parameters.flight.hash
+    return table_hash(json.dumps(changed, sort_keys=True).encode())
+
+
+def _check_loads(archive: Path, table: Table | None, loaded: LoadedPayload, telecommands: bytes) -> None:
     """Refuse a declared world whose payload has not the model, parameters and catalogue that housekeeping reports."""
     if table is None or len(table) == 0:
         raise RecordError(f"{archive}: expected housekeeping with the hashes of model and tables, found none")
     declared = {
         "model_hash": loaded.detector.model_hash,
-        "parameters_hash": loaded.parameters.flight.hash,
+        "parameters_hash": _parameters_hash(loaded, telecommands),
         "catalogue_hash": table_hash(loaded.tables.catalogue) if loaded.tables.catalogue else 0,
     }
     for name, expected in declared.items():
