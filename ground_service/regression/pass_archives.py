@@ -46,6 +46,7 @@ _RENDERED_FROM = {
     "telecommands.packets": "telecommands of its window",
     "reference.oem": "a reference ephemeris",
     "catalogue.csv": "a crater catalogue",
+    "onboard-catalogue.csv": "catalogue.sha256 in the mission description",
 }
 NO_INPUTS = "the archive of the pass does not contain the inputs of the payload"
 
@@ -149,6 +150,7 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
     for name, sha256 in (
         ("reference.oem", None if reference is None else reference.sha256),
         ("catalogue.csv", record.catalogue_sha256),
+        ("onboard-catalogue.csv", mission.catalogue.sha256 if mission.world.scenario else None),
     ):
         if sha256 is not None:
             shutil.copyfile(ground.files.path(sha256), folder / name)

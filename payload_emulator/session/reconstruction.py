@@ -59,6 +59,9 @@ DOWNLINK = "downlink.packets"
 TELECOMMANDS = "telecommands.packets"
 """Telecommand packets that were sent for the pass, in order of transmission."""
 
+CATALOGUE = "onboard-catalogue.csv"
+"""Crater catalogue of the ground, of which the table on board was made."""
+
 CHUNK_S = 86_400.0
 """Time that the orbit is propagated at once, as in flight: another division gives other last digits."""
 
@@ -97,7 +100,8 @@ def reconstruct(
     if not reports:
         raise RecordError(f"{archive}: expected image reports in telemetry, found none")
     telecommands = _octets(archive, TELECOMMANDS, "telecommands that were sent for the pass")
-    catalogue = load_catalogue(archive / "catalogue.csv")
+    _octets(archive, CATALOGUE, "the crater catalogue that was on board at launch")
+    catalogue = load_catalogue(archive / CATALOGUE)
     world = open_world(scenario, data, CHUNK_S)
     loaded = launch_payload(scenario, world.camera, data, catalogue)
     _check_loads(archive, telemetry.get("housekeeping"), loaded, telecommands)

@@ -17,7 +17,7 @@ from lunar.datafolder import DataFolder
 from payload_emulator.errors import PayloadError, RecordError
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.session.loading import launch_payload
-from payload_emulator.session.reconstruction import reconstruct
+from payload_emulator.session.reconstruction import CATALOGUE, reconstruct
 from payload_emulator.session.replay import FlightBuild, complete_archive, replay_archive
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
 from payload_emulator.session.station_ports import RECORD_HEADER
@@ -74,8 +74,8 @@ def received(folder: Path, described: Scenario) -> Path:
     folder.mkdir()
     listed = terrain.catalogue.diameter_m
     some = np.flatnonzero((listed > 5e3) & (listed < 8e3))[:40]
-    save_catalogue(terrain.measured(some), folder / "catalogue.csv")
-    catalogue = load_catalogue(folder / "catalogue.csv")
+    save_catalogue(terrain.measured(some), folder / CATALOGUE)
+    catalogue = load_catalogue(folder / CATALOGUE)
     session, ground = flown(described, 6.5, act, catalogue=catalogue)
     assert session.account.frames == FRAMES
     (folder / "downlink.packets").write_bytes(packets_of(ground.records))
@@ -151,8 +151,8 @@ def without_reports(folder: Path) -> None:
 
 
 def with_another_catalogue(folder: Path) -> None:
-    lines = (folder / "catalogue.csv").read_text().splitlines(keepends=True)
-    (folder / "catalogue.csv").write_text("".join(lines[:20]))
+    lines = (folder / CATALOGUE).read_text().splitlines(keepends=True)
+    (folder / CATALOGUE).write_text("".join(lines[:20]))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,94 @@
+"""A live pass with the declared world: planned over the API, flown, received over TCP, kept, rendered and judged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ground_service.client.local import local_client
+from ground_service.clock import ClockFile, set_mission_clock
+from ground_service.ground import Ground, open_ground
+from ground_service.links.supervisor import LinkSupervisor
+from ground_service.regression.archives import kept_archives
+from ground_service.regression.builds import CURRENT, build_of, load_build
+from ground_service.regression.gates.policy import load_policy
+from ground_service.regression.pass_archives import keep_pass
+from ground_service.regression.rendering import settle_archive
+from ground_service.regression.service import run_regression
+from ground_service.store.database import prepare_database
+from lunar.datafolder import DataFolder
+from payload_emulator.session.scenario import parse_scenario
+from studies.mission_run import run as mission_run
+from studies.mission_run.ground import EmbeddedGround
+from studies.mission_run.run import RunTerms, run_mission
+from tests.test_mission_run import SCENARIO
+
+DATA = DataFolder(None)
+TERMS = RunTerms(days=0.3, windows_per_day=1, window_s=180.0)
+WORLD = SCENARIO.replace('images = "reduced"', "").replace("degree = 8", 'degree = 8\norientation = "iau"')
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def flown(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str | None]:
+    """Folder and database of a mission that has flown one window."""
+    folder, url = tmp_path_factory.mktemp("mission"), None
+    if request.param == "postgresql":
+        url = request.getfixturevalue("new_postgres_database")()
+        prepare_database(url, upgrade=True).engine.dispose()
+
+    def opened(home: Path, data: DataFolder, clock_file: Path) -> EmbeddedGround:
+        set_mission_clock(ClockFile(clock_file).read)
+        ground = open_ground(home, data, database_url=url)
+        found = EmbeddedGround(ground, local_client(ground, "mission-run"))
+        found.links = LinkSupervisor(ground)
+        found.links.start()
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mission_run.EmbeddedGround, "open", opened)
+        figures = run_mission(parse_scenario(WORLD), DATA, folder, TERMS, lambda text: None)
+    assert figures["windows"]["processed"] == 1 and figures["packets_lost"] == 0
+    return folder, url
+
+
+def reopened(flown: tuple[Path, str | None]) -> Ground:
+    folder, url = flown
+    return open_ground(folder / "ground", DATA, database_url=url)
+
+
+def build_with(folder: Path, parameters: str) -> str:
+    folder.mkdir()
+    (folder / "parameters.toml").write_text(parameters)
+    (folder / "build.toml").write_text(
+        'schema_version = 1\nname = "candidate"\nversion = "1"\nparameters = "parameters.toml"\n'
+    )
+    return str(folder / "build.toml")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_builds_are_judged_on_the_frames_of_a_live_pass(
+    flown: tuple[Path, str | None], tmp_path: Path
+) -> None:
+    with reopened(flown) as ground:
+        [kept] = kept_archives(ground)
+        assert (kept.state, kept.reason, kept.frames_stored) == ("to render", "", 0)
+        assert kept.frames >= 10
+        digest = kept.digest
+        assert keep_pass(ground, kept.pass_id or 0).digest == digest
+        current = load_build(CURRENT)
+        good = run_regression(ground, [digest], current, current, load_policy())
+        kept = settle_archive(ground, digest)
+        assert (kept.digest, kept.state, kept.frames) == (digest, "complete", kept.frames_stored)
+        assert [one.state for one in good.passes] == ["judged"] and good.verdict == "pass"
+        assert any(gate.name.startswith("detector.") for gate in good.gates)
+        blind = build_of(ground, build_with(tmp_path / "blind", "detector.score_threshold = 0.999\n"))
+        bad = run_regression(ground, [digest], blind, current, load_policy())
+        assert bad.verdict == "fail"
+        failed = [gate.name for gate in bad.gates if gate.outcome == "fail"]
+        assert any(name.startswith("detector.") for name in failed), failed
+        # The frames belong to the received data: keeping the pass again changes nothing.
+        assert keep_pass(ground, kept.pass_id or 0) == settle_archive(ground, digest)
