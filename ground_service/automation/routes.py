@@ -47,3 +47,12 @@ def approve_automation_action(ground: GroundOf, caller: Operator, action_id: Row
 def refuse_automation_action(ground: GroundOf, caller: Operator, action_id: RowId) -> AutomationAction:
     """Refuse an action that waits for approval, and those after it in its rule."""
     return service.decide(ground, action_id, approve=False, actor=caller.name)
+
+
+@automation.post("/automation/actions/{action_id}/repeat", responses=problems(404, 409))
+def repeat_automation_action(ground: GroundOf, caller: Operator, action_id: RowId) -> AutomationAction:
+    """Queue a failed action again, and those of its rule that were skipped after it; it has three attempts again.
+
+    An action that is queued already stays as it is.
+    """
+    return service.repeat(ground, action_id, actor=caller.name)

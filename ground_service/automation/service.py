@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from sqlalchemy import Connection
 
@@ -225,12 +226,46 @@ def decide(ground: Ground, action_id: int, *, approve: bool, actor: str) -> Auto
     with ground.database.writing() as connection:
         now = utc_now_ns()
         action = store.get_action(connection, action_id)
-        store.change_state(connection, action, state, now_utc_ns=now, decided_by=actor)
+        waiting: dict[str, Any] = {"expected": ("waiting",), "now_utc_ns": now, "decided_by": actor}
+        store.change_state(connection, action, state, **waiting)
         for other in store.actions_of_event(connection, action.event):
             same = (other.rule, other.subject) == (action.rule, action.subject)
             if same and other.position > action.position and other.state == "waiting":
-                store.change_state(connection, other, state, now_utc_ns=now, decided_by=actor)
+                store.change_state(connection, other, state, **waiting)
         verb = "approve" if approve else "refuse"
         detail = {"action": action.action, "rule": action.rule, "event": action.event}
         audit(connection, actor, f"{verb} automation", str(action_id), detail)
+        return store.get_action(connection, action_id)
+
+
+def repeat(ground: Ground, action_id: int, *, actor: str) -> AutomationAction:
+    """Queue a failed action again, and those of its rule that were skipped after it; return it.
+
+    An action that is queued already is returned unchanged, so that the same request has one effect.
+
+    Raises
+    ------
+    NotFound
+        There is no such action.
+    StateConflict
+        It has not failed.
+    """
+    with ground.database.writing() as connection:
+        now = utc_now_ns()
+        action = store.get_action(connection, action_id)
+        if action.state == "queued":
+            return action
+        again: dict[str, Any] = {"attempts": 0, "next_attempt_utc_ns": None, "error": None}
+        store.change_state(connection, action, "queued", now_utc_ns=now, expected=("failed",), **again)
+        for other in store.actions_of_event(connection, action.event):
+            same = (other.rule, other.subject) == (action.rule, action.subject)
+            if same and other.position > action.position and other.state == "skipped":
+                store.change_state(connection, other, "queued", now_utc_ns=now, **again)
+        detail = {
+            "action": action.action,
+            "rule": action.rule,
+            "event": action.event,
+            "error": action.error,
+        }
+        audit(connection, actor, "repeat automation", str(action_id), detail)
         return store.get_action(connection, action_id)

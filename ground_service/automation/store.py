@@ -198,9 +198,15 @@ def last_result(connection: Connection, action: AutomationAction) -> dict[str, A
 
 
 def change_state(
-    connection: Connection, action: AutomationAction, state: str, *, now_utc_ns: int, **values: Any
+    connection: Connection,
+    action: AutomationAction,
+    state: str,
+    *,
+    now_utc_ns: int,
+    expected: tuple[str, ...] = (),
+    **values: Any,
 ) -> None:
-    """Change the state of an action.
+    """Change the state of an action, which must be in one of the `expected` states if any are given.
 
     Raises
     ------
@@ -209,7 +215,15 @@ def change_state(
     StateConflict
         Its state does not permit that.
     """
-    move(connection, AUTOMATION_ACTION, action.id, state, changed_utc_ns=now_utc_ns, **values)
+    move(
+        connection,
+        AUTOMATION_ACTION,
+        action.id,
+        state,
+        expected=expected,
+        changed_utc_ns=now_utc_ns,
+        **values,
+    )
     publish(
         connection,
         AutomationChanged(id=action.id, event=action.event, action=action.action, state=state),

@@ -469,6 +469,10 @@ class Client(Connection):
         """Refuse an action that waits for approval, and those after it in its rule."""
         return self._post(AutomationAction, f"/automation/actions/{action_id}/refuse")
 
+    def repeat_automation_action(self, action_id: int) -> AutomationAction:
+        """Queue a failed action again, and those of its rule that were skipped after it."""
+        return self._post(AutomationAction, f"/automation/actions/{action_id}/repeat")
+
     # Telecommands
 
     def list_telecommands(self, *, state: str | None = None) -> Listing[Telecommand]:

@@ -40,6 +40,12 @@ ATTITUDE_SIGMA_RAD = math.radians(0.1)
 REGISTRATION_SIGMA_M = 20.0
 """Error of the catalogue as a whole: no number of passes reduces it."""
 
+PERSISTENT_SHARE = 0.3
+"""Share of the variance of a place that is the same on every pass: the detector repeats its error on the same crater.
+
+The on-board filter uses the same share (`detection_persistence`, docs/navigation.md).
+"""
+
 CONTROLS_NEEDED = 5
 EXPLAINED_RADII = 0.7
 EXPLAINED_PX = 4.0
@@ -170,7 +176,7 @@ def combined(places: Sequence[Place]) -> Place:
     """Return one place from those of several passes, at least one, that have seen it.
 
     The weighted mean. If the passes scatter more than they claim, its uncertainty grows by as much. The error of the
-    catalogue as a whole is common to all passes and remains.
+    catalogue as a whole and the part of the detector's error that persists are common to all passes and remain.
     """
     origin = places[0]
     enu = np.array([_enu_m(origin, one) for one in places])
@@ -181,6 +187,8 @@ def combined(places: Sequence[Place]) -> Place:
     if len(places) > 1:
         chi2 = ((enu - mean) ** 2 * weight).sum(axis=0) / (len(places) - 1)
         left = left * np.maximum(chi2, 1.0)
+    # Passes of equal weight: (1 + p (n - 1)) / n of the variance of one, not 1 / n.
+    left = left + PERSISTENT_SHARE * (len(places) - 1) / weight.sum(axis=0)
     sigma = np.sqrt(left + REGISTRATION_SIGMA_M**2)
     sightings = np.array([len(one.rows) for one in places], dtype=np.float64)
     logs = np.log([one.diameter_m for one in places])

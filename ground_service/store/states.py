@@ -61,6 +61,9 @@ AUTOMATION_ACTION = StateMachine(
     {
         "waiting": ("queued", "refused", "skipped"),
         "queued": ("done", "failed", "skipped"),
+        # A person lets a failed action and those that were skipped after it be done again.
+        "failed": ("queued",),
+        "skipped": ("queued",),
     },
 )
 

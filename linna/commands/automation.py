@@ -1,4 +1,4 @@
-"""`linna automation rules | list | approve | refuse`: rules of the mission descriptions and their actions."""
+"""`linna automation rules | list | approve | refuse | repeat`: rules of the mission descriptions and their actions."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     listing.set_defaults(handler=list_actions)
     approving = actions.add_parser("approve", help="approve an action that waits for approval")
     refusing = actions.add_parser("refuse", help="refuse an action that waits for approval")
-    for action, approve in ((approving, True), (refusing, False)):
+    repeating = actions.add_parser(
+        "repeat", help="do a failed action again, and those of its rule that were skipped after it"
+    )
+    for action, decision in ((approving, "approve"), (refusing, "refuse"), (repeating, "repeat")):
         action.add_argument("action_id", type=int, metavar="ID")
-        action.set_defaults(handler=decide, approve=approve)
-    for action in (rules, listing, approving, refusing):
+        action.set_defaults(handler=decide, decision=decision)
+    for action in (rules, listing, approving, refusing, repeating):
         add_operator_options(action)
         add_json_flag(action)
 
@@ -59,10 +62,11 @@ def list_actions(arguments: argparse.Namespace) -> int:
 
 def decide(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
-        decision = (
-            service.approve_automation_action if arguments.approve else service.refuse_automation_action
-        )
-        decided = decision(arguments.action_id)
+        decided = {
+            "approve": service.approve_automation_action,
+            "refuse": service.refuse_automation_action,
+            "repeat": service.repeat_automation_action,
+        }[arguments.decision](arguments.action_id)
     emit(arguments, decided.model_dump(mode="json"), text=_line(decided))
     return 0
 

@@ -181,6 +181,11 @@ class Payload:
         return self._machine.mode
 
     @property
+    def frames(self) -> int:
+        """Frames that were handed to the detector since boot."""
+        return self._machine.observer.counts["frames"]
+
+    @property
     def waiting(self) -> int:
         """Packets that wait for downlink."""
         return self._machine.store.waiting

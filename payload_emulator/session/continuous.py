@@ -236,10 +236,7 @@ class ContinuousSession:
             self._turn()
         while not self.stopping.is_set():
             if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
-                self._held = self.holds
-                self._send_message({**self._contact_message(), "kind": "finished"})
-                while self._held and not self.stopping.is_set():
-                    self._serve(selector, _POLL_S)
+                self._finish(selector)
                 return
             self._plan_ahead()
             due_ns = self._next_turn_ns()
@@ -254,6 +251,18 @@ class ContinuousSession:
             elif self._until_ns is not None and self.utc_ns >= self._until_ns:
                 self._until_ns, self.paused = None, True
                 self._send_message({"kind": "paused", "utc": format_utc(self.utc_ns)})
+
+    def _finish(self, selector: selectors.BaseSelector) -> None:
+        """Say that the end is reached and wait for `run` where time holds, also to a console that connects later."""
+        self._held = self.holds
+        message = {**self._contact_message(), "kind": "finished"}
+        self._send_message(message)
+        told = set(self.console.clients)
+        while self._held and not self.stopping.is_set():
+            self._serve(selector, _POLL_S)
+            if not told.issuperset(self.console.clients):
+                told.update(self.console.clients)
+                self._send_message(message)
 
     def _next_turn_ns(self) -> int:
         """Return the time of the next step: of the payload, of the link, or the longest step there is."""
@@ -367,7 +376,8 @@ class ContinuousSession:
         exposure = self._image(self._utc_of(ticks)) if will_look else None
         if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
             spacecraft.detector.show(self.world, exposure)
-        resets = len(spacecraft.resets)
+        resets, payload = len(spacecraft.resets), spacecraft.payload
+        frames = payload.frames
         packets = spacecraft.step(
             utc_ns,
             None if exposure is None else exposure.image,
@@ -379,7 +389,9 @@ class ContinuousSession:
             instruments=NO_SAMPLES if exposure is None else exposure.instruments,
         )
         self._receiver.carrier = self._receiver.bit_lock = heard
-        self.account.frames += exposure is not None
+        # An image that the payload did not look at, such as one made for a command that it refused, is no frame.
+        rebooted = spacecraft.payload is not payload
+        self.account.frames += payload.frames - frames + (spacecraft.payload.frames if rebooted else 0)
         self.account.resets += len(spacecraft.resets) - resets
         if contact is not None:
             self._send(contact, packets)

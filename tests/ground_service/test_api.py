@@ -371,6 +371,7 @@ MATRIX = [
     ("GET", "/automation/actions", "viewer"),
     ("POST", "/automation/actions/1/approve", "operator"),
     ("POST", "/automation/actions/1/refuse", "operator"),
+    ("POST", "/automation/actions/1/repeat", "operator"),
     ("GET", "/exports/formats", "viewer"),
     ("POST", "/exports", "viewer"),
     ("GET", "/session", "viewer"),

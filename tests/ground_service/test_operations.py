@@ -22,7 +22,8 @@ with warnings.catch_warnings():
 
 VERBS = {
     "accept", "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export",
-    "find", "get", "import", "keep", "list", "refuse", "reject", "release", "render", "request", "revoke", "run",
+    "find", "get", "import", "keep", "list", "refuse", "reject", "release", "render", "repeat", "request",
+    "revoke", "run",
     "search", "send", "shelve", "start", "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {

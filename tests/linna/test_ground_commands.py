@@ -354,6 +354,7 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             do("automation", "list", "--limit", 3)
             ask("automation", "approve", 999)
             ask("automation", "refuse", 999)
+            ask("automation", "repeat", 999)
             ask("catalogue", "add", mission)
             ask("plan", "request", "list")
             ask("export", 99, "--format", "csv", "--out", tmp_path / "export.zip")

@@ -359,6 +359,43 @@ def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
         session.stopping.set()
 
 
+def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> None:
+    """A session that is resumed after its end has passed waits for `run`, whoever connects first."""
+    state = tmp_path / "session.state"
+    flown(scenario(), 1.0, checkpoint_file=state)
+    session = ContinuousSession(
+        scenario(), DataFolder(None), holds=True, stop_utc_ns=EPOCH, checkpoint_file=state
+    )
+    thread = threading.Thread(target=session.run, daemon=True)
+    thread.start()
+    try:
+        until = time.monotonic() + 60.0
+        while not session._held:
+            assert time.monotonic() < until and thread.is_alive()
+            time.sleep(0.01)
+        with socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=60.0) as console:
+            assert json.loads(console.makefile("r").readline())["kind"] == "finished"
+            console.sendall(b"run\n")
+            thread.join(60)
+        assert not thread.is_alive()
+    finally:
+        session.stopping.set()
+
+
+def test_images_that_the_payload_refuses_to_look_at_are_no_frames() -> None:
+    """In safe mode the start of the observation is refused, and the image that was made for it is not counted."""
+
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and ground.count == 0:
+            start = ground.function("start_observation", 60.0, 15.0)
+            safe = ground.at(EPOCH + 5 * HOUR_NS - 60 * NS, ground.function("set_mode", 0.0))
+            ground.send(safe, ground.at(EPOCH + 5 * HOUR_NS, start))
+
+    session, _ = flown(scenario(SHORT), 6.0, act)
+    payload = session.spacecraft.payload
+    assert session.account.frames == payload.frames == 0
+
+
 def test_a_damaged_or_foreign_state_is_refused_in_one_line(tmp_path: Path) -> None:
     state = tmp_path / "session.state"
     state.write_bytes(b"nothing")

@@ -25,19 +25,29 @@ function conditions(when) {
     .join(", ");
 }
 
+function button(row, label, decision) {
+  const made = element(
+    "button",
+    { type: "button", "data-needs": "operator", "aria-label": `${label} action ${row.id}` },
+    label,
+  );
+  made.addEventListener(
+    "click",
+    acting(async () => {
+      await send("POST", `automation/actions/${row.id}/${decision}`);
+      await load();
+    }),
+  );
+  return made;
+}
+
 function decisions(row) {
-  const button = (label, decision) => {
-    const made = element("button", { type: "button", "data-needs": "operator" }, label);
-    made.addEventListener(
-      "click",
-      acting(async () => {
-        await send("POST", `automation/actions/${row.id}/${decision}`);
-        await load();
-      }),
-    );
-    return made;
-  };
-  return element("span", {}, button("Approve", "approve"), " ", button("Refuse", "refuse"));
+  return element("span", {}, button(row, "Approve", "approve"), " ", button(row, "Refuse", "refuse"));
+}
+
+function result(row) {
+  if (row.state !== "failed") return outcome(row);
+  return element("span", {}, outcome(row), " ", button(row, "Repeat", "repeat"));
 }
 
 const load = pager(async (limit, offset) => {
@@ -47,7 +57,7 @@ const load = pager(async (limit, offset) => {
     get("automation/rules"),
   ]);
   show("waiting", table("Actions that wait for approval", [...columns, ["Decision", decisions]], waiting.items, "None."));
-  show("actions", table("Actions", [...columns, ["Result", outcome]], page.items, "No action yet."));
+  show("actions", table("Actions", [...columns, ["Result", result]], page.items, "No action yet."));
   show(
     "rules",
     table(

@@ -188,13 +188,15 @@ def _place(east_m: float = 0.0, sigma_m: float = 50.0, diameter_m: float = 8000.
     return Place(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
 
 
-def test_passes_that_agree_halve_the_variance_but_not_the_error_of_the_catalogue() -> None:
+def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them() -> None:
+    """The error of the catalogue, and the 30 % of the variance that the detector repeats on every pass."""
     common = 20.0
     sigma = float(np.hypot(100.0, common))
+    assert combined([_place(sigma_m=sigma)]).sigma_m[0] == pytest.approx(sigma)
     four = combined([_place(sigma_m=sigma)] * 4)
-    assert four.sigma_m[0] == pytest.approx(np.hypot(50.0, common))
+    assert four.sigma_m[0] == pytest.approx(np.sqrt(100.0**2 * (0.3 + 0.7 / 4.0) + common**2))
     many = combined([_place(sigma_m=sigma)] * 10_000)
-    assert many.sigma_m[0] == pytest.approx(common, rel=0.01)
+    assert many.sigma_m[0] == pytest.approx(np.sqrt(0.3 * 100.0**2 + common**2), rel=0.01)
 
 
 def test_passes_that_disagree_enlarge_the_uncertainty() -> None:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ground_service import events
-from ground_service.automation.service import decide, list_actions, list_rules, record_actions
+from ground_service.automation.service import decide, list_actions, list_rules, record_actions, repeat
+from ground_service.client.local import local_client
 from ground_service.clock import utc_now_ns
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput, StateConflict, StorageFull
@@ -305,6 +306,42 @@ def test_a_failed_action_skips_those_after_it_and_states_why(
     window = get_window(ground, window_id)
     assert (window.state, window.reason) == ("downlinked", f"align failed: {why}")
     assert not has_repetitions(ground)
+
+
+def test_a_failed_action_is_repeated_by_an_operator(
+    either: Ground, flown: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With those that were skipped after it; the same request again changes nothing."""
+
+    def broken(*_: Any, **__: Any) -> Any:
+        raise InvalidInput("align", "", "a reference", "none")
+
+    monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
+    with monkeypatch.context() as patched:
+        patched.setattr(actions, "align_pass", broken)
+        window_id = prepared(either, flown)
+        receive(either, flown.packets, tmp_path)
+    assert [one[1:] for one in recorded(either)] == [("align", "failed"), ("report", "skipped")]
+    align = next(one for one in list_actions(either)[0] if one.action == "align")
+    report = next(one for one in list_actions(either)[0] if one.action == "report")
+    with pytest.raises(StateConflict, match="expected state failed, found skipped"):
+        repeat(either, report.id, actor="ann")
+    with pytest.raises(StateConflict, match="expected state waiting, found failed"):
+        decide(either, align.id, approve=True, actor="ann")
+    # Nobody does the work here yet: the request is recorded once, however often it is made.
+    with monkeypatch.context() as patched:
+        patched.setattr(actions, "_run_chain", lambda *_: None)
+        queued = repeat(either, align.id, actor="ann")
+        assert (queued.state, queued.attempts, queued.error) == ("queued", 0, None)
+        assert repeat(either, align.id, actor="ann") == queued
+    with local_client(either, "ann") as service:
+        entries = [one for one in service.list_audit() if one.action == "repeat automation"]
+    assert [(one.actor, one.target) for one in entries] == [("ann", str(align.id))]
+    actions.run_actions(either, align.event, "job")
+    assert {one[2] for one in recorded(either)} == {"done"}
+    assert get_window(either, window_id).state == "processed"
+    with pytest.raises(StateConflict, match="expected state failed, found done"):
+        repeat(either, align.id, actor="ann")
 
 
 def test_a_report_that_failed_is_made_later(
