@@ -139,14 +139,18 @@ def _add_calibrate(verbs: Any) -> None:
     calibrate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
     calibrate.add_argument("--out", type=Path, required=True, metavar="M.onnx")
     calibrate.add_argument(
-        "--parts", nargs="*", choices=PARTS, default=list(PARTS), help="what is stored (default: all)"
+        "--parts",
+        nargs="*",
+        choices=PARTS,
+        default=["score", "sigma"],
+        help="what is stored (default: score and sigma)",
     )
     calibrate.add_argument(
-        "--probability",
+        "--precision",
         type=float,
-        default=0.5,
+        default=0.85,
         metavar="P",
-        help="on board a detection is used from this probability of being a catalogued crater (default: 0.5)",
+        help="share of the detections used on board that are catalogued craters of 3 to 30 km (default: 0.85)",
     )
     add_json_flag(calibrate)
     calibrate.set_defaults(handler=_calibrate)
@@ -297,13 +301,13 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from payload_emulator.training.data.dataset import Dataset, write_whole
     from payload_emulator.training.model.fit_calibration import fit_calibration, format_calibration_figures
 
-    if not 0.0 < arguments.probability < 1.0:
-        raise UsageError(f"--probability: expected a value between 0 and 1, found {arguments.probability:g}")
+    if not 0.0 < arguments.precision < 1.0:
+        raise UsageError(f"--precision: expected a value between 0 and 1, found {arguments.precision:g}")
     octets, document = fit_calibration(
         model_octets(arguments.model),
         [Dataset(folder) for folder in arguments.dataset],
         arguments.parts,
-        arguments.probability,
+        arguments.precision,
         lambda frames: progress(frames, len(frames), "calibrate", "frames"),
     )
     sha256 = write_whole(arguments.out, octets)

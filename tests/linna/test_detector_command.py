@@ -227,10 +227,10 @@ def test_making_from_no_recipe_is_refused(tmp_path, capsys):
     assert "expected a TOML file" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("probability", ["0", "1", "-0.5", "nan"])
-def test_a_probability_outside_zero_and_one_is_refused_before_any_work(capsys, tmp_path, probability):
+@pytest.mark.parametrize("precision", ["0", "1", "-0.5", "nan"])
+def test_a_precision_outside_zero_and_one_is_refused_before_any_work(capsys, tmp_path, precision):
     command = ["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(tmp_path / "m.onnx")]
-    assert run([*command, f"--probability={probability}"]) == 2
+    assert run([*command, f"--precision={precision}"]) == 2
     assert "expected a value between 0 and 1" in capsys.readouterr().err
 
 

@@ -22,7 +22,6 @@ from lunar.arrays import BoolArray, FloatArray, IntArray
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision.calibration import (
     CALIBRATION_KEY,
-    PARTS,
     REFERENCE_DIAMETER_PX,
     Calibration,
     ScoreModel,
@@ -54,8 +53,12 @@ from payload_emulator.training.evaluate.scoring import (
 )
 from payload_emulator.training.model.calibrate import NAVIGATION_PRECISION
 
-ON_BOARD_PROBABILITY = 0.5
-"""On board a detection is used if it is a catalogued crater rather than not."""
+ON_BOARD_PRECISION = 0.85
+"""Share of the detections of 3 to 30 km used on board that are catalogued craters, over the validation frames."""
+
+DEFAULT_PARTS = ("score", "sigma")
+"""The pull of the Sun is left out: on validation frames it is below 0.1 px at 20 px, with opposite signs on real and on
+procedural terrain."""
 
 _KNOTS_PX = (10.0, 14.0, 20.0, 32.0, 48.0, 80.0)
 _SCORED_M = (3_000.0, 30_000.0)
@@ -65,6 +68,11 @@ _RIGHT_PROBABILITY = 0.4
 _SAME_SIZE = 0.4  # of ln diameter: a pair that differs more is of two craters
 _CELL_DEG = (15.0, 10.0)
 _OUTLIER_SIGMAS = 3.5
+FRESH_FACTOR = 1.6
+"""Factor on the fitted sigma of fresh errors. The error of a crater also drifts with the direction of view while it
+crosses the image, alike for neighbouring craters, which the filter takes for new information. Chosen of 1, 1.6 and 2.2
+as the least with a NIS of 0.8 to 1.2 and no more refused fixes over validation windows (`docs/detector.md`)."""
+
 _FRESH_OUTLIER_SIGMAS = 6.0
 """Beyond, an error new in a frame is left out of the fit. Its distribution has long tails that the filter meets: a
 detection that jumps refuses a whole fix if the stated sigma is that of the quiet ones."""
@@ -111,8 +119,8 @@ def plain_model(model_octets: bytes) -> bytes:
 def fit_calibration(
     model_octets: bytes,
     datasets: Sequence[Dataset],
-    parts: Sequence[str] = PARTS,
-    probability: float = ON_BOARD_PROBABILITY,
+    parts: Sequence[str] = DEFAULT_PARTS,
+    precision: float = ON_BOARD_PRECISION,
     progress: Callable[[Sequence[Any]], Iterable[Any]] = iter,
 ) -> tuple[bytes, dict[str, Any]]:
     """The model with the named parts of a calibration, and what was fitted with its evidence.
@@ -148,7 +156,7 @@ def fit_calibration(
     metadata = dict(detector.metadata)
     if calibration.score is not None:
         metadata[_RAW_THRESHOLDS] = json.dumps({name: metadata.get(name, "0.4") for name in _THRESHOLDS})
-        thresholds = _thresholds(truths, found, score, probability)
+        thresholds = _thresholds(truths, found, score, precision)
         metadata |= {name: str(value) for name, value in thresholds.items()}
     notes = {
         "frames": len(frames),
@@ -161,7 +169,9 @@ def fit_calibration(
         **notes,
         "parts": list(parts),
         "thresholds": thresholds,
-        "score_threshold_by_diameter_px": _raw_thresholds(score, probability),
+        "score_threshold_by_diameter_px": _raw_thresholds(score, thresholds["score_threshold"])
+        if calibration.score is not None
+        else [],
         "sun": {"coefficients_px": list(sun.coefficients), **evidence},
         "sigma": {"fresh": list(sigma.fresh), "total": list(sigma.total), **sigma_evidence},
     }
@@ -221,18 +231,22 @@ def _raw_thresholds(score: ScoreModel, probability: float) -> list[dict[str, flo
 
 
 def _thresholds(
-    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], score: ScoreModel, probability: float
+    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], score: ScoreModel, precision: float
 ) -> dict[str, float]:
     """Thresholds of the calibrated score: on board, of the greatest F1, and of the precision for navigation."""
     calibrated = []
     for part in found:
         moved = replace(part, score=score.probability(part.score, part.diameter_px))
-        order = np.argsort(-moved.score, kind="stable")
-        calibrated.append(_ordered(moved, order))
+        calibrated.append(_ordered(moved, np.argsort(-moved.score, kind="stable")))
+    on_board = threshold_for_precision(
+        tally(truths, calibrated, low_m=_SCORED_M[0], high_m=_SCORED_M[1]), precision
+    )
     tallied = tally(truths, calibrated)
     balanced, _ = best_threshold(tallied)
-    navigation = max(probability, threshold_for_precision(tallied, NAVIGATION_PRECISION))
-    return dict(zip(_THRESHOLDS, (probability, round(balanced, 3), round(navigation, 3)), strict=True))
+    navigation = max(on_board, threshold_for_precision(tallied, NAVIGATION_PRECISION))
+    return dict(
+        zip(_THRESHOLDS, (round(value, 3) for value in (on_board, balanced, navigation)), strict=True)
+    )
 
 
 def _ordered(part: FrameDetections, order: IntArray) -> FrameDetections:
@@ -374,6 +388,7 @@ def fit_sigma(pairs: Pairs) -> tuple[SigmaModel, dict[str, Any]]:
     fresh, kept_again = _log_linear(
         inner.features[again], 0.5 * (scatter**2).sum(axis=1), _FRESH_OUTLIER_SIGMAS
     )
+    fresh[0] += np.log(FRESH_FACTOR)
     low, high = np.percentile(inner.features, (1.0, 99.0), axis=0)
     model = SigmaModel(*(tuple(float(x) for x in part) for part in (fresh, total, low, high)))
     variance, of_frame = model.variances_px2(inner.features)
@@ -451,7 +466,8 @@ def format_calibration_figures(document: dict[str, Any]) -> str:
         f"{document['frames']} validation frames, {document['pairs']} detections of catalogued craters; parts "
         f"{', '.join(document['parts']) or 'none'}",
         f"threshold on board {thresholds['score_threshold']:.2f}, balanced {thresholds['f1_threshold']:.2f}, "
-        f"navigation {thresholds['navigation_threshold']:.2f}; score of the network on board: {limits}",
+        f"navigation {thresholds['navigation_threshold']:.2f}; score of the network on board: "
+        f"{limits or 'the same for all sizes'}",
         f"pull of the Sun px: {pulls}",
         f"sigma: mean square error over variance {sigma['mean_square_over_variance']:.2f}, "
         f"{100 * sigma['outlier_share']:.1f} % outliers",

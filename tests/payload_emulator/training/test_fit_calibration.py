@@ -5,11 +5,12 @@ import pytest
 
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.flight.vision.calibration import CALIBRATION_KEY, sun_directions
+from payload_emulator.flight.vision.calibration import CALIBRATION_KEY, PARTS, sun_directions
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.scoring import FrameDetections
 from payload_emulator.training.model.fit_calibration import (
+    FRESH_FACTOR,
     Pairs,
     fit_calibration,
     fit_score,
@@ -115,7 +116,7 @@ def test_lasting_and_fresh_errors_are_told_apart():
     for size in (-0.5, 0.0, 0.8):
         total, fresh = model.variances_px2(np.array([[1.0, size, np.log(1.5), 1.0, 1.7, 0.5]]))
         lasting = 1.2 * np.exp(size)
-        assert np.sqrt(fresh[0]) == pytest.approx(0.4, rel=0.1)
+        assert np.sqrt(fresh[0]) == pytest.approx(FRESH_FACTOR * 0.4, rel=0.1)
         assert np.sqrt(total[0]) == pytest.approx(np.hypot(0.4, lasting), rel=0.15)
     assert evidence["mean_square_over_variance"] == pytest.approx(1.0, abs=0.05)
 
@@ -147,10 +148,11 @@ def test_a_model_carries_the_parts_that_were_asked_for(blob_dataset, monkeypatch
     monkeypatch.setattr(module, "_pairs", lambda *_: pairs())
     monkeypatch.setattr(module, "_LEAST_ROWS", 10)
     shipped = load_shipped_model()
-    whole, document = fit_calibration(shipped, [blob_dataset])
+    whole, document = fit_calibration(shipped, [blob_dataset], PARTS)
     detector = OnnxDetector(whole)
     assert None not in (detector.calibration.score, detector.calibration.sigma, detector.calibration.sun)
-    assert detector.score_threshold == document["thresholds"]["score_threshold"] == 0.5
+    assert detector.score_threshold == document["thresholds"]["score_threshold"]
+    assert document["thresholds"]["score_threshold"] <= document["thresholds"]["navigation_threshold"]
     assert document["sun"]["coefficients_px"] == list(detector.calibration.sun.coefficients)
     assert len(document["score_threshold_by_diameter_px"]) == 6
     text = format_calibration_figures(document)
