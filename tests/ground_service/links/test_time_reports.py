@@ -11,6 +11,7 @@ import pytest
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.ground import Ground
 from ground_service.links import service
+from ground_service.timekeeping import recorrelation
 from ground_service.timekeeping.service import spacecraft_correlations, spacecraft_time_reports
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.oem import save_oem
@@ -69,7 +70,13 @@ def downlink(orbit: Ephemeris, station_clock_ns: int) -> bytes:
 
 @pytest.mark.parametrize(("station_clock_s", "is_used"), [(0, True), (3600, False), (-3600, False)])
 def test_the_clock_is_correlated_from_time_reports_of_a_link(
-    either: Ground, station: Station, orbit: Ephemeris, tmp_path: Path, station_clock_s: int, is_used: bool
+    either: Ground,
+    station: Station,
+    orbit: Ephemeris,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    station_clock_s: int,
+    is_used: bool,
 ) -> None:
     save_oem(orbit, tmp_path / "orbit.oem")
     add_ephemeris(either, either.files.put_file(tmp_path / "orbit.oem"), name="orbit")
@@ -92,3 +99,6 @@ def test_the_clock_is_correlated_from_time_reports_of_a_link(
     assert 0.0 < line.residual_rms_ns < line.residual_max_ns < 2 * TICK_NS
     assert {one.station for one in reports} == {"lab"}
     assert max(abs(one.residual_ns) for one in reports) < 2 * TICK_NS
+    # The light times are kept; the ephemeris need not be.
+    monkeypatch.delattr(recorrelation, "_load")
+    assert spacecraft_time_reports(either, 76, "flight") == reports
