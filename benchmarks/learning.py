@@ -106,7 +106,15 @@ def learn(arguments: argparse.Namespace, data: DataFolder, work: Path) -> dict[s
         epoch = parse_utc(start) + round(arguments.later_days * 86_400e9)
         later = {
             name: _later(
-                ground, scenario, data, table, work, format_utc(epoch), arguments.later, hidden, accepted
+                ground,
+                scenario,
+                data,
+                table,
+                work,
+                format_utc(epoch),
+                arguments.later,
+                hidden,
+                accepted if name == "learned" else (),
             )
             for name, table in tables.items()
         }
@@ -169,15 +177,21 @@ def _later(
     hidden: IntArray,
     accepted: Sequence[Landmark],
 ) -> list[dict[str, Any]]:
-    """Return the figures of later passes that are flown with a table; the ground has the same craters."""
-    kept, rows = set(table.ids.tolist()), []
+    """Return the figures of later passes that are flown with a table; the ground has the same craters.
+
+    Parameters
+    ----------
+    accepted
+        Landmarks that the table contains.
+    """
+    rows = []
     complete = bool(np.isin(hidden, table.ids).any())
 
     def known(catalogue: CraterCatalogue) -> CraterCatalogue:
         if complete:
             return catalogue
         thin = catalogue.select(~np.isin(catalogue.ids, hidden))
-        return extended_catalogue(thin, accepted) if kept - set(catalogue.ids.tolist()) else thin
+        return extended_catalogue(thin, accepted) if accepted else thin
 
     for k in range(passes):
         archive = work / f"later-{k}"
