@@ -73,6 +73,11 @@ _ENVIRONMENT = ("PATH", "HOME", "LANG", "TMPDIR", "OMP_NUM_THREADS", "NUMBA_CACH
 _DOWNLINKS = ("downlink.cadu", "downlink.packets")
 # Settings of a scenario by which the renderer opens a file, and their values that name none.
 _FILE_SETTINGS = (("orbit", "oem", ("",)), ("dynamics", "gravity", ("auto", "builtin")))
+# The same for the archive of a live pass, whose payload is loaded as at launch.
+_LAUNCH_SETTINGS = (
+    ("navigation", "filter_gravity", ("auto", "builtin")),
+    ("navigation", "anchoring_catalogue", ("",)),
+)
 # Run by the process that becomes the renderer: limits, and its end with that of the service.
 _LAUNCH = """
 import ctypes, os, resource, signal, sys
@@ -164,7 +169,13 @@ def untrusted_scenario(manifest: Mapping[str, Any]) -> str:
         table = scenario.get(section)
         return table.get(key, default) if isinstance(table, dict) else default
 
-    for section, key, permitted in _FILE_SETTINGS:
+    is_live = INPUTS not in manifest["files"]
+    if is_live and "/" in str(value("detector", "network", "")):
+        return (
+            "the scenario of the archive is not rendered: detector.network: expected the name of a shipped network, "
+            "found a file"
+        )
+    for section, key, permitted in (*_FILE_SETTINGS, *(_LAUNCH_SETTINGS if is_live else ())):
         if value(section, key, permitted[0]) not in permitted:
             expected = " or ".join(permitted) or "none"
             return f"the scenario of the archive is not rendered: {section}.{key}: expected {expected}, found a file"

@@ -24,6 +24,7 @@ from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store
 from ground_service.regression.archives import (
+    INPUTS,
     PassArchive,
     check_out,
     keep_archive,
@@ -299,6 +300,31 @@ def test_the_scenario_of_an_archive_opens_no_file_and_renders_no_large_images(
     kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
     assert kept.state == "telemetry only"
     assert kept.reason == f"the scenario of the archive is not rendered: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "reason"),
+    [
+        (
+            '[detector]\nnetwork = "/etc/x"',
+            "detector.network: expected the name of a shipped network, found a file",
+        ),
+        (
+            '[navigation]\nfilter_gravity = "/etc/x"',
+            "navigation.filter_gravity: expected auto or builtin, found a file",
+        ),
+        (
+            '[navigation]\nanchoring_catalogue = "x"',
+            "navigation.anchoring_catalogue: expected none, found a file",
+        ),
+        ('[detector]\nnetwork = "craters"\n[navigation]\nfilter_gravity = "builtin"', ""),
+    ],
+)
+def test_the_declared_world_of_a_live_pass_opens_no_file(scenario: str, reason: str) -> None:
+    """The payload is loaded as at launch, from the scenario; an archive with inputs of the payload has it on record."""
+    found = rendering.untrusted_scenario({"scenario_toml": scenario, "files": {}})
+    assert found == (reason and f"the scenario of the archive is not rendered: {reason}")
+    assert rendering.untrusted_scenario({"scenario_toml": scenario, "files": {INPUTS: {}}}) == ""
 
 
 def test_the_renderer_imports_nothing_from_the_archive(
