@@ -230,6 +230,71 @@ def test_a_notebook_keeps_entries_with_their_author_for_other_browsers(mct, show
         other.context.close()
 
 
+def stored_annotations(url):
+    """The stored annotations of plots with their documents."""
+    listed = json.loads(ask(f"{url}/api/v1/displays")[1])["items"]
+    keys = [one["key"] for one in listed if one["type"] == "annotation"]
+    return [json.loads(ask(f"{url}/api/v1/displays/{key}")[1]) for key in keys]
+
+
+def open_plot(page, url):
+    """Open the plot of the temperature in the interval of the pass; return its drawing area."""
+    instance = spacecraft(url)["instance"]
+    end = int(parse_utc("2029-08-07T07:00:00Z")) // 1_000_000
+    bounds = f"tc.mode=fixed&tc.startBound={end - 2 * 3_600_000}&tc.endBound={end}&tc.timeSystem=utc"
+    page.goto("about:blank")
+    page.goto(
+        f"/mct#/browse/linna:spacecraft/linna:vehicle~76~{instance}/linna:parameter~76~{instance}~temperature_c?{bounds}"
+    )
+    area = page.locator(".gl-plot-display-area").first
+    expect(area.locator("canvas").first).to_be_visible(timeout=WAIT_MS)
+    expect(page.get_by_label("Plot Series Loading")).to_have_count(0)
+    return area
+
+
+def drag_over(page, area, keys):
+    """Drag from one corner of a plot to the other with keys held."""
+    box = area.bounding_box()
+    for key in keys:
+        page.keyboard.down(key)
+    page.mouse.move(box["x"] + 0.05 * box["width"], box["y"] + 0.05 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.move(box["x"] + 0.95 * box["width"], box["y"] + 0.95 * box["height"])
+    page.mouse.up()
+    for key in keys:
+        page.keyboard.up(key)
+
+
+def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser):
+    area = open_plot(mct, shown.url)
+    drag_over(mct, area, ("Alt", "Shift"))
+    mct.get_by_role("tab", name="Annotations").click()
+    mct.locator(".js-add-tag-button").click()
+    mct.get_by_placeholder("Type to select tag").click()
+    mct.locator(".js-tag-option", has_text="Anomaly").click()
+    wait_until(lambda: stored_annotations(shown.url), "the annotation is not stored")
+    (kept,) = stored_annotations(shown.url)
+    name = json.loads(ask(f"{shown.url}/api/v1/session")[1])["name"]
+    assert (kept["created_by"], kept["document"]["createdBy"]) == (name, name)
+    assert kept["document"]["tags"] == ["anomaly"]
+    (target,) = kept["document"]["targets"]
+    assert target["keyString"].endswith("~temperature_c") and target["minX"] < target["maxX"]
+    other = browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900}).new_page()
+    try:
+        again = open_plot(other, shown.url)
+        box = again.bounding_box()
+        other.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"], steps=5)
+        other.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+        other.get_by_role("tab", name="Annotations").click()
+        expect(other.locator(".c-tag__label", has_text="Anomaly")).to_be_visible(timeout=WAIT_MS)
+        other.locator(".c-tag__label", has_text="Anomaly").hover()
+        other.get_by_label("Remove tag Anomaly").click()
+        wait_until(lambda: stored_annotations(shown.url)[0]["document"]["_deleted"], "it is not removed")
+    finally:
+        other.context.close()
+
+
 def stored_notebook(url):
     """The stored notebook with its document."""
     (key,) = (
