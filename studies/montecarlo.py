@@ -7,6 +7,7 @@ covariances that the filter claims: a filter whose noise is mistuned looks fine 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -50,6 +51,7 @@ from tmtc.tables import (
 _NS = 1_000_000_000
 _ORIENTATION_STEP_NS = 7_200 * _NS
 _PUSH_S = 60.0
+_WAVES = 100
 _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 
 
@@ -57,8 +59,9 @@ _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 class CatalogueErrors:
     """Errors of the uploaded catalogue, one sigma, drawn once per run.
 
-    `offset_enu_m` is shared by all craters, with `offset_sigma_m` drawn on top; `wrong_share` is the share of entries
-    where there is no crater at all.
+    `offset_enu_m` is shared by all craters, with `offset_sigma_m` drawn on top. `regional_sigma_m` is the size of a
+    shift east, north, up that is similar over `regional_rad` (1/e, angle at the Moon's centre).
+    `wrong_share` is the share of entries where there is no crater at all.
     """
 
     centre_of_diameter: float = 0.03
@@ -66,6 +69,8 @@ class CatalogueErrors:
     height_m: float = 100.0
     offset_enu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    regional_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    regional_rad: float = 1.0
     wrong_share: float = 0.0
 
 
@@ -390,6 +395,9 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
     centre_m = np.maximum(errors.centre_of_diameter * table.diameter_m, errors.centre_floor_m)
     sigma_m = np.stack([centre_m, centre_m, np.full(len(table), errors.height_m)], axis=1)
     shift_m = sigma_m * rng.standard_normal(sigma_m.shape) + np.array(errors.offset_enu_m)
+    if any(errors.regional_sigma_m):
+        field = regional_field(table.latitude_rad, table.longitude_rad, errors.regional_rad, rng)
+        shift_m = shift_m + np.array(errors.regional_sigma_m) * field
     wrong = rng.uniform(size=len(table)) < errors.wrong_share
     turned = np.where(wrong, rng.uniform(0.0, 2.0 * np.pi, len(table)), 0.0)
     moved = CatalogueTable(
@@ -401,6 +409,34 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
         sigma_m,
     )
     return unpack_catalogue_table(pack_catalogue_table(moved))
+
+
+def regional_field(
+    latitude_rad: FloatArray, longitude_rad: FloatArray, correlation_rad: float, rng: np.random.Generator
+) -> FloatArray:
+    """Return three random fields (n, 3) of variance 1 and covariance exp(-d / correlation) over the chord d.
+
+    Sums of waves, with wave vectors from the spectral density of the covariance in three dimensions.
+
+    References
+    ----------
+    Rahimi, Recht (2007), Random features for large-scale kernel machines.
+    """
+    level = np.cos(latitude_rad)
+    places = np.stack(
+        [level * np.cos(longitude_rad), level * np.sin(longitude_rad), np.sin(latitude_rad)], axis=1
+    )
+    fields = []
+    for _ in range(3):
+        vectors = rng.standard_normal((_WAVES, 3)) / (
+            correlation_rad * np.abs(rng.standard_normal((_WAVES, 1)))
+        )
+        phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+        total = np.zeros(latitude_rad.size)
+        for vector, phase in zip(vectors, phases, strict=True):
+            total += np.cos(places @ vector + phase)
+        fields.append(total * math.sqrt(2.0 / _WAVES))
+    return np.stack(fields, axis=1)
 
 
 def _truth(

@@ -143,7 +143,9 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
             bias_correlation_s=errors.pixel_correlation_s,
             scale_sigma=errors.scale_sigma,
         ),
-        catalogue_errors=CatalogueErrors(offset_sigma_m=errors.catalogue_offset_m),
+        catalogue_errors=CatalogueErrors(
+            regional_sigma_m=errors.catalogue_offset_m, regional_rad=errors.catalogue_correlation_rad
+        ),
         start_position_m=5_000.0,
         start_velocity_m_s=5.0,
         attitude_noise_rad=errors.attitude_noise_rad,

@@ -158,7 +158,7 @@ class TerrainSection:
     the data folder), both named by their paths in the data folder. The Sun of the scenario must be that of the
     photographs, for example `light.mode = "paper"` with equal limits.
     `registration_north_east_m` shifts height rasters on the ground, in metres to the north and to the east; empty: the
-    shift that belongs to the rasters (-59 m to the north for GLD100). A procedural Moon has no registration.
+    none. The catalogue is registered to the rasters as they are georeferenced; a procedural Moon has no registration.
     """
 
     source: Literal["auto", "raster", "procedural", "catalogue", "photograph"] = "auto"

@@ -192,13 +192,13 @@ def _errors(
     position, velocity = world.truth.states(utc_ns)
     truth = np.concatenate([position, velocity], axis=1)
     rotation = world.truth.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns), dtype=np.float64))
-    to_truth = _turns(rotation, orientation, ticks)
+    to_truth = turns(rotation, orientation, ticks)
     rtn = rtn_from_inertial(truth[:, :3], truth[:, 3:])
-    error = _split(own[:, :6], truth, to_truth, rtn)
-    own_error = np.einsum("nji,nkj->nki", to_truth, _halves(_turned(own[:, :6], to_truth) - truth))
-    nees = _nees(own_error.reshape(-1, 6), covariance[:, :6, :6])
+    error = rtn_errors(own[:, :6], truth, to_truth, rtn)
+    own_error = np.einsum("nji,nkj->nki", to_truth, halves(turned(own[:, :6], to_truth) - truth))
+    nees = normalised_squares(own_error.reshape(-1, 6), covariance[:, :6, :6])
     only = _propagated(loaded, model, burns, ticks)
-    only_error = np.linalg.norm(_split(only, truth, to_truth, rtn)[:, :3], axis=1)
+    only_error = np.linalg.norm(rtn_errors(only, truth, to_truth, rtn)[:, :3], axis=1)
     coast_end = np.full(frame.size, np.nan)
     for first, _ in _arcs(world.frame_utc_ns, imaging)[1:]:
         at = int(np.searchsorted(frame, first))
@@ -207,33 +207,33 @@ def _errors(
             if prior is not None:
                 here = slice(at, at + 1)
                 coast_end[at] = np.linalg.norm(
-                    _split(prior[None, :6], truth[here], to_truth[here], rtn[here])[0, :3]
+                    rtn_errors(prior[None, :6], truth[here], to_truth[here], rtn[here])[0, :3]
                 )
     return FlownErrors(frame, error, nees, only_error, coast_end)
 
 
-def _turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
+def turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
     """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
     own = [orientation.at(int(tick)) for tick in ticks]
     known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
     return np.asarray(np.einsum("nji,njk->nik", rotation, known), dtype=np.float64)
 
 
-def _halves(states: FloatArray) -> FloatArray:
+def halves(states: FloatArray) -> FloatArray:
     """Position and velocity of states (n, 6) as (n, 2, 3)."""
     return states.reshape(-1, 2, 3)
 
 
-def _turned(states: FloatArray, turn: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nij,nkj->nki", turn, _halves(states)).reshape(-1, 6), dtype=np.float64)
+def turned(states: FloatArray, turn: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nij,nkj->nki", turn, halves(states)).reshape(-1, 6), dtype=np.float64)
 
 
-def _split(states: FloatArray, truth: FloatArray, turn: FloatArray, rtn: FloatArray) -> FloatArray:
+def rtn_errors(states: FloatArray, truth: FloatArray, turn: FloatArray, rtn: FloatArray) -> FloatArray:
     """Errors (n, 6) of the payload's states along the axes of the true orbit."""
-    return _turned(_turned(states, turn) - truth, rtn)
+    return turned(turned(states, turn) - truth, rtn)
 
 
-def _nees(error: FloatArray, block: FloatArray) -> FloatArray:
+def normalised_squares(error: FloatArray, block: FloatArray) -> FloatArray:
     """Return the normalised errors squared (n,) of position and velocity (n, 6) under covariances (n, 6, 6)."""
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", block), 1e-30))
     whitened = error / scale

@@ -26,6 +26,7 @@ from studies.montecarlo import (
     consistency,
     fly,
     fly_many,
+    regional_field,
     verdict,
 )
 from studies.montecarlo_world import TRACKS, standard_case
@@ -241,9 +242,26 @@ def test_the_shipped_filter_knows_its_errors(shipped: Any) -> None:
 
 def test_a_filter_that_leaves_out_what_detections_share_is_found_out_by_its_errors(shipped: Any) -> None:
     errors = CommonErrors(pixel_bias_px=1e-3)
-    case = replace(shipped, parameters=replace(shipped.parameters, errors=errors))
+    case = replace(
+        shipped,
+        parameters=replace(shipped.parameters, errors=errors),
+        detector=replace(shipped.detector, bias_sigma_px=0.25),
+    )
     runs = [fly(case, seed) for seed in (31, 32)]
     assert consistency(runs, settle_frames=40).anees > chi2.ppf(0.975, 12) / 2.0
+
+
+def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle() -> None:
+    rng = np.random.default_rng(5)
+    # Pairs of places 30 degrees apart on the equator, and 2 degrees.
+    longitude = np.radians(np.array([0.0, 2.0, 30.0]))
+    draws = np.stack([regional_field(np.zeros(3), longitude, np.radians(30.0), rng) for _ in range(300)])
+    fields = np.swapaxes(draws, 1, 2).reshape(-1, 3)
+    # 900 draws: a correlation is known to 0.03; chords of 2 and 30 degrees are 0.067 and 0.989 of the memory.
+    assert np.mean(fields**2) == pytest.approx(1.0, abs=0.12)
+    together = np.corrcoef(fields.T)
+    assert together[0, 1] == pytest.approx(np.exp(-0.067), abs=0.06)
+    assert together[0, 2] == pytest.approx(np.exp(-0.989), abs=0.12)
 
 
 def test_slow_errors_wander_with_the_memory_they_are_given() -> None:

@@ -258,10 +258,18 @@ def test_a_prediction_carries_each_part_by_its_own_law() -> None:
     transition[:9, :9] = model.transition
     transition[9:12, 9:12] = tilt * np.eye(3)
     transition[12:14, 12:14] = shift * np.eye(2)
+    # What the registration leaves is lost with the angle flown, at a memory of 30 degrees.
+    there = model.propagate(prior.mean[:9], prior.ticks, 1_300 * SECOND).state[:3]
+    here = prior.mean[:3]
+    angle = np.arccos(here @ there / np.linalg.norm(here) / np.linalg.norm(there))
+    place = np.exp(-angle / np.radians(30.0))
+    assert 0.1 < place < 0.95
+    transition[14:17, 14:17] = place * np.eye(3)
     noise = np.zeros((24, 24))
     noise[:9, :9] = model.noise
     noise[9:12, 9:12] = np.eye(3) * 2e-4**2 * (1.0 - tilt**2)
     noise[12:14, 12:14] = np.eye(2) * 0.25**2 * (1.0 - shift**2)
+    noise[14:17, 14:17] = np.diag([15.0, 12.0, 10.0]) ** 2 * (1.0 - place**2)
     np.testing.assert_allclose(found.mean, transition @ prior.mean, rtol=1e-12)
     expected = transition @ prior.covariance @ transition.T + noise
     scale = np.sqrt(np.diag(expected))
