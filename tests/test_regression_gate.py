@@ -20,6 +20,7 @@ from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.suite import SUITE, suite_scenarios, write_suite
+from payload_emulator.training.model.fit_calibration import plain_model
 
 FRAMES = 8
 
@@ -45,7 +46,7 @@ def untrained(folder: Path) -> Path:
     import onnx
     from onnx import numpy_helper
 
-    model = onnx.load_from_string(load_shipped_model())
+    model = onnx.load_from_string(plain_model(load_shipped_model()))  # a calibration is of one network only
     rng = np.random.default_rng(1)
     for tensor in model.graph.initializer:
         weights = numpy_helper.to_array(tensor)

@@ -14,12 +14,14 @@ from payload_emulator.flight.vision.detector import INPUT_NAME, OnnxDetector
 from payload_emulator.flight.vision.preprocess import prepare_image, sun_up_turns
 from payload_emulator.training.data.dataset import Dataset
 from payload_emulator.training.evaluate.evaluate import refuse_other_camera
+from payload_emulator.training.model.fit_calibration import plain_model
 
 
 def quantise(model_octets: bytes, datasets: Sequence[Dataset], frames: int = 48) -> bytes:
     """Octets of the network with 8-bit weights (per channel) and activations; its head stays in floating point.
 
-    Ranges are taken from frames of the validation split. The metadata are kept, so the thresholds are too.
+    Ranges are taken from frames of the validation split. The metadata are kept, so the thresholds are too, but for a
+    calibration, which is of the given network only.
 
     Raises
     ------
@@ -30,6 +32,7 @@ def quantise(model_octets: bytes, datasets: Sequence[Dataset], frames: int = 48)
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
+    model_octets = plain_model(model_octets)
     detector = OnnxDetector(model_octets)
     for dataset in datasets:
         refuse_other_camera(detector, dataset)
