@@ -258,7 +258,8 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     assert any("continues from 2029-08-07T" in line for line in lines)
     assert again["starts"] == 2 and again["interventions"] == 0
     differ = {
-        "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "interventions_list", "incidents",
+        "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "memory_lives", "interventions_list",
+        "incidents",
     }  # fmt: skip
     assert {key: value for key, value in again.items() if key not in differ} == {
         key: value for key, value in whole.items() if key not in differ

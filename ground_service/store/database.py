@@ -98,6 +98,8 @@ class Database:
     def __post_init__(self) -> None:
         server = self.engine.dialect.name == "postgresql"
         readers = self.engine.execution_options(isolation_level="AUTOCOMMIT") if server else self.engine
+        if server:
+            event.listen(readers, "before_cursor_execute", _refuse_changes)
         object.__setattr__(self, "_readers", readers)
 
     @property
@@ -420,6 +422,13 @@ def _prepare_postgresql(connection: Any, _record: object) -> None:
         if cursor.fetchone()[0] not in SAFE_COMMITS:
             cursor.execute("SET synchronous_commit = on")
     connection.commit()
+
+
+def _refuse_changes(*given: Any) -> None:
+    """Refuse a change on a connection for reading: no end of a transaction would confirm or undo it."""
+    context = given[4]
+    if context is not None and (context.isinsert or context.isupdate or context.isdelete):
+        raise RuntimeError(f"expected a query on a connection for reading, found: {given[2][:200]}")
 
 
 def _note_use(_connection: Any, record: ConnectionPoolEntry) -> None:

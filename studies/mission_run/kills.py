@@ -212,7 +212,9 @@ class Keeper:
             self._back.clear()
             self._spacecraft_is_down = True
             self._kill_spacecraft()
-            self._back.wait()
+            # The run may wait for another part before it starts the spacecraft again.
+            while not self._back.wait(LOOK_S):
+                self._revive()
             self._spacecraft_is_down = False
         else:
             part = self._parts[planned.part]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import inspect, text
+from sqlalchemy import delete, insert, inspect, select, text
 
 from ground_service.errors import (
     DatabaseNotMigrated,
@@ -30,6 +30,7 @@ from ground_service.store.database import (
 )
 from ground_service.store.files import FileArchive
 from ground_service.store.models import METADATA
+from ground_service.store.repository import VEHICLES
 from tests.ground_service.schema import described_schema
 
 
@@ -125,6 +126,19 @@ def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong: 
         prepare_database(wrong)
     assert "secret" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_connection_for_reading_refuses_changes(postgres_url: str) -> None:
+    database = prepare_database(postgres_url, upgrade=True)
+    changes = (insert(VEHICLES).values(ccsds_id=76, instance="flight"), delete(VEHICLES))
+    for change in changes:
+        with pytest.raises(RuntimeError, match="a connection for reading"), database.reading() as connection:
+            connection.execute(change)
+    with database.writing() as connection:
+        connection.execute(changes[0])
+    with database.reading() as connection:
+        assert len(connection.execute(select(VEHICLES)).all()) == 1
+    database.engine.dispose()
 
 
 def test_a_write_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest import service as ingesting
+from ground_service.ingest import reading as ingesting
 from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest, ingest_file
 from ground_service.ingest.stream import DownlinkReader

@@ -181,7 +181,7 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
             assert time.monotonic() < until
             time.sleep(0.1)
         assert [one.name for one in users.list_users(ground)] == ["before", "in-the-backup"]
-        with ground.database.reading() as connection:
+        with ground.database.snapshot() as connection:
             assert list(audit.broken_entries(connection)) == []
         users.add_user(ground, "afterwards", "viewer")  # the service continues, on a new timeline
 
