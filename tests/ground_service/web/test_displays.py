@@ -13,6 +13,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import TimeoutError as TimedOut
 from playwright.sync_api import expect
 
 from ground_service.ground import open_ground
@@ -205,10 +206,22 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     expect(event).to_contain_text("high", timeout=WAIT_MS)
 
 
+def choose_in_create_menu(page, name):
+    """Choose an entry of the menu, which is empty until the displays are loaded."""
+    entry = page.get_by_role("menuitem", name=name, exact=True)
+    for _ in range(6):
+        page.get_by_role("button", name="Create").click()
+        try:
+            entry.wait_for(timeout=10_000)
+            break
+        except TimedOut:
+            page.keyboard.press("Escape")
+    entry.click()
+
+
 def test_a_notebook_keeps_entries_with_their_author_for_other_browsers(mct, shown, browser):
     mct.goto("/mct#/browse/linna.stored:layouts")
-    mct.get_by_role("button", name="Create").click()
-    mct.get_by_role("menuitem", name="Notebook", exact=True).click()
+    choose_in_create_menu(mct, "Notebook")
     mct.get_by_label("Title", exact=True).fill("Notes of the pass")
     mct.get_by_label("Save", exact=True).click()
     mct.locator(".c-notebook__drag-area").click()
@@ -285,10 +298,16 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser):
         again = open_plot(other, shown.url)
         box = again.bounding_box()
         other.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"], steps=5)
-        other.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
-        other.get_by_role("tab", name="Annotations").click()
-        expect(other.locator(".c-tag__label", has_text="Anomaly")).to_be_visible(timeout=WAIT_MS)
-        other.locator(".c-tag__label", has_text="Anomaly").hover()
+        tag = other.locator(".c-tag__label", has_text="Anomaly")
+        for _ in range(6):  # a range is selected once the annotations are loaded
+            other.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+            other.get_by_role("tab", name="Annotations").click()
+            try:
+                tag.wait_for(timeout=10_000)
+                break
+            except TimedOut:
+                continue
+        tag.hover()
         other.get_by_label("Remove tag Anomaly").click()
         wait_until(lambda: stored_annotations(shown.url)[0]["document"]["_deleted"], "it is not removed")
     finally:
@@ -359,8 +378,7 @@ def test_the_layout_of_a_payload_engineer_shows_states_series_and_images(mct, sh
 
 def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
     mct.goto("/mct#/browse/linna.stored:layouts")
-    mct.get_by_role("button", name="Create").click()
-    mct.get_by_role("menuitem", name="Folder").click()
+    choose_in_create_menu(mct, "Folder")
     mct.get_by_label("Title", exact=True).fill("Shift of Monday")
     mct.get_by_label("Save", exact=True).click()
     expect(mct.get_by_role("region", name="Shift of Monday Object View")).to_be_visible(timeout=WAIT_MS)
