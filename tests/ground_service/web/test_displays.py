@@ -207,16 +207,10 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
 
 
 def choose_in_create_menu(page, name):
-    """Choose an entry of the menu, which is empty until the displays are loaded."""
-    entry = page.get_by_role("menuitem", name=name, exact=True)
-    for _ in range(6):
-        page.get_by_role("button", name="Create").click()
-        try:
-            entry.wait_for(timeout=10_000)
-            break
-        except TimedOut:
-            page.keyboard.press("Escape")
-    entry.click()
+    """Choose an entry of the menu: the new object becomes part of the one that is shown."""
+    page.wait_for_function("() => window.openmct?.router?.path?.length > 0", timeout=WAIT_MS)
+    page.get_by_role("button", name="Create").click()
+    page.get_by_role("menuitem", name=name, exact=True).click()
 
 
 def test_a_notebook_keeps_entries_with_their_author_for_other_browsers(mct, shown, browser):
