@@ -76,7 +76,8 @@ class Recording:
     first
         First detection of each frame and the end of the last, shape (n + 1,).
     detections
-        All detections, columns u, v, diameter, score, sigma in pixels, shape (m, 5).
+        All detections, columns u, v, diameter, score, sigma in pixels, and the lasting share of the variance (NaN where
+        the network states none), shape (m, 6); without the last column, (m, 5), it is not known.
     catalogue
         True craters near the track with the heights of their rims.
     tables
@@ -104,7 +105,11 @@ class Recording:
         """Return the detections of a frame; None where the image was not usable."""
         if not self.usable[number]:
             return None
-        return Detections(*self.detections[self.first[number] : self.first[number + 1]].T.copy())
+        columns = self.detections[self.first[number] : self.first[number + 1]].T.copy()
+        count = len(_COLUMNS)
+        lasts = len(columns) > count and not np.isnan(columns[count]).any()
+        found = Detections(*columns[:count])
+        return replace(found, persistence=columns[count]) if lasts else found
 
 
 def record(scenario: Scenario, data: DataFolder, progress: Progress | None = None) -> Recording:
@@ -121,7 +126,8 @@ def record(scenario: Scenario, data: DataFolder, progress: Progress | None = Non
         ticks.append(exposure.clock_ticks)
         attitude.append(exposure.attitude)
         rotation.append(exposure.camera_from_mcmf)
-        rows.append(np.stack([getattr(found, name) for name in _COLUMNS], axis=1))
+        lasting = np.full(len(found), np.nan) if found.persistence is None else found.persistence
+        rows.append(np.stack([*(getattr(found, name) for name in _COLUMNS), lasting], axis=1))
     table, registration = unpack_catalogue_table(loaded.tables.catalogue), world.terrain.registration
     shift_m = np.zeros((len(table), 2))
     if registration is not None:
