@@ -47,6 +47,9 @@ RETRY_S = 1.0
 REFUSED_S = 0.5
 """Time after which a station that has refused a transmission is asked again."""
 
+TURN_S = 30.0
+"""Longest time for which telecommands wait for earlier ones of another link."""
+
 MISSED_S = 1.0
 INCOMING = "incoming"
 LOCK = "lock"
@@ -95,12 +98,19 @@ class LinkRunner:
         self._acknowledged = 0
         self._last_block_s = 0.0
         self._repeated_for: int | None = None
+        self._waits_s: float | None = None
+        self._overtaking: int | None = None
         self.lost = False
 
     @property
     def octets_received(self) -> int:
         """Octets that were received and ingested since the start, with those that an earlier owner had left."""
         return self._progress.ingested
+
+    @property
+    def waits_for_others(self) -> bool:
+        """Whether telecommands wait for earlier ones of another link."""
+        return self._waits_s is not None
 
     @property
     def commands_unsent(self) -> int:
@@ -311,12 +321,38 @@ class LinkRunner:
             else service.pending_transmissions(self._ground, self._name)
         )
         for one in transmissions:
+            if not self._is_in_turn(one):
+                return
             if self._transmit(self._up, one):
                 self._note_transmitted(one)
             elif not self._is_handed_over(self._up, one):
                 return
         if due.requested:
             service.note_sent_request(self._ground, self._name, self._owner, due.request)
+
+    def _is_in_turn(self, transmission: TransmissionRow) -> bool:
+        """Return whether no earlier transmission of the spacecraft waits at another link, or the wait was too long.
+
+        The payload refuses telecommands that overtake others.
+        """
+        others = service.links_with_earlier(self._ground, transmission)
+        now = time.monotonic()
+        if not others:
+            self._waits_s = None
+            return True
+        if self._waits_s is None:
+            self._waits_s = now
+        if now - self._waits_s < TURN_S:
+            return False
+        if transmission.id != self._overtaking:
+            self._overtaking = transmission.id
+            log.warning(
+                "link %s: telecommands %s are sent before earlier ones of link %s",
+                self._name,
+                list(transmission.telecommands),
+                ", ".join(others),
+            )
+        return True
 
     def _is_handed_over(self, up: Connector, transmission: TransmissionRow) -> bool:
         """Give a transmission that the station has refused to the link in contact; return whether there is one.

@@ -425,6 +425,12 @@ def hand_over(ground: Ground, declared: DeclaredLink, transmission: Transmission
     return other
 
 
+def links_with_earlier(ground: Ground, transmission: TransmissionRow) -> list[str]:
+    """Return the other links at which earlier transmissions of the same spacecraft may not be on the wire."""
+    with ground.database.reading() as connection:
+        return store.links_with_earlier(connection, transmission)
+
+
 def note_transmitted(ground: Ground, transmission: TransmissionRow, contact_id: int | None) -> None:
     """Record that a transmission is on the wire."""
     with ground.database.writing() as connection:

@@ -227,6 +227,17 @@ def pending_transmissions(connection: Connection, link: str) -> list[Transmissio
     return [_transmission(row) for row in connection.execute(query.order_by(_TRANSMISSIONS.c.id)).mappings()]
 
 
+def links_with_earlier(connection: Connection, transmission: TransmissionRow) -> list[str]:
+    """Return the other links at which earlier transmissions of the same spacecraft may not be on the wire."""
+    query = select(_TRANSMISSIONS.c.link).where(
+        _TRANSMISSIONS.c.vehicle_id == transmission.vehicle_id,
+        _TRANSMISSIONS.c.id < transmission.id,
+        _TRANSMISSIONS.c.link != transmission.link,
+        _TRANSMISSIONS.c.transmitted_utc_ns.is_(None),
+    )
+    return [str(name) for name in connection.execute(query.distinct().order_by("link")).scalars()]
+
+
 def transmitted_before(
     connection: Connection, vehicle: int, before_utc_ns: int, since_utc_ns: int, attempts: int
 ) -> list[TransmissionRow]:

@@ -81,7 +81,7 @@ def _advance(
     facts = _facts(connection, window, correlations)
     state, reason = state_of(facts)
     values: dict[str, Any] = {}
-    if facts.frames > 0 and window.pass_id is None:
+    if facts.frames > 0 and window.pass_id is None and state != "failed":
         mission_id = window.mission_id or missions.in_force(connection, window.vehicle_id)
         pass_id = store.add_pass(connection, window, mission_id, utc_now_ns())
         values |= {"pass_id": pass_id, "mission_id": mission_id}
@@ -102,6 +102,7 @@ def _facts(
     frames = store.received_frames(connection, vehicle, start, stop)
     return WindowFacts(
         decision=window.decision,
+        replaced=store.is_replaced(connection, window),
         predecessor_failed=predecessor is not None
         and store.get_window(connection, predecessor).state == "failed",
         command_states=tuple(view.state for view in views_of_window(connection, window.id, utc_now_ns())),

@@ -142,6 +142,19 @@ def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
     return _windows(connection, query.order_by(WINDOWS.c.start_utc_ns), WindowRecord)
 
 
+def is_replaced(connection: Connection, window: WindowRecord) -> bool:
+    """Return whether a window that was entered later, was approved and has not failed covers part of its time."""
+    query = select(WINDOWS.c.id).where(
+        WINDOWS.c.vehicle_id == window.vehicle_id,
+        WINDOWS.c.id > window.id,
+        WINDOWS.c.decision == "approved",
+        WINDOWS.c.state != "failed",
+        WINDOWS.c.start_utc_ns < window.stop.utc_ns,
+        WINDOWS.c.stop_utc_ns > window.start.utc_ns,
+    )
+    return connection.execute(query.limit(1)).first() is not None
+
+
 def records_where(connection: Connection, *conditions: Any) -> list[WindowRecord]:
     """Return the windows that fulfil conditions on their columns, in order of time."""
     query = _joined().where(*conditions).order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)

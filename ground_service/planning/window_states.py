@@ -18,6 +18,8 @@ DECISIONS = ("draft", "approved", "failed")
 COMMITTED = ("approved", "uplinked", "executing", "executed", "downlinked")
 """States in which a window claims its time and its storage."""
 
+REPLACED = "it failed, and another window has its time"
+
 
 @dataclass(frozen=True, slots=True)
 class WindowFacts:
@@ -29,6 +31,8 @@ class WindowFacts:
         What people decided last: draft, approved or failed.
     predecessor_failed
         Whether the window that has to come before it failed.
+    replaced
+        Whether a later window that has not failed covers part of its time: data of that time belong to the later one.
     command_states
         States of the telecommands that carry it up and of those they carry, with the failure where one failed.
     frames
@@ -47,6 +51,7 @@ class WindowFacts:
 
     decision: str
     predecessor_failed: bool = False
+    replaced: bool = False
     command_states: tuple[str, ...] = ()
     frames: int = 0
     started: bool = False
@@ -61,6 +66,8 @@ def state_of(facts: WindowFacts) -> tuple[str, str | None]:
     """The state of a window, and the reason where it failed."""
     if facts.decision != "approved":
         return facts.decision, None
+    if facts.replaced:
+        return "failed", REPLACED
     begun = facts.started or facts.frames > 0
     over = begun and (facts.stopped or facts.heard_after)
     if over and facts.heard_after and (facts.lost == 0 or facts.closed):

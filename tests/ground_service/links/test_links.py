@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from sqlalchemy import select
@@ -21,6 +22,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.links import service, store
 from ground_service.links.runner import LinkRunner
+from ground_service.links.store import TransmissionRow
 from ground_service.links.stream import ACKNOWLEDGEMENT, TRANSMISSION
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
@@ -581,6 +583,60 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
     finally:
         first.close()
         second.close()
+
+
+def held_elsewhere(ground: Ground, station: Station) -> tuple[TransmissionRow, list[int], list[int]]:
+    """Telecommands that the link "other" has taken and not sent, and later ones that any link may take."""
+    declare(
+        ground,
+        station.link("confirm = true").replace("silence_s = 1.0", "silence_s = 60.0")
+        + station.link("confirm = true").replace('"lab"', '"other"'),
+    )
+    other = service.declared_links(ground)["other"]
+    assert service.acquire(ground, other, "there", 15_000_000_000)
+    earlier = released(ground, 2)
+    (transmission,) = service.take_transmissions(ground, other, "there")
+    return transmission, earlier, released(ground, 2)
+
+
+def test_telecommands_do_not_overtake_those_that_another_link_has(either: Ground, stream: bytes) -> None:
+    """At a handover the payload would refuse the overtaken ones as out of sequence."""
+    station = Confirming()
+    try:
+        transmission, earlier, later = held_elsewhere(either, station)
+        with operated(either) as runner:
+            station.accept().sendall(stream[: 2 * CADU])
+            until(lambda: runner.waits_for_others, "telecommands that wait")
+            assert not station.transmissions
+            other = service.declared_links(either)["other"]
+            assert service.hand_over(either, other, transmission) == "lab"
+            until(lambda: runner.commands_unsent == 0, "both transmissions")
+            assert not runner.waits_for_others
+        assert [packets_of(octets) for _, octets in station.transmissions] == [
+            octets_of(either, earlier),
+            octets_of(either, later),
+        ]
+    finally:
+        station.close()
+
+
+def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
+    either: Ground, stream: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ground_service.links.runner.TURN_S", 0.0)
+    log = MagicMock()
+    monkeypatch.setattr("ground_service.links.runner.log", log)
+    station = Confirming()
+    try:
+        transmission, _, later = held_elsewhere(either, station)
+        with operated(either) as runner:
+            station.accept().sendall(stream[: 2 * CADU])
+            until(lambda: runner.commands_unsent == 0, "the later telecommands")
+        assert [packets_of(octets) for _, octets in station.transmissions] == [octets_of(either, later)]
+        assert [one.id for one in service.pending_transmissions(either, "other")] == [transmission.id]
+        assert log.warning.call_args.args[1:] == ("lab", later, "other")
+    finally:
+        station.close()
 
 
 @pytest.mark.parametrize(

@@ -205,6 +205,7 @@ SENT = ("completed", "accepted")
         (WindowFacts("approved", command_states=SENT), "uplinked"),
         (WindowFacts("approved", command_states=("sent", "failed")), "failed"),
         (WindowFacts("approved", predecessor_failed=True, command_states=SENT), "failed"),
+        (WindowFacts("approved", replaced=True, command_states=SENT, frames=2), "failed"),
         (WindowFacts("approved", command_states=SENT, heard_after=True), "failed"),
         (WindowFacts("approved", command_states=SENT, started=True), "executing"),
         (WindowFacts("approved", command_states=SENT, frames=2), "executing"),

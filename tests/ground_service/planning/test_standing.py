@@ -21,6 +21,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
+from ground_service.planning.progress import advance_windows
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
 from ground_service.store.database import prepare_database
 from ground_service.worker.follow_up import follow_in_process
@@ -176,6 +177,27 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
     assert {get.state for get in list_commands(either)[0] if get.record.window_id == first.id} == {"rejected"}
     assert standing.get_plan(either, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]
     assert standing.get_request(either, key).windows == {"approved": 4, "failed": 1}
+
+
+def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
+    either: Ground, oem: Path, now: Now, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(either, oem)
+    request(either)
+    standing.plan_tick(either, now.utc_ns)
+    first = min(planning.list_windows(either)[0], key=lambda one: one.start.utc_ns)
+    with either.database.writing() as connection:
+        window = store.get_record(connection, first.id)
+        assert store.change_window(connection, window, state="failed", reason="a telecommand of it failed")
+    assert standing.plan_tick(either, now.utc_ns)["added"] == 1
+    second = max(planning.list_windows(either)[0], key=lambda one: one.id)
+    assert (second.start, second.stop) == (first.start, first.stop)
+    monkeypatch.setattr(store, "received_frames", lambda *_: 5)
+    advance_windows(either, 1)
+    found = [planning.get_window(either, one.id) for one in (first, second)]
+    assert [one.state for one in found] == ["failed", "executing"]
+    assert found[0].pass_id is None and found[1].pass_id is not None
+    assert found[0].reason == "a telecommand of it failed"
 
 
 def test_windows_of_the_present_period_count_long_after_they_ended(
