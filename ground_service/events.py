@@ -34,7 +34,8 @@ class Event(BaseModel):
 class TelemetryReceived(Event):
     """New packets of a vehicle were stored; `first_ticks` and `last_ticks` are None if no packet has a time.
 
-    `kinds` are the kinds of samples in the packets: housekeeping, states, events, and so on.
+    `kinds` are the kinds of samples in the packets: housekeeping, states, events, and so on. `first_sample_ticks` and
+    `last_sample_ticks` are the times of samples before and after those of all packets; None without such samples.
     """
 
     event_kind = "telemetry"
@@ -42,6 +43,8 @@ class TelemetryReceived(Event):
     packets: int
     first_ticks: int | None = None
     last_ticks: int | None = None
+    first_sample_ticks: int | None = None
+    last_sample_ticks: int | None = None
     kinds: tuple[str, ...] = ()
 
 

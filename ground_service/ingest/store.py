@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
-from sqlalchemy import Connection, bindparam, delete, func, select
+from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, select
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
@@ -114,21 +114,31 @@ def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored
     added = int(np.count_nonzero(ids))
     samples = store_samples(connection, vehicle_id, batch.dictionary_version, batch.rows, ids)
     if added:
-        ticks = batch.ticks[(ids > 0) & (batch.ticks != NO_TICKS)]
-        first, last = (int(ticks.min()), int(ticks.max())) if ticks.size else (None, None)
-        publish(
-            connection,
-            TelemetryReceived(
-                vehicle_id=vehicle_id,
-                packets=added,
-                first_ticks=first,
-                last_ticks=last,
-                kinds=tuple(
-                    sorted(kind for kind, columns in batch.rows.items() if (ids[columns["packet"]] > 0).any())
-                ),
-            ),
-        )
+        publish(connection, _received(vehicle_id, batch, ids))
     return Stored(added, count - added, samples)
+
+
+def _received(vehicle_id: int, batch: Batch, ids: IntArray) -> TelemetryReceived:
+    """Return the event of the new packets of a batch, those with an id above 0."""
+    ticks = batch.ticks[(ids > 0) & (batch.ticks != NO_TICKS)]
+    first, last = (int(ticks.min()), int(ticks.max())) if ticks.size else (None, None)
+    kinds: list[str] = []
+    times: list[int] = []
+    for kind, columns in batch.rows.items():
+        sampled = columns["ticks"][ids[columns["packet"]] > 0]
+        if sampled.size:
+            kinds.append(kind)
+            times += [int(sampled.min()), int(sampled.max())]
+    earliest, latest = min(times, default=NO_TICKS), max(times, default=NO_TICKS)
+    return TelemetryReceived(
+        vehicle_id=vehicle_id,
+        packets=int(np.count_nonzero(ids)),
+        first_ticks=first,
+        last_ticks=last,
+        first_sample_ticks=earliest if times and first is not None and earliest < first else None,
+        last_sample_ticks=latest if times and last is not None and latest > last else None,
+        kinds=tuple(sorted(kinds)),
+    )
 
 
 def note_receptions(
@@ -368,13 +378,7 @@ def results_of_vehicle(
     query = (
         select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.id, _INGESTS.c.accounting)
         .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
-        .where(
-            _INGESTS.c.last_ticks.is_(None)
-            | (_INGESTS.c.last_ticks >= start_ticks) & (_INGESTS.c.first_ticks <= stop_ticks),
-            (_INGESTS.c.vehicle_id == vehicle)
-            | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
-            _INGESTS.c.state == "done",
-        )
+        .where(*_may_have_packets(vehicle, start_ticks, stop_ticks))
         .order_by(_INGESTS.c.file_sha256)
     )
     found = (
@@ -382,6 +386,24 @@ def results_of_vehicle(
         for sha256, octets, ingest_id, accounting in connection.execute(query)
     )
     return [one for one in found if one[2] is None or vehicle in one[2].vehicle_ids]
+
+
+def results_state(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> Hashable:
+    """Return a value that differs after another ingest of `results_of_vehicle`."""
+    columns = func.count(), func.count(_INGESTS.c.last_ticks), func.max(_INGESTS.c.finished_utc_ns)
+    query = select(*columns).where(*_may_have_packets(vehicle, start_ticks, stop_ticks))
+    return tuple(connection.execute(query).one())
+
+
+def _may_have_packets(vehicle: int, start_ticks: int, stop_ticks: int) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions of ingests that are done and may have packets of a vehicle in a time."""
+    return (
+        _INGESTS.c.last_ticks.is_(None)
+        | (_INGESTS.c.last_ticks >= start_ticks) & (_INGESTS.c.first_ticks <= stop_ticks),
+        (_INGESTS.c.vehicle_id == vehicle)
+        | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
+        _INGESTS.c.state == "done",
+    )
 
 
 def forget_samples(connection: Connection, vehicle: int, dictionary_version: int) -> None:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ground_service.ingest.packets import packet_ticks
 from lunar.arrays import BoolArray, IntArray
@@ -35,7 +36,7 @@ class RawFile:
     packet_ticks, packet_apid, packet_good
         For every packet (p,), including damaged ones; the APID of a damaged packet may be wrong.
     packet_digest
-        Hash of every packet, empty for damaged ones.
+        Hash of every packet (p, 2) as two numbers of 64 bits, 0 for damaged ones.
     skipped_ticks, skipped_octets
         For every interval (s,) of octets that belongs to no frame or no packet.
     has_frames
@@ -49,10 +50,16 @@ class RawFile:
     packet_ticks: IntArray
     packet_apid: IntArray
     packet_good: BoolArray
-    packet_digest: tuple[bytes, ...]
+    packet_digest: NDArray[np.uint64]
     skipped_ticks: IntArray
     skipped_octets: IntArray
     has_frames: bool
+
+    @property
+    def octets(self) -> int:
+        """Memory of the arrays."""
+        arrays = (getattr(self, one.name) for one in fields(self))
+        return sum(one.nbytes for one in arrays if isinstance(one, np.ndarray))
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -126,9 +133,7 @@ def account_raw(files: Sequence[RawFile], start_ticks: int, stop_ticks: int) -> 
         return np.asarray((ticks >= start_ticks) & (ticks <= stop_ticks), dtype=np.bool_)
 
     frames = frames_bad = corrected = octets = skipped = 0
-    seen: dict[int, int] = {}
-    distinct: dict[int, set[bytes]] = {}
-    crc_errors: dict[int, int] = {}
+    apids, digests, damaged = [_none(0)], [np.zeros((0, 2), dtype=np.uint64)], [_none(0)]
     for file in files:
         here = inside(file.frame_ticks)
         frames += int(np.count_nonzero(here))
@@ -136,22 +141,34 @@ def account_raw(files: Sequence[RawFile], start_ticks: int, stop_ticks: int) -> 
         corrected += int(file.frame_corrected[here].sum())
         octets += int(file.frame_octets[here].sum())
         skipped += int(file.skipped_octets[inside(file.skipped_ticks)].sum())
-        for row in np.flatnonzero(inside(file.packet_ticks)).tolist():
-            apid = int(file.packet_apid[row])
-            if file.packet_good[row]:
-                seen[apid] = seen.get(apid, 0) + 1
-                distinct.setdefault(apid, set()).add(file.packet_digest[row])
-            else:
-                crc_errors[apid] = crc_errors.get(apid, 0) + 1
+        here = inside(file.packet_ticks)
+        apids.append(file.packet_apid[here & file.packet_good])
+        digests.append(file.packet_digest[here & file.packet_good])
+        damaged.append(file.packet_apid[here & ~file.packet_good])
     return RawAccount(
         frames=frames if any(file.has_frames for file in files) else None,
         frames_bad=frames_bad,
         symbols_corrected=corrected,
         octets=octets,
         octets_skipped=skipped,
-        duplicates={apid: count - len(distinct[apid]) for apid, count in seen.items()},
-        crc_errors=crc_errors,
+        duplicates=_repeated(np.concatenate(apids), np.concatenate(digests)),
+        crc_errors=_counts(np.concatenate(damaged)),
     )
+
+
+def _repeated(apid: IntArray, digest: NDArray[np.uint64]) -> dict[int, int]:
+    """Return how many packets (n,) of each APID have the hash of another one that is counted."""
+    order = np.lexsort((digest[:, 1], digest[:, 0], apid))
+    apid, digest = apid[order], digest[order]
+    same = (np.diff(apid) == 0) & (np.diff(digest, axis=0) == 0).all(axis=1)
+    repeated = _counts(apid[1:][same])
+    return {one: repeated.get(one, 0) for one in np.unique(apid).tolist()}
+
+
+def _counts(apid: IntArray) -> dict[int, int]:
+    """Return the number of packets (n,) of each APID."""
+    values, counts = np.unique(apid, return_counts=True)
+    return dict(zip(values.tolist(), counts.tolist(), strict=True))
 
 
 def _frames(
@@ -230,10 +247,13 @@ def _stream_octets(found: DownlinkDecode) -> int:
     return sum(found.octets.values())
 
 
-def _digests(found: DownlinkDecode) -> tuple[bytes, ...]:
+def _digests(found: DownlinkDecode) -> NDArray[np.uint64]:
     view = found.buffer.data
     rows = zip(found.cut.offsets.tolist(), found.cut.lengths.tolist(), found.cut.crc_ok.tolist(), strict=True)
-    return tuple(
-        hashlib.blake2b(view[start : start + length], digest_size=DIGEST_OCTETS).digest() if good else b""
+    octets = b"".join(
+        hashlib.blake2b(view[start : start + length], digest_size=DIGEST_OCTETS).digest()
+        if good
+        else bytes(DIGEST_OCTETS)
         for start, length, good in rows
     )
+    return np.frombuffer(octets, dtype="<u8").reshape(-1, 2).astype(np.uint64)

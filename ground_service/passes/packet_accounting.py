@@ -6,9 +6,10 @@ with on-board times in the pass (`passes.downlink_accounting`); other passes of 
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
+from collections.abc import Hashable
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,9 @@ STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observatio
 
 COMPLETENESS_BINS = 60
 GAP_POINTS = 256
+
+KEPT_OCTETS = 64 << 20
+"""Memory of the contents of raw files that are kept: those of about a million packets, in files of any size."""
 
 RAW_LIMIT_OCTETS = 128 << 20
 """Largest size of raw files that are read again for a report; above it, the dependent values are not computed."""
@@ -100,7 +104,7 @@ def _raw_account(
     for one in ingested:
         if one.octets > RAW_LIMIT_OCTETS:
             return None
-        found.append(_raw_file(files, one.sha256, spacecraft, one.sections))
+        found.append(_RAW_FILES.get(files, one.sha256, spacecraft, one.sections))
     return account_raw(found, span.start_ticks, span.stop_ticks) if found else None
 
 
@@ -149,12 +153,34 @@ def _sections(reception: ReceivedLink | None) -> tuple[LinkSection, ...]:
     )
 
 
-@lru_cache(maxsize=32)
-def _raw_file(
-    files: FileArchive, sha256: str, spacecraft_id: int, sections: tuple[LinkSection, ...]
-) -> RawFile:
-    """Return the content of a raw file; cached, because the file of a hash never changes."""
-    return read_raw(files.get(sha256), spacecraft_id, sections)
+class _RawFiles:
+    """Content of raw files, of which the last ones used are kept: the file of a hash never changes."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[Hashable, RawFile] = OrderedDict()
+        self._octets = 0
+
+    def get(
+        self, files: FileArchive, sha256: str, spacecraft_id: int, sections: tuple[LinkSection, ...]
+    ) -> RawFile:
+        """Return the content of a raw file."""
+        key = (files.root, sha256, spacecraft_id, sections)
+        with self._lock:
+            if (found := self._kept.get(key)) is not None:
+                self._kept.move_to_end(key)
+                return found
+        found = read_raw(files.get(sha256), spacecraft_id, sections)
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = found
+                self._octets += found.octets
+            while self._octets > KEPT_OCTETS:
+                self._octets -= self._kept.popitem(last=False)[1].octets
+        return found
+
+
+_RAW_FILES = _RawFiles()
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,27 +199,23 @@ class _Images:
 
 
 def _images(connection: Connection, record: PassRecord, span: PassSpan) -> _Images:
-    def columns(kind: str, *names: str, after_ticks: int = 0) -> dict[str, list[Any]]:
-        stop = span.stop_ticks + after_ticks
-        return store.samples(connection, replace(span, stop_ticks=stop), kind, names)
-
-    images = columns("detections", "ticks", "frame_number")
+    images = store.sample_arrays(connection, span, "detections", ("ticks", "frame_number"))
     # An observation ends at the first frame time at or after its planned end: up to one cadence after the span.
-    events = columns("events", "event_id", "frame_number", after_ticks=_cadence_ticks(record))
-    counters: dict[int, list[int]] = {STARTED: [], STOPPED: []}
-    for event, number in zip(events["event_id"], events["frame_number"], strict=True):
-        if event in counters:
-            counters[event].append(number)
+    later = replace(span, stop_ticks=span.stop_ticks + cadence_ticks(record))
+    events = store.sample_arrays(connection, later, "events", ("event_id", "frame_number"))
+    started = events["frame_number"][events["event_id"] == STARTED]
+    stopped = events["frame_number"][events["event_id"] == STOPPED]
     return _Images(
-        len(set(images["ticks"])),
-        min(images["frame_number"], default=0),
-        max(images["frame_number"], default=-1),
-        min(counters[STARTED], default=None),
-        max(counters[STOPPED], default=None),
+        np.unique(images["ticks"]).size,
+        int(images["frame_number"].min()) if images["ticks"].size else 0,
+        int(images["frame_number"].max(initial=-1)),
+        int(started.min()) if started.size else None,
+        int(stopped.max()) if stopped.size else None,
     )
 
 
-def _cadence_ticks(record: PassRecord) -> int:
+def cadence_ticks(record: PassRecord) -> int:
+    """Return the interval of the frames of a pass; 0 if it is not stated."""
     cadence_s = record.manifest.get("cadence_s")
     return 0 if cadence_s is None else round(cadence_s * TICKS_PER_SECOND)
 
@@ -247,8 +269,8 @@ def _completeness(
     if len(ticks) == 0:
         return None
     edges = np.linspace(record.start_utc_ns, record.stop_utc_ns, COMPLETENESS_BINS + 1).astype(np.int64)
-    received = np.histogram(np.clip(span.utc_ns(list(ticks)), edges[0], edges[-1]), edges)[0]
-    when = np.clip(span.utc_ns(lost[:, 0].astype(np.int64).tolist()), edges[0], edges[-1])
+    received = np.histogram(np.clip(span.utc_ns(ticks), edges[0], edges[-1]), edges)[0]
+    when = np.clip(span.utc_ns(lost[:, 0].astype(np.int64)), edges[0], edges[-1])
     missing = np.histogram(when, edges, weights=lost[:, 1])[0]
     return CompletenessSeries(edges, received + np.rint(missing).astype(np.int64), received.astype(np.int64))
 

@@ -152,10 +152,10 @@ def get_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassDetail:
     return service.get_pass(ground, pass_id)
 
 
-@passes.get("/passes/{pass_id}/completeness")
-def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Completeness:
+@passes.get("/passes/{pass_id}/completeness", response_model=Completeness)
+def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Response:
     """Count the received and missing packets of a pass."""
-    return Completeness.of_accounting(service.completeness(ground, pass_id))
+    return Response(service.completeness_document(ground, pass_id), media_type="application/json")
 
 
 @passes.get("/passes/{pass_id}/detections")

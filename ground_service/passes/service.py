@@ -17,10 +17,12 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.ingest.redecode import readable_version
+from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
 from ground_service.passes import store
-from ground_service.passes.cache import remembered
+from ground_service.passes.cache import Cache
 from ground_service.passes.model import (
+    Completeness,
     Crater,
     Detection,
     Event,
@@ -30,7 +32,7 @@ from ground_service.passes.model import (
     SpacecraftEvent,
     Trend,
 )
-from ground_service.passes.packet_accounting import packet_accounting
+from ground_service.passes.packet_accounting import cadence_ticks, packet_accounting
 from ground_service.passes.parameters import series_source, state_unit
 from ground_service.passes.series import (
     PARAMETERS,
@@ -47,7 +49,7 @@ from ground_service.passes.span import (
     pass_span,
     vehicle_span,
 )
-from ground_service.passes.store import detection_frames, detection_samples, event_list
+from ground_service.passes.store import detection_frames, detection_samples
 from ground_service.passes.trends import trend_of
 from ground_service.store import rollups
 from ground_service.store.files import StoredFile
@@ -56,7 +58,7 @@ from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.store import load_correlations
 from lunar.catalogue import CraterCatalogue, load_catalogue
-from reports.values import PacketAccounting, PassEvent
+from reports.values import PacketAccounting
 from tmtc.dictionary import DICTIONARY
 
 TREND_DAYS = 30
@@ -141,30 +143,44 @@ def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
     """Return the accounting of the received and missing packets of a pass."""
     with ground.database.reading() as connection:
         record = store.get_pass(connection, pass_id)
-        return remembered(
-            ground,
-            connection,
-            ("completeness", pass_id),
-            lambda: packet_accounting(ground.files, connection, record, pass_span(connection, record)),
-        )
+        return packet_accounting(ground.files, connection, record, pass_span(connection, record))
 
 
-def events(ground: Ground, pass_id: int) -> tuple[PassEvent, ...]:
-    """Return the event reports of a pass, in time order."""
+def completeness_document(ground: Ground, pass_id: int) -> bytes:
+    """As `completeness`, as JSON of `Completeness`, kept until data of the pass are new."""
     with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
-        return remembered(
-            ground,
-            connection,
-            ("events", pass_id),
-            lambda: event_list(connection, pass_span(connection, record)),
+        record, span, cache = _opened(ground, connection, pass_id)
+
+        def make() -> bytes:
+            found = packet_accounting(ground.files, connection, record, span)
+            return Completeness.of_accounting(found).model_dump_json().encode()
+
+        stop = span.stop_ticks + cadence_ticks(record)
+        where = (span.vehicle, span.start_ticks, span.stop_ticks)
+        return cache.answer(
+            ("completeness", pass_id),
+            make,
+            start_ticks=span.start_ticks,
+            stop_ticks=stop,
+            state=results_state(connection, *where),
         )
+
+
+def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassRecord, PassSpan, Cache]:
+    """Return a pass, its interval of on-board time, and the cached answers on its vehicle."""
+    record = store.get_pass(connection, pass_id)
+    cache = Cache(ground, connection, record.vehicle_id)
+    # An empty interval: telemetry does not change it.
+    span = cache.answer(("span", pass_id), lambda: pass_span(connection, record), start_ticks=1, stop_ticks=0)
+    return record, span, cache
 
 
 def list_events(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Event], int]:
     """Return a page of the event reports of a pass, in time order, and the total number."""
-    found = events(ground, pass_id)
-    return [Event.of(asdict(one), time=one.utc_ns) for one in found[offset : offset + limit]], len(found)
+    with ground.database.reading() as connection:
+        _, span, _ = _opened(ground, connection, pass_id)
+        found, total = store.event_page(connection, span, newest_first=False, limit=limit, offset=offset)
+    return [Event.of(asdict(one), time=one.utc_ns) for one in found], total
 
 
 def spacecraft_events(
@@ -214,10 +230,12 @@ def _pass_at(passes: Sequence[PassRecord], utc_ns: int) -> int | None:
 def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:
     """Return a page of the detections of a pass, in time order, and the total number."""
     with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
-        span = pass_span(connection, record)
-        ticks, offsets = remembered(
-            ground, connection, ("frames", pass_id), lambda: detection_frames(connection, span)
+        _, span, cache = _opened(ground, connection, pass_id)
+        ticks, offsets = cache.answer(
+            ("frames", pass_id),
+            lambda: detection_frames(connection, span),
+            start_ticks=span.start_ticks,
+            stop_ticks=span.stop_ticks,
         )
         total = int(offsets[-1])
         rows = np.arange(min(offset, total), min(offset + limit, total))
@@ -284,27 +302,32 @@ def state_series(
         If there is no such pass or no such estimator.
     """
     with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
-        return _state_series(connection, record, estimator, values, max_points)
+        span = pass_span(connection, store.get_pass(connection, pass_id))
+        return _state_series(connection, span, estimator, values, max_points)
 
 
 def states_document(
     ground: Ground, pass_id: int, estimator: str, values: tuple[str, ...], max_points: int
 ) -> bytes:
-    """As `state_series`, as JSON, kept until something is new."""
+    """As `state_series`, as JSON, kept until data of the pass are new."""
     with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
+        _, span, cache = _opened(ground, connection, pass_id)
 
         def make() -> bytes:
-            found = _state_series(connection, record, estimator, values, max_points)
+            found = _state_series(connection, span, estimator, values, max_points)
             return _json({"estimator": estimator, "series": [series_document(one) for one in found]})
 
-        return remembered(ground, connection, ("states", pass_id, estimator, values, max_points), make)
+        return cache.answer(
+            ("states", pass_id, estimator, values, max_points),
+            make,
+            start_ticks=span.start_ticks,
+            stop_ticks=span.stop_ticks,
+        )
 
 
 def _state_series(
     connection: Connection,
-    record: PassRecord,
+    span: PassSpan,
     estimator: str,
     values: tuple[str, ...],
     max_points: int,
@@ -315,7 +338,6 @@ def _state_series(
     codes = {name: code for code, name in DICTIONARY.labels("navigation_state", "estimator").items()}
     if estimator not in codes:
         raise NotFound("estimator", estimator[:80])
-    span = pass_span(connection, record)
     source = KindSamples("navigation_states", span.dictionary_version, codes[estimator])
     reading = SeriesReading(connection, span, source, max_points)
     found = reading.series({value: state_unit(value) for value in values})
@@ -331,15 +353,20 @@ def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: i
 
 
 def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points: int) -> bytes:
-    """As `parameter_series`, as JSON, kept until something is new."""
+    """As `parameter_series`, as JSON, kept until data of the pass are new."""
     with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
+        _, span, cache = _opened(ground, connection, pass_id)
 
         def make() -> bytes:
-            span = pass_span(connection, record)
             return _json(series_document(_parameter_series(connection, span, parameter, max_points)))
 
-        return remembered(ground, connection, ("parameter", pass_id, parameter, max_points), make)
+        return cache.answer(
+            ("parameter", pass_id, parameter, max_points),
+            make,
+            start_ticks=span.start_ticks,
+            stop_ticks=span.stop_ticks,
+            state=store.declared_state(connection, span.vehicle),
+        )
 
 
 def _parameter_series(connection: Connection, span: PassSpan, parameter: str, max_points: int) -> Series:
@@ -384,7 +411,7 @@ def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list
 def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
     """Return the trends over the last `TREND_DAYS` days of on-board time with housekeeping."""
     with ground.database.reading() as connection:
-        return remembered(ground, connection, ("trends", vehicle), lambda: _trends(connection, vehicle))
+        return Cache(ground, connection, vehicle).answer("trends", lambda: _trends(connection, vehicle))
 
 
 def _trends(connection: Connection, vehicle: int) -> list[Trend]:

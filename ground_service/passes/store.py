@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, ScalarSelect, func, insert, select
+from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
 
 from ground_service.passes.model import PassDetail, PassRecord, PassSummary
 from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
 from ground_service.store import repository, telemetry
-from ground_service.store.codec import unpack_detections
+from ground_service.store.codec import DETECTION_ITEM, unpack_detections
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import IntArray
 from reports.values import PassEvent
@@ -210,36 +210,28 @@ def passes_with_images(
     return [PassRecord.of(row) for row in rows]
 
 
-def archive_state(connection: Connection) -> Hashable:
-    """Return a value that differs after new packets, ingests, decodings or correlations.
-
-    Everything else of the archive that answers depend on is never changed.
-    """
-    newest = tuple(connection.execute(_NEWEST).one())
-    decoded = [tuple(row) for query in (_DECODED, _DECLARED) for row in connection.execute(query)]
-    return (*newest, *decoded)
+def decoding_state(connection: Connection, vehicle: int) -> Hashable:
+    """Return a value that differs after another decoding of the packets of a vehicle."""
+    return tuple(connection.execute(_DECODED, {"vehicle": vehicle}).one())
 
 
-_NEWEST = select(
-    *(
-        select(value).scalar_subquery()
-        for value in (
-            func.max(repository.PACKETS.c.id),
-            func.max(repository.INGESTS.c.finished_utc_ns),
-            func.max(repository.CORRELATIONS.c.id),
-            func.sum(repository.CORRELATIONS.c.superseded),
-        )
+def declared_state(connection: Connection, vehicle: int) -> Hashable:
+    """Return a value that differs after more packets were decoded that mission descriptions declare."""
+    return tuple(tuple(row) for row in connection.execute(_DECLARED, {"vehicle": vehicle}))
+
+
+_DECODED = select(repository.VEHICLES.c.decoded_version, repository.VEHICLES.c.redecoding_version).where(
+    repository.VEHICLES.c.id == bindparam("vehicle")
+)
+_DECLARED = (
+    select(
+        repository.PACKET_DECODINGS.c.definition_id,
+        repository.PACKET_DECODINGS.c.decoded_to,
+        repository.PACKET_DECODINGS.c.complete,
     )
+    .where(repository.PACKET_DECODINGS.c.vehicle_id == bindparam("vehicle"))
+    .order_by(repository.PACKET_DECODINGS.c.definition_id)
 )
-_DECODED = select(repository.VEHICLES.c.id, repository.VEHICLES.c.decoded_version).order_by(
-    repository.VEHICLES.c.id
-)
-_DECLARED = select(
-    repository.PACKET_DECODINGS.c.vehicle_id,
-    repository.PACKET_DECODINGS.c.definition_id,
-    repository.PACKET_DECODINGS.c.decoded_to,
-    repository.PACKET_DECODINGS.c.complete,
-).order_by(repository.PACKET_DECODINGS.c.vehicle_id, repository.PACKET_DECODINGS.c.definition_id)
 
 
 def samples(connection: Connection, span: PassSpan, kind: str, names: Sequence[str]) -> dict[str, list[Any]]:
@@ -306,9 +298,25 @@ def _first_reports(rows: Mapping[str, list[Any]]) -> list[int]:
 
 def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
     """On-board time of every frame (n,), ascending, and where its detections begin among all of the span (n + 1,)."""
+    table = repository.SAMPLES["detections"]
+    query = (
+        select(table.c.ticks, table.c.frame_number, func.length(table.c["items"]))
+        .where(
+            table.c.vehicle_id == span.vehicle,
+            table.c.dictionary_version == span.dictionary_version,
+            table.c.ticks.between(span.start_ticks, span.stop_ticks),
+        )
+        .order_by(table.c.ticks, table.c.frame_number)
+    )
+    rows = telemetry.whole_numbers(connection, query)
+    if (np.diff(rows[:, :2], axis=0) == 0).all(axis=1).any():
+        return _detection_frames_by_content(connection, span)
+    return rows[:, 0], np.concatenate(([0], np.cumsum(rows[:, 2] // DETECTION_ITEM.itemsize)))
+
+
+def _detection_frames_by_content(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
+    """As `detection_frames`, where images were reported twice: of two reports the first by content counts."""
     rows = samples(connection, span, "detections", ("ticks", "frame_number", "items"))
-    if not rows["ticks"]:
-        return np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
     chosen = _first_reports(rows)
     _, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
     return np.array([rows["ticks"][i] for i in chosen], dtype=np.int64), offsets
@@ -332,14 +340,16 @@ def event_page(
     connection: Connection,
     span: PassSpan,
     *,
-    severities: Sequence[str],
-    name: str | None,
+    severities: Sequence[str] = (),
+    name: str | None = None,
+    newest_first: bool = True,
     limit: int,
     offset: int,
 ) -> tuple[list[PassEvent], int]:
-    """Return a page of the event reports of a span that match, newest first, and their number.
+    """Return a page of the event reports of a span that match, in time order, and their number.
 
-    No severities: all. `name` is a part of the name of the event.
+    No severities: all. `name` is a part of the name of the event. Reports of one time are in the order of their
+    content, whatever the order in which they came.
     """
     table = repository.SAMPLES["events"]
     where = [
@@ -354,10 +364,13 @@ def event_page(
         labels = DICTIONARY.labels("event_info", "event_id")
         where.append(table.c.event_id.in_([code for code, label in labels.items() if part in label]))
     total = connection.execute(select(func.count()).select_from(table).where(*where)).scalar_one()
+    order = [
+        table.c[column] for column in ("ticks", "event_id", "frame_number", "value_1", "value_2", "packet_id")
+    ]
     query = (
         select(*(table.c[column] for column in _EVENT_COLUMNS))
         .where(*where)
-        .order_by(table.c.ticks.desc(), table.c.packet_id.desc())
+        .order_by(*(column.desc() if newest_first else column for column in order))
         .limit(limit)
         .offset(offset)
     )

@@ -136,6 +136,12 @@ def last_number(connection: Connection) -> int:
     return int(connection.execute(select(func.max(_EVENTS.c.id))).scalar() or 0)
 
 
+def newest_event(connection: Connection) -> LoggedEvent | None:
+    """Return the newest event; None without events."""
+    row = connection.execute(select(_EVENTS).order_by(_EVENTS.c.id.desc()).limit(1)).first()
+    return None if row is None else LoggedEvent(*row)
+
+
 def position_of(connection: Connection, consumer: str) -> int:
     """Return the number of the last event that a consumer has handled; 0 before its first."""
     query = select(_POSITIONS.c.number).where(_POSITIONS.c.consumer == consumer)

@@ -27,8 +27,18 @@ def packet_headers(
     if stop_ticks is not None:
         query = query.where(PACKETS.c.ticks <= stop_ticks)
     query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
-    rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 3)
+    rows = whole_numbers(connection, query)
     return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
+
+
+def whole_numbers(connection: Connection, query: Select[Any]) -> IntArray:
+    """Return the rows of a query of whole numbers (n, columns).
+
+    Plain tuples of the driver need no translation; rows as objects take most of the time.
+    """
+    with connection.execute(query) as result:
+        rows = result.cursor.fetchall()
+    return np.array(rows, dtype=np.int64).reshape(-1, len(query.selected_columns))
 
 
 def _apids(connection: Connection, vehicle: int) -> list[int]:

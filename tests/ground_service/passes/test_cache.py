@@ -1,0 +1,163 @@
+"""Cached answers: kept while other data come, made again with new data of their interval, made once for many."""
+
+import threading
+from collections.abc import Callable, Hashable
+
+import pytest
+from sqlalchemy import delete
+
+from ground_service.events import CorrelationChanged, LinkChanged, TelemetryReceived, publish
+from ground_service.events import Event as Published
+from ground_service.ground import Ground
+from ground_service.passes import cache as module
+from ground_service.passes.cache import Cache
+from ground_service.store.models import EVENT_LOG
+from ground_service.store.vehicles import change_vehicle, vehicle_id
+
+START, STOP = 1000, 2000
+
+
+class Archive:
+    """Events of two vehicles, and a cached answer on an interval of the first: how often it was made."""
+
+    def __init__(self, ground: Ground) -> None:
+        self.ground = ground
+        with ground.database.writing() as connection:
+            self.vehicle, self.other = (vehicle_id(connection, 76, name) for name in ("flight", "other"))
+            publish(connection, LinkChanged(link="first", state="open"))
+        self.made = 0
+
+    def happens(self, *events: Published) -> None:
+        with self.ground.database.writing() as connection:
+            for one in events:
+                publish(connection, one)
+
+    def telemetry(self, first: int | None, last: int | None, **more: int) -> None:
+        vehicle = more.pop("vehicle", self.vehicle)
+        self.happens(
+            TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=first, last_ticks=last, **more)
+        )
+
+    def make(self) -> int:
+        self.made += 1
+        return self.made
+
+    def ask(self, state: Hashable = None) -> int:
+        with self.ground.database.reading() as connection:
+            cache = Cache(self.ground, connection, self.vehicle)
+            return cache.answer("answer", self.make, start_ticks=START, stop_ticks=STOP, state=state)
+
+
+@pytest.fixture
+def archive(ground: Ground) -> Archive:
+    return Archive(ground)
+
+
+def test_an_answer_is_kept_while_data_of_other_intervals_and_vehicles_come(archive: Archive) -> None:
+    assert archive.ask() == 1
+    archive.telemetry(0, START - 1)
+    archive.telemetry(STOP + 1, STOP + 9)
+    archive.telemetry(START, STOP, vehicle=archive.other)
+    archive.happens(CorrelationChanged(vehicle_id=archive.other, segments=1))
+    archive.happens(LinkChanged(link="first", state="closed"))
+    assert archive.ask() == 1
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, START), (STOP, STOP + 9), (None, None), (1200, 1300)])
+def test_an_answer_is_made_again_with_new_data_of_its_interval(
+    archive: Archive, first: int | None, last: int | None
+) -> None:
+    assert archive.ask() == 1
+    archive.telemetry(first, last)
+    assert archive.ask() == 2
+    assert archive.ask() == 2
+
+
+def test_samples_of_other_times_than_their_packets_count(archive: Archive) -> None:
+    assert archive.ask() == 1
+    archive.telemetry(STOP + 5, STOP + 9, first_sample_ticks=STOP)
+    assert archive.ask() == 2
+    archive.telemetry(0, START - 5, last_sample_ticks=START)
+    assert archive.ask() == 3
+
+
+def test_correlations_decodings_and_other_states_make_an_answer_again(archive: Archive) -> None:
+    assert archive.ask() == 1
+    archive.happens(CorrelationChanged(vehicle_id=archive.vehicle, segments=1))
+    assert archive.ask() == 2
+    with archive.ground.database.writing() as connection:
+        change_vehicle(connection, archive.vehicle, decoded_version=7)
+    assert archive.ask() == 3
+    assert archive.ask("other") == 4
+    assert archive.ask("other") == 4
+
+
+def test_a_gap_in_the_events_forgets_all_answers(archive: Archive) -> None:
+    assert archive.ask() == 1
+    archive.telemetry(START, STOP)
+    archive.telemetry(0, 1)
+    with archive.ground.database.writing() as connection:
+        newest = connection.execute(EVENT_LOG.select().order_by(EVENT_LOG.c.id.desc())).first()
+        assert newest is not None
+        connection.execute(delete(EVENT_LOG).where(EVENT_LOG.c.id < newest.id))
+    assert archive.ask() == 2
+
+
+def test_more_new_events_than_are_looked_at_forget_all_answers(archive: Archive) -> None:
+    assert archive.ask() == 1
+    for _ in range(2):
+        archive.happens(*[LinkChanged(link="first", state="open")] * (module.CHANGES_KEPT // 2))
+    assert archive.ask() == 2
+
+
+def test_an_answer_older_than_a_change_that_is_known_is_not_kept(archive: Archive) -> None:
+    with archive.ground.database.reading() as connection:
+        cache = Cache(archive.ground, connection, archive.vehicle)
+
+        def slow() -> str:
+            archive.telemetry(START, STOP)
+            with archive.ground.database.reading() as other:
+                Cache(archive.ground, other, archive.vehicle)
+            return "before the change"
+
+        assert cache.answer("answer", slow, start_ticks=START, stop_ticks=STOP) == "before the change"
+    assert archive.ask() == 1
+
+
+def test_an_answer_that_many_need_at_once_is_made_once(archive: Archive) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    found: list[int] = []
+
+    def slow() -> int:
+        begun.set()
+        assert go_on.wait(20)
+        return archive.make()
+
+    def ask(make: Callable[[], int]) -> None:
+        with archive.ground.database.reading() as connection:
+            cache = Cache(archive.ground, connection, archive.vehicle)
+            found.append(cache.answer("answer", make))
+
+    first = threading.Thread(target=ask, args=(slow,))
+    first.start()
+    assert begun.wait(20)
+    others = [threading.Thread(target=ask, args=(archive.make,)) for _ in range(3)]
+    for one in others:
+        one.start()
+    turns = module._databases[archive.ground.database.engine]._turns
+    while max(turn.threads for turn in list(turns.values())) < 4:
+        assert all(one.is_alive() for one in others)
+    go_on.set()
+    for one in (first, *others):
+        one.join(20)
+    assert found == [1, 1, 1, 1]
+    assert not turns
+
+
+def test_long_answers_are_made_each_time(archive: Archive) -> None:
+    with archive.ground.database.reading() as connection:
+        for size, kept in ((module.LONGEST_OCTETS, True), (module.LONGEST_OCTETS + 1, False)):
+            octets = [bytes(size), b"new"]
+            cache = Cache(archive.ground, connection, archive.vehicle)
+            assert cache.answer(size, lambda octets=octets: octets[0]) == octets[0]
+            assert (cache.answer(size, lambda octets=octets: octets[1]) == octets[0]) is kept
