@@ -162,6 +162,8 @@ class NavigationRun:
         Craters of the fix, and how many of them were taken for another.
     findable
         Detections in the frame of craters that are in the catalogue.
+    attitude_noise_rad
+        Noise of the attitude that the monitor estimates; 0 while it is as declared.
     """
 
     frame_utc_ns: IntArray
@@ -178,6 +180,7 @@ class NavigationRun:
     wrong: IntArray
     findable: IntArray
     altitude_m: FloatArray
+    attitude_noise_rad: FloatArray
 
     @property
     def error_m(self) -> FloatArray:
@@ -207,6 +210,8 @@ class Consistency:
         Position error, 3-D.
     fixed_share, wrong_share
         Frames fixed, of those with at least four findable craters; craters taken for others, of those matched.
+    degraded_share
+        Frames in which the monitor judges the attitude noisier than declared.
     """
 
     anees: float
@@ -218,6 +223,7 @@ class Consistency:
     largest_m: float
     fixed_share: float
     wrong_share: float
+    degraded_share: float
 
 
 def fly(case: NavigationCase, seed: int) -> NavigationRun:
@@ -288,6 +294,7 @@ def consistency(runs: Iterable[NavigationRun], settle_frames: int = 20) -> Consi
         largest_m=float(np.max(length)),
         fixed_share=float(np.mean(fixed[findable >= 4.0])),
         wrong_share=float(np.sum(joined("wrong")) / max(np.sum(matched), 1.0)),
+        degraded_share=float(np.mean(joined("attitude_noise_rad") > 0.0)),
     )
 
 
@@ -598,6 +605,7 @@ def _row(
         wrong,
         findable,
         float(np.linalg.norm(true_state[:3])) - MOON_RADIUS_M,
+        report.attitude_noise_rad,
     )
 
 

@@ -1,4 +1,7 @@
-"""Names of the codes that packets carry; `_1` marks the enumerations as version 1 of the dictionary has them."""
+"""Names of the codes that packets carry.
+
+`_1` marks the enumerations as version 1 of the dictionary has them, `EVENTS_2` the events of versions 2 to 6.
+"""
 
 from __future__ import annotations
 
@@ -50,13 +53,14 @@ TABLES_1: Labels = (
     (6, "thumbnail"), (7, "landmark_map"),
 )  # fmt: skip
 
-EVENTS: Labels = (
+EVENTS_2: Labels = (
     *EVENTS_1,
     (10, "activity_expired"), (11, "activity_failed"), (12, "thumbnail_stored"), (13, "report_definition_changed"),
     (23, "image_streak"), (24, "camera_recovered"),
     (59, "memory_repaired"), (60, "safe_mode_entered"), (61, "table_hash_mismatch"), (62, "memory_unrepairable"),
     (69, "store_overwritten"), (70, "event_reporting_changed"),
 )  # fmt: skip
+EVENTS: Labels = (*EVENTS_2, (39, "attitude_degraded"), (40, "attitude_restored"))
 FAILURES: Labels = (*FAILURES_1, (18, "unknown_structure"), (19, "structures_full"))
 FUNCTIONS: Labels = (
     *FUNCTIONS_1,

@@ -2,7 +2,8 @@
 
 Everything that crosses the link is defined here and, for optional instruments, in `tmtc.instruments`; the ICD and the
 XTCE export are generated from it. A version only adds packets, so that each version decodes the telemetry of older
-payloads. Versions after the third add the packets of instruments, the sixth the image report.
+payloads. Versions after the third add the packets of instruments, the sixth the image report, the seventh the events
+of the attitude monitor.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from tmtc.codes import (
     ESTIMATORS,
     EVENTS,
     EVENTS_1,
+    EVENTS_2,
     FAILURES,
     FAILURES_1,
     FUNCTIONS,
@@ -331,7 +333,7 @@ _STRUCTURE = Field(
 _MILLISECONDS = "Processor time a step, mean since the last report"
 
 
-def _second_telemetry() -> tuple[PacketDefinition, ...]:
+def _second_telemetry(events: Labels) -> tuple[PacketDefinition, ...]:
     """What version 2 adds: the filter in full, and the payload as a machine."""
     return (
         PacketDefinition(
@@ -376,7 +378,7 @@ def _second_telemetry() -> tuple[PacketDefinition, ...]:
                 ),
             ),
         ),
-        *_machine_telemetry(),
+        *_machine_telemetry(events),
     )  # fmt: skip
 
 
@@ -419,7 +421,7 @@ def _performance() -> PacketDefinition:
     )  # fmt: skip
 
 
-def _machine_telemetry() -> tuple[PacketDefinition, ...]:
+def _machine_telemetry(events: Labels) -> tuple[PacketDefinition, ...]:
     return (
         _performance(),
         PacketDefinition(
@@ -439,7 +441,7 @@ def _machine_telemetry() -> tuple[PacketDefinition, ...]:
         PacketDefinition(
             "disabled_events", APID_EVENTS, 5, 8, "Events that are not reported",
             (Field("count", "u8", "Number of events that follow"),),
-            Group("count", (Field("event_id", "u16", "Event", labels=EVENTS),)),
+            Group("count", (Field("event_id", "u16", "Event", labels=events),)),
         ),
         PacketDefinition(
             "schedule_report", APID_SCHEDULE, 11, 13, "Activities of the schedule, by release time",
@@ -553,11 +555,17 @@ DICTIONARY_1 = Dictionary(
     telemetry=_telemetry(EVENTS_1, FAILURES_1, TABLES_1),
     telecommands=_telecommands(EVENTS_1, FUNCTIONS_1, TABLES_1, ARGUMENTS_1, 1),
 )
-DICTIONARY_2 = Dictionary(
-    version=2,
-    telemetry=_telemetry(EVENTS, FAILURES, TABLES) + _second_telemetry(),
-    telecommands=_telecommands(EVENTS, FUNCTIONS, TABLES, ARGUMENTS, 31) + _second_telecommands(),
-)
+
+
+def _with_events(events: Labels) -> tuple[tuple[PacketDefinition, ...], tuple[PacketDefinition, ...]]:
+    """Return telemetry and telecommands of version 2, with the events of a version."""
+    return (
+        _telemetry(events, FAILURES, TABLES) + _second_telemetry(events),
+        _telecommands(events, FUNCTIONS, TABLES, ARGUMENTS, 31) + _second_telecommands(),
+    )
+
+
+DICTIONARY_2 = Dictionary(2, *_with_events(EVENTS_2))
 DICTIONARY_3 = Dictionary(
     version=3,
     telemetry=DICTIONARY_2.telemetry + _third_telemetry(),
@@ -567,17 +575,22 @@ DICTIONARY_3 = Dictionary(
 
 IMAGE_REPORTS_SINCE = 6
 """Dictionary version that added the image report."""
+ATTITUDE_EVENTS_SINCE = 7
+"""Dictionary version that added the events of the attitude monitor."""
 
 
 def _later(version: int) -> Dictionary:
     """Return the dictionary of a version after the third: with the packets of the instruments known by then."""
-    known = tuple(one.packet for one in instrument_telemetry() if one.since <= version)
+    telemetry, telecommands = _with_events(EVENTS if version >= ATTITUDE_EVENTS_SINCE else EVENTS_2)
+    telemetry += _third_telemetry() + tuple(
+        one.packet for one in instrument_telemetry() if one.since <= version
+    )
     if version >= IMAGE_REPORTS_SINCE:
-        known += _sixth_telemetry()
-    return Dictionary(version, DICTIONARY_3.telemetry + known, DICTIONARY_3.telecommands)
+        telemetry += _sixth_telemetry()
+    return Dictionary(version, telemetry, telecommands)
 
 
-_ADDED = sorted({one.since for one in instrument_telemetry()} | {IMAGE_REPORTS_SINCE})
+_ADDED = sorted({one.since for one in instrument_telemetry()} | {IMAGE_REPORTS_SINCE, ATTITUDE_EVENTS_SINCE})
 _VERSIONS = {
     dictionary.version: dictionary
     for dictionary in (DICTIONARY_1, DICTIONARY_2, DICTIONARY_3, *map(_later, _ADDED))

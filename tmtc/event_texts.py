@@ -131,6 +131,12 @@ EVENT_TEXTS: Mapping[str, EventText] = {
     "fix_refused": _of(
         "{0} candidates, {1} expected", ("candidate pairs", _number()), ("expected craters", _number())
     ),
+    "attitude_degraded": _of(
+        "noise {0} per axis, declared {1}",
+        ("estimated noise per axis, deg", _number("deg")),
+        ("declared noise per axis, deg", _number("deg")),
+    ),
+    "attitude_restored": _of("declared noise {0} per axis", ("declared noise per axis, deg", _number("deg"))),
     "anchor_read": _of("trigger: {0}, {1} estimator", ("trigger", _TRIGGER), ("estimator", _ESTIMATOR)),
     "clock_jump": _of("{0}", ("jump, s", _number("s"))),
     "clock_synchronised": _of("{0}", ("on-board time", _time)),

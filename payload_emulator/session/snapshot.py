@@ -29,7 +29,7 @@ from lunar.propagation import Trajectory
 from payload_emulator.errors import RecordError
 from payload_emulator.session.checkpoint import replace_file
 
-VERSION = 2
+VERSION = 3
 _HEADER = re.compile(rb"LINNA exact state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
 _EXPECTED = "the exact state of a session (linna emulate --continuous --snapshot)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")

@@ -51,8 +51,8 @@ def test_what_cannot_be_kept_or_belongs_elsewhere_is_refused_in_one_line() -> No
     octets = pack_snapshot("a", {"one": 1}, {})
     with pytest.raises(RecordError, match="expected the exact state of scenario b, found that of a"):
         unpack_snapshot(octets, "b", {})
-    with pytest.raises(RecordError, match="expected version 2 of the exact state, found 1"):
-        unpack_snapshot(octets.replace(b"version 2", b"version 1", 1), "a", {})
+    with pytest.raises(RecordError, match="expected version 3 of the exact state, found 1"):
+        unpack_snapshot(octets.replace(b"version 3", b"version 1", 1), "a", {})
 
 
 def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path) -> None:
 
 def sealed(document: bytes) -> bytes:
     """A pickle with the header that fits."""
-    return f"LINNA exact state, version 2, SHA-256 {sha256(document).hexdigest()}\n".encode() + document
+    return f"LINNA exact state, version 3, SHA-256 {sha256(document).hexdigest()}\n".encode() + document
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 11, 30, -1])

@@ -6,7 +6,8 @@ frame to a new state and a report of all decisions:
 1. predict the orbit to the time of the frame (`prediction`);
 2. associate detections with craters of the map (`association`) and correct the estimate (`correction`);
 3. where image and map keep disagreeing, widen the search, then search without a prior (`recovery`);
-4. map craters that the catalogue does not contain (`landmark_map`).
+4. monitor the noise of the attitude (`attitude_monitor`);
+5. map craters that the catalogue does not contain (`landmark_map`).
 
 A fix that fails its tests is refused: the orbit is then coasted on dynamics alone, and its uncertainty grows.
 """
@@ -33,6 +34,12 @@ from payload_emulator.flight.navigation.association import (
     detection_variance_px2,
     search_margin_px,
     tracking_limit_m,
+)
+from payload_emulator.flight.navigation.attitude_monitor import (
+    AttitudeMonitor,
+    RotationEvidence,
+    is_examined,
+    monitored,
 )
 from payload_emulator.flight.navigation.correction import Fix, correct
 from payload_emulator.flight.navigation.dynamics import OrbitModel, process_noise
@@ -89,6 +96,8 @@ class AnchoredSetup:
         Standard deviation of the empirical acceleration, radial, transverse, normal.
     burns
         Planned burns.
+    initial
+        Estimate that starts the filter.
     """
 
     parameters: AnchoredParameters
@@ -97,6 +106,7 @@ class AnchoredSetup:
     model: OrbitModel
     markov_sigma_m_s2: tuple[float, float, float]
     burns: BurnTable
+    initial: FilterState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +127,10 @@ class AnchoredState:
         Height of the ground in view above the sphere of the maps, according to the catalogue.
     disagreements
         Consecutive frames in which image and map disagree.
+    fixed_ticks
+        Time of the last fix; None before the first.
+    attitude
+        Monitor of the attitude.
     previous
         Detections of the previous frame for the relative measurement; None without.
     places
@@ -129,6 +143,8 @@ class AnchoredState:
     image_ticks: int
     surface_m: float = 0.0
     disagreements: int = 0
+    fixed_ticks: int | None = None
+    attitude: AttitudeMonitor = field(default_factory=AttitudeMonitor)
     previous: Remembered | None = None
     places: PlaceIndex | None = None
 
@@ -180,6 +196,8 @@ class AnchoredReport:
         The fix; None without one.
     new_landmarks
         Landmarks that were made or improved.
+    attitude_declared_rad, attitude_noise_rad
+        Standard deviation of the attitude per axis as declared, and as estimated if it is noisier, else 0.
     """
 
     outcome: Outcome
@@ -197,6 +215,8 @@ class AnchoredReport:
     ties: int = 0
     fix: Fix | None = None
     new_landmarks: tuple[Landmark, ...] = ()
+    attitude_declared_rad: float = 0.0
+    attitude_noise_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,6 +243,7 @@ class _Decisions:
 
     candidates: int = 0
     expected: int = 0
+    attitude_declared_rad: float = 0.0
     ties: int = 0
     fix: Fix | None = None
     new_landmarks: tuple[Landmark, ...] = field(default=())
@@ -241,9 +262,6 @@ def start(
     degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
     noise = process_noise(degree, gravity.name) if parameters.noise is None else parameters.noise
     model = OrbitModel(gravity, orientation, degree, noise)
-    setup = AnchoredSetup(
-        parameters, camera, catalogue, model, noise.markov_sigma_m_s2, no_burns() if burns is None else burns
-    )
     estimate = kalman.initial_filter_state(
         initial_state.ticks,
         initial_state.position_icrf_m,
@@ -253,6 +271,15 @@ def start(
         noise.markov_sigma_m_s2,
         parameters.errors,
     )
+    setup = AnchoredSetup(
+        parameters,
+        camera,
+        catalogue,
+        model,
+        noise.markov_sigma_m_s2,
+        no_burns() if burns is None else burns,
+        estimate,
+    )
     return setup, AnchoredState(estimate, landmark_map(catalogue), MapState(), initial_state.ticks)
 
 
@@ -261,17 +288,25 @@ def step(
 ) -> tuple[AnchoredState, AnchoredReport]:
     """Return the state after one frame and the report of its decisions.
 
-    Outside the orientation table neither dynamics nor catalogue can be used: the state then stays as it is.
+    Outside the orientation table neither dynamics nor catalogue can be used: the state then stays as it is. An estimate
+    that left the plausible distances from the Moon is replaced by the uploaded initial state.
     """
     found, camera_from_icrf = observation.found, observation.camera_from_icrf
     setup = _with_attitude_sigma(setup, observation.attitude_sigma_rad)
+    declared_rad = setup.parameters.errors.attitude_noise_rad
+    setup = _with_attitude_sigma(setup, state.attitude.sigma_rad(declared_rad))
     parameters = setup.parameters
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
     prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors)
+    if prior is not None and not is_usable(prior, parameters.limits):
+        state = replace(state, estimate=setup.initial, fixed_ticks=None, previous=None)
+        prior = predicted(setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors)
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
     state, decided = _entered(state, prior, observation, setup)
-    state = replace(state, estimate=kalman.with_attitude_error(state.estimate, observation.attitude_error))
+    decided = replace(decided, attitude_declared_rad=declared_rad)
+    error = _scaled(observation.attitude_error, parameters.errors.attitude_noise_rad, declared_rad)
+    state = replace(state, estimate=kalman.with_attitude_error(state.estimate, error))
     if found is None:
         return state, _report(state, setup, Outcome.no_image, mcmf_from_icrf, decided)
     if camera_from_icrf is None or not len(found):
@@ -281,18 +316,20 @@ def step(
         decided = replace(decided, ties=ties)
     pose = kalman.pose_of(state.estimate, camera_from_icrf, mcmf_from_icrf)
     search = search_around(state, pose, found, setup)
+    before = state.disagreements
     state = replace(
         state,
         estimate=search.prior,
-        disagreements=recovery.disagreements(
-            state.disagreements, search.fix, search.expected, len(found), parameters
-        ),
+        disagreements=recovery.disagreements(before, search.fix, search.expected, len(found), parameters),
     )
+    evidence = rotation_evidence(state, search, state.disagreements > before, pose, found, setup)
+    judged = monitored(state.attitude, evidence, declared_rad, setup.camera.focal_px, parameters.monitor)
     fix = search.fix
-    if fix is None:
+    if fix is None and not (evidence is not None and is_examined(judged, parameters.monitor)):
         state, fix = recovered(state, pose, found, setup)
     if fix is not None:
-        state = replace(state, estimate=fix.update.state)
+        state = replace(state, estimate=fix.update.state, fixed_ticks=observation.ticks)
+    state = with_judged_attitude(state, judged, parameters)
     decided = replace(decided, candidates=search.candidates, expected=search.expected, fix=fix)
     if parameters.map_landmarks:
         state, made = map_frame(state, fix, found, camera_from_icrf, mcmf_from_icrf, setup)
@@ -342,6 +379,16 @@ def _with_attitude_sigma(setup: AnchoredSetup, sigma_rad: float | None) -> Ancho
         return setup
     errors = replace(setup.parameters.errors, attitude_noise_rad=sigma_rad)
     return replace(setup, parameters=replace(setup.parameters, errors=errors))
+
+
+def _scaled(
+    error: kalman.AttitudeError | None, used_rad: float, declared_rad: float
+) -> kalman.AttitudeError | None:
+    """Return the attitude error with its covariances scaled from the declared to the used standard deviation."""
+    if error is None or not used_rad > declared_rad > 0.0:
+        return error
+    factor = (used_rad / declared_rad) ** 2
+    return kalman.AttitudeError(factor * error.covariance, error.memory, factor * error.added)
 
 
 def _entered(
@@ -423,6 +470,53 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     return Search(prior, fix, identification.candidates, expected)
 
 
+def rotation_evidence(
+    state: AnchoredState,
+    search: Search,
+    disagrees: bool,
+    pose: Pose,
+    found: Detections,
+    setup: AnchoredSetup,
+) -> RotationEvidence | None:
+    """Return what a frame says about a rotation of the camera; None without enough craters.
+
+    Where image and map disagree, craters are associated once more as if the attitude were uncertain by `trial_rad`. The
+    result is evidence of the attitude only: it corrects nothing.
+    """
+    parameters, fix = setup.parameters, search.fix
+    trial_rad = parameters.monitor.trial_rad
+    if disagrees:
+        prior = search.prior
+        if trial_rad <= parameters.errors.attitude_noise_rad or prior.position_sigma_m > tracking_limit_m(
+            prior, parameters
+        ):
+            return None
+        wide = replace(state, estimate=kalman.with_attitude_error(prior, None))
+        tried = search_around(wide, pose, found, _with_attitude_sigma(setup, trial_rad))
+        fix = tried.fix
+    if fix is None or len(fix.index) < parameters.monitor.least_craters:
+        return None
+    return replace(fix.update.rotation, trial=disagrees)
+
+
+def with_judged_attitude(
+    state: AnchoredState, judged: AttitudeMonitor, parameters: AnchoredParameters
+) -> AnchoredState:
+    """Return the state with the noise of the attitude as judged after a frame.
+
+    Fixes of the frames before the detection trusted the attitude too much: with it, the uncertainty of the orbit grows
+    by what one frame with such an attitude can displace it, and craters that took part of the error are dropped.
+    """
+    if judged.degraded and not state.attitude.degraded:
+        height_m = max(altitude_above_sphere_m(state.estimate), parameters.limits.lowest_altitude_m)
+        shift_m = judged.noise_rad * height_m
+        estimate = kalman.widened(
+            state.estimate.only_craters(kalman.TURN), shift_m, recovery.ORBITAL_RATE_RAD_S * shift_m
+        )
+        state = replace(state, estimate=estimate)
+    return replace(state, attitude=judged)
+
+
 def recovered(
     state: AnchoredState, pose: Pose, found: Detections, setup: AnchoredSetup
 ) -> tuple[AnchoredState, Fix | None]:
@@ -430,7 +524,10 @@ def recovered(
     parameters, camera, prior = setup.parameters, setup.camera, state.estimate
     if not recovery.is_widened_search_due(state.disagreements, parameters):
         return state, None
-    fix = recovery.search_widely(prior, pose, found, state.landmarks, camera, parameters)
+    unseen_s = math.inf
+    if state.fixed_ticks is not None:
+        unseen_s = (prior.ticks - state.fixed_ticks) / TICKS_PER_SECOND
+    fix = recovery.search_widely(prior, pose, found, state.landmarks, camera, parameters, unseen_s)
     if fix is None and recovery.is_lost_search_due(state.disagreements, parameters):
         places = place_index(state.landmarks) if state.places is None else state.places
         state = replace(state, places=places)
@@ -540,4 +637,6 @@ def _report(
         decided.ties,
         fix,
         decided.new_landmarks,
+        decided.attitude_declared_rad,
+        state.attitude.noise_rad,
     )

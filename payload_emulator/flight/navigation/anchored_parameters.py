@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.acquisition import AcquisitionParameters
+from payload_emulator.flight.navigation.attitude_monitor import MonitorParameters
 from payload_emulator.flight.navigation.dynamics import ProcessNoise
 from payload_emulator.flight.navigation.filter import CommonErrors
 from payload_emulator.flight.navigation.identification import IdentificationParameters
@@ -53,6 +54,10 @@ class AnchoredLimits:
         Search without a prior only in every n-th frame: a search takes up to a second.
     search_radius_sigmas
         Number of standard deviations that the half width of the widened search represents.
+    search_largest_m
+        Largest standard deviation of the position that a search by votes covers. Its time grows with the area: 28 km
+        are an area of 200 km by 200 km (`AcquisitionParameters.prior_sigmas`), beyond that the search without a prior
+        is faster.
     found_sigmas, found_position_m, found_velocity_m_s
         Initial uncertainty of the filter after a search without a prior: this multiple of the standard deviation of the
         position plus a floor, which covers the offset of the catalogue, and a floor of the velocity.
@@ -72,6 +77,7 @@ class AnchoredLimits:
     judged_craters: int = 4
     lost_search_every: int = 3
     search_radius_sigmas: float = 3.0
+    search_largest_m: float = 28e3
     found_sigmas: float = 3.0
     found_position_m: float = 200.0
     found_velocity_m_s: float = 1.0
@@ -108,6 +114,8 @@ class AnchoredParameters:
         Whether craters that are not in the catalogue are mapped and used on later passes, and the parameters of this.
     relative
         Whether the motion between two frames is measured with uncatalogued detections, and the parameters of this.
+    monitor
+        Parameters of the monitor of the attitude.
     limits
         Plausibility limits, gap limits and gates.
     crater_limit
@@ -134,4 +142,5 @@ class AnchoredParameters:
     mapping: MappingParameters = field(default_factory=MappingParameters)
     crater_limit: int = 32
     relative: RelativeParameters = field(default_factory=RelativeParameters)
+    monitor: MonitorParameters = field(default_factory=MonitorParameters)
     limits: AnchoredLimits = field(default_factory=AnchoredLimits)

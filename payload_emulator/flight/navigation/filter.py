@@ -18,6 +18,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
+from payload_emulator.flight.navigation.attitude_monitor import RotationEvidence
 from payload_emulator.flight.navigation.dynamics import OrbitModel
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting, look
 from tmtc.cuc import TICKS_PER_SECOND
@@ -167,6 +168,8 @@ class Update:
     attitude_rad, attitude_sigma_rad
         Rotation that the attitude of the frame is off by beyond what lasts, shape (3,), and what is left uncertain of
         it and of what lasts about the worst axis.
+    rotation
+        What the innovations say about a rotation of the camera.
     """
 
     state: FilterState
@@ -175,6 +178,7 @@ class Update:
     residual_px: FloatArray
     attitude_rad: FloatArray
     attitude_sigma_rad: float
+    rotation: RotationEvidence
 
 
 def initial_filter_state(
@@ -360,7 +364,12 @@ def update(
         if not (np.all(np.isfinite(innovation)) and np.all(np.isfinite(spread))):
             return None
         if step == 0:
-            nis = float(innovation @ np.linalg.solve(spread, innovation))
+            turning = design[:, turn : turn + 3]
+            solved = np.linalg.solve(spread, np.column_stack([innovation, turning]))
+            nis = float(innovation @ solved[:, 0])
+            rotation = RotationEvidence(
+                turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad
+            )
             spread_of_sum = spread.reshape(index.size, 2, index.size, 2).sum(axis=(0, 2))
             mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
         gain: FloatArray = np.asarray(np.linalg.solve(spread, crossed).T, dtype=np.float64)
@@ -385,6 +394,7 @@ def update(
         uv_px - after.uv_px,
         mean[turn : turn + 3],
         float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
+        rotation,
     )
 
 

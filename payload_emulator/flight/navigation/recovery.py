@@ -21,11 +21,12 @@ from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, look
 from payload_emulator.flight.vision.detections import Detections
 
 _NO_CRATERS = np.empty(0, dtype=np.int64)
-# Angular rate of a low orbit (2 pi in 111 minutes): an along-track position error implies a velocity error of this rate
-# times the position error.
-_ORBITAL_RATE_RAD_S = 1e-3
 # Highest altitude of a search without a prior over the predicted one.
 _HIGHEST_SHARE = 1.2
+
+ORBITAL_RATE_RAD_S = 1e-3
+"""Angular rate of a low orbit (2 pi in 111 minutes): an along-track position error implies a velocity error of this
+rate times the position error."""
 
 
 def disagreements(
@@ -67,21 +68,34 @@ def search_by_votes(
     camera: PinholeCamera,
     parameters: AnchoredParameters,
     radius_m: float,
+    unseen_s: float | None = None,
 ) -> Fix | None:
-    """Return a fix from a search by votes within a radius of the prediction; None where none is safe."""
+    """Return a fix from a search by votes around the prediction; None where none is safe.
+
+    Parameters
+    ----------
+    radius_m
+        Standard deviation of the position that the search covers, per axis.
+    unseen_s
+        Time since the last fix, inf without one, if the search goes beyond what the prediction claims; None if it does
+        not.
+    """
     prior = prior.only_craters(_NO_CRATERS)
     pairs = acquire(
         found,
         landmarks,
         pose,
         camera,
-        radius_m,
+        min(radius_m, parameters.limits.search_largest_m),
         np.sqrt(detection_variance_px2(found, parameters)),
         parameters.errors.attitude_noise_rad + parameters.errors.attitude_bias_rad,
         parameters.acquisition,
     )
     if pairs is None:
         return None
+    if unseen_s is not None:
+        moved_m = float(np.linalg.norm(pairs.pose.position_icrf_m - pose.position_icrf_m))
+        prior = kalman.widened(prior, moved_m, _velocity_error_m_s(moved_m, unseen_s, radius_m))
     sighting = look(landmarks, pairs.index, pairs.pose, camera)
     everything = np.arange(pairs.index.size)
     identification = Identification(pairs.detection, everything, pairs.candidates, pairs.needed)
@@ -98,14 +112,30 @@ def search_widely(
     landmarks: LandmarkMap,
     camera: PinholeCamera,
     parameters: AnchoredParameters,
+    unseen_s: float = math.inf,
 ) -> Fix | None:
-    """Return a fix from a search far beyond the claimed uncertainty of the estimate; None where none is safe."""
-    wide = prior.covariance.copy()
-    extra = parameters.search_radius_m / parameters.limits.search_radius_sigmas
-    wide[kalman.POSITION, kalman.POSITION] += np.eye(3) * extra**2
-    wide[kalman.VELOCITY, kalman.VELOCITY] += np.eye(3) * (_ORBITAL_RATE_RAD_S * extra) ** 2
-    widened = replace(prior, covariance=wide)
-    return search_by_votes(widened, pose, found, landmarks, camera, parameters, extra)
+    """Return a fix from a search far beyond the claimed uncertainty of the estimate; None where none is safe.
+
+    The uncertainty of the prediction grows by the distance at which the place was found, not by the radius of the
+    search: a short pass would otherwise determine the velocity from the errors of a few craters.
+
+    Parameters
+    ----------
+    unseen_s
+        Time since the last fix; inf without one.
+    """
+    radius_m = parameters.search_radius_m / parameters.limits.search_radius_sigmas
+    return search_by_votes(prior, pose, found, landmarks, camera, parameters, radius_m, unseen_s)
+
+
+def _velocity_error_m_s(moved_m: float, unseen_s: float, radius_m: float) -> float:
+    """Return the error of velocity that belongs to a position error of some size.
+
+    It is that of another place on the orbit, or of a motion that began after the last fix, such as a burn that is not
+    planned; the latter is limited to what the radius of the search stands for.
+    """
+    recent_m_s = moved_m / unseen_s if unseen_s > 0.0 else math.inf
+    return max(ORBITAL_RATE_RAD_S * moved_m, min(recent_m_s, ORBITAL_RATE_RAD_S * radius_m))
 
 
 def search_everywhere(
@@ -140,7 +170,7 @@ def search_everywhere(
         new,
         _turned_velocity(prior.mean[kalman.VELOCITY], old, new),
         limits.found_sigmas * float(place.sigma_m.max()) + limits.found_position_m,
-        _ORBITAL_RATE_RAD_S * float(np.linalg.norm(new - old)) + limits.found_velocity_m_s,
+        ORBITAL_RATE_RAD_S * float(np.linalg.norm(new - old)) + limits.found_velocity_m_s,
         markov_sigma_m_s2,
         parameters.errors,
     )

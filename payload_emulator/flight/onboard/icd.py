@@ -79,6 +79,11 @@ _FAULTS = (
         "the search for craters is widened until it is found again",
     ),
     (
+        "attitude noisier than declared",
+        "attitude_degraded, attitude_restored",
+        "the estimated noise is used in place of the declared one until it is restored",
+    ),
+    (
         "processor hangs",
         "watchdog_reset",
         "reset by the watchdog; the observation is resumed; `watchdog_limit` within an hour: safe",

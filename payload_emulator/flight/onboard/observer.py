@@ -305,6 +305,7 @@ class Observer:
             "fix_refused", outcome is Outcome.refused, float(report.candidates), float(report.expected)
         )
         self._trouble("filter_divergence", report.lost, max(report.sigma_rtn_m), 0.0)
+        self._report_attitude(report)
         self._telemetry.send(
             "navigation_state",
             {
@@ -369,6 +370,18 @@ class Observer:
         if present and event not in self._in_trouble:
             self._telemetry.event("medium", event, value_1, value_2)
         (self._in_trouble.add if present else self._in_trouble.discard)(event)
+
+    def _report_attitude(self, report: AnchoredReport) -> None:
+        """Report beginning and end of an attitude that is noisier than declared."""
+        degraded = bool(report.attitude_noise_rad > 0.0)
+        if degraded == ("attitude_degraded" in self._in_trouble):
+            return
+        (self._in_trouble.add if degraded else self._in_trouble.discard)("attitude_degraded")
+        noise_deg, declared_deg = np.degrees([report.attitude_noise_rad, report.attitude_declared_rad])
+        if degraded:
+            self._telemetry.event("medium", "attitude_degraded", float(noise_deg), float(declared_deg))
+        else:
+            self._telemetry.event("info", "attitude_restored", float(declared_deg))
 
     def _odometry_frame(self, mode: Mode, found: Detections) -> float:
         """Run one odometry on one frame, report it, and return the altitude it scaled the frame with."""

@@ -15,6 +15,7 @@ from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation import anchored, association, correction, recovery
 from payload_emulator.flight.navigation import filter as kalman
+from payload_emulator.flight.navigation.acquisition import Acquisition
 from payload_emulator.flight.navigation.anchored import (
     AnchoredReport,
     AnchoredSetup,
@@ -418,21 +419,71 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
     assert found_anywhere() is None
 
 
-def test_a_widened_search_adds_its_radius_to_what_the_orbit_believes(
-    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("moved_m", "unseen_s", "velocity_m_s"),
+    [
+        (2_000.0, np.inf, 2.0),  # no fix so far: 1e-3/s of the distance
+        (2_000.0, 4_000.0, 2.0),  # the last fix is a coast ago
+        (2_000.0, 500.0, 4.0),  # what moved the estimate came after the last fix
+        (2_000.0, 60.0, 8.0),  # not more than the radius of the search stands for
+        (2_000.0, -5.0, 8.0),  # a clock that was set back says nothing of the motion
+        (20_000.0, 60.0, 20.0),
+    ],
+)
+def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch, moved_m: float, unseen_s: float, velocity_m_s: float
 ) -> None:
-    """Half a width of 24 km is three sigma: 8 km, and a velocity of 1e-3/s of that."""
+    """Half a width of 24 km is three sigma: 8 km, and a velocity of 8 m/s."""
     navigator = orbit.navigator(search_radius_m=24_000.0)
     prior, found = navigator.estimate, orbit.detections(0)
-    calls = recorded(monkeypatch, recovery, "search_by_votes", "the fix")
-    chosen: Any = ("the map", "the camera", navigator.setup.parameters)
-    assert recovery.search_widely(prior, "the pose", found, *chosen) == "the fix"
-    ((wide, pose, given, *rest, radius_m),) = calls
-    assert (pose, radius_m) == ("the pose", 8_000.0) and given is found and tuple(rest) == chosen
+    pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    away = replace(pose, position_icrf_m=pose.position_icrf_m + np.array([0.0, moved_m, 0.0]))
+    none = np.empty(0, dtype=np.int64)
+    place = Acquisition(none, none, away, 5, 3)
+    acquired = recorded(monkeypatch, recovery, "acquire", place)
+    corrected: list[Any] = []
+    monkeypatch.setattr(recovery, "correct", lambda *given, **named: corrected.append((given, named)))
+    parameters = navigator.setup.parameters
+    chosen: Any = (found, navigator.state.landmarks, orbit.case.camera, parameters)
+    recovery.search_widely(prior, pose, *chosen, unseen_s)
+    assert acquired[0][4] == 8_000.0
+    (given, named) = corrected[0]
     added = np.zeros_like(prior.covariance)
-    added[:3, :3], added[3:6, 3:6] = np.eye(3) * 64e6, np.eye(3) * 64.0
-    np.testing.assert_allclose(wide.covariance - prior.covariance, added, rtol=1e-9, atol=1e-6)
-    np.testing.assert_array_equal(wide.mean, prior.mean)
+    added[:3, :3], added[3:6, 3:6] = np.eye(3) * moved_m**2, np.eye(3) * velocity_m_s**2
+    np.testing.assert_allclose(given[0].covariance - prior.covariance, added, rtol=1e-9, atol=1e-6)
+    np.testing.assert_array_equal(given[0].mean, prior.mean)
+    assert named == {"reacquired": True}
+    # A search within what the estimate claims adds nothing, and covers 28 km (1 sigma) at most.
+    recovery.search_by_votes(prior, pose, *chosen, 90_000.0)
+    assert acquired[1][4] == 28_000.0
+    np.testing.assert_array_equal(corrected[1][0][0].covariance, prior.covariance)
+
+
+def test_the_time_since_the_last_fix_goes_into_the_widened_search(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    navigator = orbit.navigator(suspicion_frames=1, lost_frames=100)
+    widened = recorded(monkeypatch, recovery, "search_widely")
+    monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: None)
+    empty = Detections(*np.full((5, 6), 5.0))
+    navigator.step(int(orbit.ticks[0]), empty, orbit.attitude(0))
+    fly(orbit, navigator, 1, 3)
+    assert navigator.state.fixed_ticks == orbit.ticks[2]
+    navigator.step(int(orbit.ticks[4]), empty, orbit.attitude(4))
+    assert [given[-1] for given in widened] == [np.inf, 30.0]
+
+
+def test_an_estimate_that_left_the_moon_starts_again_from_the_tables(orbit: Orbit) -> None:
+    navigator = orbit.navigator()
+    fly(orbit, navigator, 0, 3)
+    below = navigator.estimate.mean.copy()
+    below[:3] *= 0.9
+    broken = FilterState(
+        navigator.estimate.ticks, below, navigator.estimate.covariance, navigator.estimate.craters
+    )
+    navigator.state = replace(navigator.state, estimate=broken)
+    report = navigator.step(int(orbit.ticks[3]), orbit.detections(3), orbit.attitude(3))
+    assert report.outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
 
 
 def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(

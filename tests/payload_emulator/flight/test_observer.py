@@ -76,6 +76,7 @@ class Navigator:
         self.given: list[tuple[int, Detections | None, Any]] = []
         self.outcome, self.lost, self.fix, self.new_landmarks = Outcome.coasted, False, None, ()
         self.breaks = self.reacquired = False
+        self.attitude_noise_rad = 0.0
         root = RNG.standard_normal((18, 18))
         self.start = SimpleNamespace(estimate=None, landmarks=None)
         self.state = SimpleNamespace(
@@ -91,7 +92,7 @@ class Navigator:
             raise np.linalg.LinAlgError
         return self.state, AnchoredReport(
             self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
-            self.lost, 0, self.fix, self.new_landmarks,
+            self.lost, 0, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad,
         )  # fmt: skip
 
     def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
@@ -251,6 +252,19 @@ def test_lasting_trouble_is_reported_at_its_beginning(rig: SimpleNamespace) -> N
     assert names.count("filter_divergence") == 2 and names.count("fix_refused") == 1
     first = next(event for event in rig.telemetry.events if event[1] == "filter_divergence")
     assert first == ("medium", "filter_divergence", 6.0, 0.0)
+
+
+def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(rig: SimpleNamespace) -> None:
+    for noise_deg in (0.0, 0.2, 0.3, 0.0, 0.0, 1.0):
+        rig.navigator.attitude_noise_rad = np.radians(noise_deg)
+        look(rig)
+    found = [event for event in rig.telemetry.events if event[1].startswith("attitude")]
+    assert [event[:2] for event in found] == [
+        ("medium", "attitude_degraded"),
+        ("info", "attitude_restored"),
+        ("medium", "attitude_degraded"),
+    ]
+    np.testing.assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
 
 
 def test_a_reset_of_the_filter_is_told_and_counted(rig: SimpleNamespace) -> None:
