@@ -131,6 +131,9 @@ class AnchoredState:
         Time of the last fix; None before the first.
     attitude
         Monitor of the attitude.
+    trusted
+        Predictions for the frames in the window of the monitor since the last reset of the filter, oldest first,
+        without craters; none while the attitude is degraded.
     previous
         Detections of the previous frame for the relative measurement; None without.
     places
@@ -145,6 +148,7 @@ class AnchoredState:
     disagreements: int = 0
     fixed_ticks: int | None = None
     attitude: AttitudeMonitor = field(default_factory=AttitudeMonitor)
+    trusted: tuple[FilterState, ...] = ()
     previous: Remembered | None = None
     places: PlaceIndex | None = None
 
@@ -299,7 +303,7 @@ def step(
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
     prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors)
     if prior is not None and not is_usable(prior, parameters.limits):
-        state = replace(state, estimate=setup.initial, fixed_ticks=None, previous=None)
+        state = replace(state, estimate=setup.initial, fixed_ticks=None, previous=None, trusted=())
         prior = predicted(setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors)
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
@@ -329,7 +333,9 @@ def step(
         state, fix = recovered(state, pose, found, setup)
     if fix is not None:
         state = replace(state, estimate=fix.update.state, fixed_ticks=observation.ticks)
-    state = with_judged_attitude(state, judged, parameters)
+        if fix.reacquired:
+            state = replace(state, trusted=())
+    state = with_judged_attitude(state, judged, None if evidence is None else search.prior, setup)
     decided = replace(decided, candidates=search.candidates, expected=search.expected, fix=fix)
     if parameters.map_landmarks:
         state, made = map_frame(state, fix, found, camera_from_icrf, mcmf_from_icrf, setup)
@@ -366,7 +372,8 @@ def measured(
 
 def widened(state: AnchoredState, sigma_position_m: float, sigma_velocity_m_s: float) -> AnchoredState:
     """Return the state with more uncertainty per axis, after an event outside dynamics and burns such as a restart."""
-    return replace(state, estimate=kalman.widened(state.estimate, sigma_position_m, sigma_velocity_m_s))
+    estimate = kalman.widened(state.estimate, sigma_position_m, sigma_velocity_m_s)
+    return replace(state, estimate=estimate, trusted=())
 
 
 def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
@@ -500,21 +507,37 @@ def rotation_evidence(
 
 
 def with_judged_attitude(
-    state: AnchoredState, judged: AttitudeMonitor, parameters: AnchoredParameters
+    state: AnchoredState, judged: AttitudeMonitor, prior: FilterState | None, setup: AnchoredSetup
 ) -> AnchoredState:
     """Return the state with the noise of the attitude as judged after a frame.
 
-    Fixes of the frames before the detection trusted the attitude too much: with it, the uncertainty of the orbit grows
-    by what one frame with such an attitude can displace it, and craters that took part of the error are dropped.
+    Fixes before the detection trusted the attitude too much: with it, the estimate is replaced by the prediction from
+    the beginning of the window. If the filter was reset within the window, its uncertainty grows by what one frame
+    with such an attitude can displace it.
+
+    Parameters
+    ----------
+    prior
+        Prediction for the frame if the monitor got evidence from it, else None.
     """
-    if judged.degraded and not state.attitude.degraded:
-        height_m = max(altitude_above_sphere_m(state.estimate), parameters.limits.lowest_altitude_m)
+    parameters, before = setup.parameters, state.attitude
+    trusted = state.trusted
+    if prior is not None:
+        trusted = (*trusted, prior.only_craters(_NO_CRATERS))[-parameters.monitor.window_frames :]
+    if not judged.degraded or before.degraded:
+        return replace(state, attitude=judged, trusted=() if judged.degraded else trusted)
+    estimate = state.estimate
+    if trusted:
+        carried = predicted(trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors)
+        if carried is not None and is_usable(carried, parameters.limits):
+            estimate = carried
+    if len(trusted) <= len(before.window) and len(trusted) < parameters.monitor.window_frames:
+        height_m = max(altitude_above_sphere_m(estimate), parameters.limits.lowest_altitude_m)
         shift_m = judged.noise_rad * height_m
         estimate = kalman.widened(
-            state.estimate.only_craters(kalman.TURN), shift_m, recovery.ORBITAL_RATE_RAD_S * shift_m
+            estimate.only_craters(_NO_CRATERS), shift_m, recovery.ORBITAL_RATE_RAD_S * shift_m
         )
-        state = replace(state, estimate=estimate)
-    return replace(state, attitude=judged)
+    return replace(state, estimate=estimate, attitude=judged, trusted=())
 
 
 def recovered(

@@ -22,6 +22,8 @@ from lunar.arrays import FloatArray
 
 # Share of the frames, those with the largest rotations, that the rotation common to all frames is fitted without.
 _STANDING_OUT = 0.2
+# Of the three axes of a frame the best known one counts most: together they are worth one and a half.
+_AXES = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +163,9 @@ def monitored(
         worse = bool(found)
         if found:  # frames before the change say nothing of the present noise
             window, shown = window[-min(found) :], shown.newest(min(found))
-    noise_rad = min(math.sqrt(max(shown.mean, smallest_rad**2)), parameters.largest_rad)
+    # Few frames tell little about the noise: one standard error more is used.
+    variance = shown.mean * (1.0 + math.sqrt(2.0 / (_AXES * shown.effective_frames)))
+    noise_rad = min(math.sqrt(max(variance, smallest_rad**2)), parameters.largest_rad)
     return AttitudeMonitor(window, noise_rad if worse else 0.0)
 
 
@@ -185,6 +189,11 @@ class FrameVariances:
     @property
     def mean(self) -> float:
         return float(self.squares @ self.weights / max(float(self.weights.sum()), 1e-30))
+
+    @property
+    def effective_frames(self) -> float:
+        """Number of frames of equal weight with the same standard error of the mean."""
+        return float(self.weights.sum()) ** 2 / max(float(self.weights @ self.weights), 1e-30) or 1.0
 
 
 def frame_variances(window: tuple[RotationEvidence, ...], floor_rad: float) -> FrameVariances:
