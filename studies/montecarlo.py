@@ -223,7 +223,7 @@ class Consistency:
     largest_m: float
     fixed_share: float
     wrong_share: float
-    degraded_share: float
+    degraded_share: float = 0.0
 
 
 def fly(case: NavigationCase, seed: int) -> NavigationRun:
