@@ -238,9 +238,12 @@ def _gravity_octets(field: GravityField) -> bytes:
 def _attitude_errors(scenario: Scenario) -> CommonErrors:
     """How well the ADCS knows the attitude, by its data sheet: as flown, no better than flight believes as shipped."""
     errors, attitude = CommonErrors(), scenario.attitude
+    noise_deg = attitude.declared_noise_deg
+    if noise_deg < 0.0:
+        noise_deg = attitude.knowledge_noise_deg
     return replace(
         errors,
-        attitude_noise_rad=max(errors.attitude_noise_rad, float(np.radians(attitude.knowledge_noise_deg))),
+        attitude_noise_rad=max(errors.attitude_noise_rad, float(np.radians(noise_deg))),
         attitude_bias_rad=max(errors.attitude_bias_rad, float(np.radians(attitude.knowledge_bias_deg))),
     )
 

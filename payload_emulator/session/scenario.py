@@ -205,11 +205,15 @@ class NavigationSection:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSection:
-    """Pointing of the camera and what the ADCS knows of it, 1 sigma per axis."""
+    """Pointing of the camera and what the ADCS knows of it, 1 sigma per axis.
+
+    `declared_noise_deg` is what its data sheet states; negative: the true noise.
+    """
 
     pointing_error_deg: float = 0.0
     knowledge_noise_deg: float = 0.0
     knowledge_bias_deg: float = 0.0
+    declared_noise_deg: float = -1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,9 +52,9 @@ class MonitorParameters:
 
     Attributes
     ----------
-    rules
-        Any of them detects: the first a moderate excess of noise, the second a large one at once. In 20 simulated
-        passes with the declared noise the largest significances were 1.5 and 1.4.
+    moderate, sudden
+        Rules, any of which detects: the first a moderate excess of noise, the second a large one at once. In 20
+        simulated passes with the declared noise the largest significances were 1.5 and 1.4.
     least_frames
         With fewer frames there is no judgement.
     least_craters
@@ -71,7 +71,8 @@ class MonitorParameters:
         Largest standard deviation that is used.
     """
 
-    rules: tuple[DetectionRule, ...] = (DetectionRule(24, 0.2, 2.5), DetectionRule(5, 0.4, 3.0))
+    moderate: DetectionRule = DetectionRule(24, 0.2, 2.5)
+    sudden: DetectionRule = DetectionRule(5, 0.4, 3.0)
     least_frames: int = 5
     least_craters: int = 3
     floor_px: float = 0.15
@@ -82,7 +83,7 @@ class MonitorParameters:
 
     @property
     def window_frames(self) -> int:
-        return max(rule.frames for rule in self.rules)
+        return max(self.moderate.frames, self.sudden.frames)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +160,8 @@ def monitored(
         worse = shown.mean > (parameters.restored * smallest_rad) ** 2
     else:
         limit = (parameters.worse * smallest_rad) ** 2
-        found = [rule.frames for rule in parameters.rules if exceeds(shown.newest(rule.frames), limit, rule)]
+        rules = (parameters.moderate, parameters.sudden)
+        found = [rule.frames for rule in rules if exceeds(shown.newest(rule.frames), limit, rule)]
         worse = bool(found)
         if found:  # frames before the change say nothing of the present noise
             window, shown = window[-min(found) :], shown.newest(min(found))

@@ -197,6 +197,6 @@ INSTRUMENT = SimulatedInstrument(
     data_sheet=_data_sheet,
     start=start,
     measure=measure,
-    replaces=("attitude.knowledge_noise_deg", "attitude.knowledge_bias_deg"),
+    replaces=("attitude.knowledge_noise_deg", "attitude.knowledge_bias_deg", "attitude.declared_noise_deg"),
     gives_attitude=True,
 )

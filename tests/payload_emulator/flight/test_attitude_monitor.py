@@ -144,8 +144,8 @@ def flown(
 ) -> NavigationRun:
     parameters = AnchoredParameters(gravity_degree=50)
     if not watched:
-        never = (DetectionRule(24, 0.2, np.inf),)
-        parameters = replace(parameters, monitor=replace(parameters.monitor, rules=never))
+        never = DetectionRule(24, 0.2, np.inf)
+        parameters = replace(parameters, monitor=replace(parameters.monitor, moderate=never, sudden=never))
     return montecarlo.fly(
         navigation_case(60, attitude_noise_rad=float(np.radians(noise_deg)), parameters=parameters), seed
     )
