@@ -39,6 +39,9 @@ TICK_S = 0.1
 POLL_S = 0.05
 """A station that pauses for this long has sent what it has: the segment is ingested."""
 
+WHOLE_S = 0.01
+"""A station that pauses for this long after a whole frame has sent what it has, if the frames before were whole."""
+
 REST_S = 0.6
 """After this long, octets that show no frame are ingested as well."""
 
@@ -63,11 +66,13 @@ class _Progress:
     """Octets of the link in this process: received, and of these ingested.
 
     `heard_utc_ns` is the mission time of the newest reception, `empty_utc_ns` the one before the newest look at the
-    connection that found nothing. Octets that wait unread are no silence, however late they are read.
+    connection that found nothing. Octets that wait unread are no silence, however late they are read. `frame_octets` is
+    the length of a frame, with its record, of the segment that was ingested last; 0 if it did not hold whole frames.
     """
 
     received: int = 0
     ingested: int = 0
+    frame_octets: int = 0
     heard_utc_ns: int | None = None
     empty_utc_ns: int | None = None
     cut_utc_ns: dict[str, int] = field(default_factory=dict)
@@ -223,7 +228,7 @@ class LinkRunner:
             if self._progress.received - self._progress.ingested >= SPOOL_LIMIT_OCTETS:
                 self._stopping.wait(TICK_S)  # the flow control of TCP holds the station back
                 return
-            self._block = self._down.receive(POLL_S)
+            self._block = self._down.receive(WHOLE_S if self._holds_whole_frames else POLL_S)
             if self._block is None:
                 self._progress.empty_utc_ns = before
         octets = self._block
@@ -231,9 +236,12 @@ class LinkRunner:
             rest_s = time.monotonic() - self._last_block_s
             pause = rest_s >= PAUSE_S or not self._down.connected
             # Less than a frame stays in the segment for a while, to be continued by what comes next. A single frame
-            # is not recognised without its neighbours: the ingest joins it to them.
+            # is not recognised without its neighbours, unless those before it were whole.
+            idle = self._ingest_is_idle
             if self._spool.size and (
-                rest_s >= REST_S or ((self._ingest_is_idle or pause) and self._spool.holds_a_unit())
+                rest_s >= REST_S
+                or (idle and self._holds_whole_frames)
+                or ((idle or pause) and self._spool.holds_a_unit())
             ):
                 self._cut()
             return
@@ -245,6 +253,12 @@ class LinkRunner:
             self._down.send(ACKNOWLEDGEMENT.pack(self._acknowledged))
         if self._spool.size >= SEGMENT_OCTETS:
             self._cut()
+
+    @property
+    def _holds_whole_frames(self) -> bool:
+        """Return whether the segment ends with a frame, by the length of the frames before it."""
+        frame = self._progress.frame_octets
+        return bool(frame and self._spool.size and self._spool.size % frame == 0)
 
     @property
     def _ingest_is_idle(self) -> bool:
@@ -486,6 +500,7 @@ class LinkRunner:
             heard,
             _clock_offset_ns(made, heard),
         )
+        self._progress.frame_octets = _frame_octets(made)
         self._progress.ingested += octets
 
     # State
@@ -562,6 +577,15 @@ def ended_holder(home: Path, name: str) -> str | None:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return file.read(OWNER_LIMIT) or None
     return None
+
+
+def _frame_octets(made: IngestResult | None) -> int:
+    """Return the octets of each frame, with its record, of a piece of whole frames; 0 for any other piece."""
+    reception = None if made is None else made.reception
+    if reception is None or reception.octets_other or not reception.frames:
+        return 0
+    length, rest = divmod(reception.octets, reception.frames)
+    return 0 if rest else length
 
 
 def _clock_offset_ns(made: IngestResult | None, heard_utc_ns: int | None) -> int | None:

@@ -248,6 +248,10 @@ _trimmed: dict[Path, float] = {}
 """When this process trimmed each cache, by the monotonic clock."""
 
 
+_durable: set[Path] = set()
+"""Folders of an archive whose entries in its root this process has synchronised; they are not removed."""
+
+
 def files_of(home: Path, objects: ObjectStore | None = None) -> FileArchive:
     """Return the file archive of a service, in an object store or under its home folder."""
     return FileArchive(home / "files", None if objects is None else objects.under("files"))
@@ -315,7 +319,9 @@ class IncomingFile:
                     self._temporary = None
                 # also if another process stored it, because its synchronisation may still be pending
                 sync_folder(target.parent)
-                sync_folder(self._archive.root)
+                if target.parent not in _durable:
+                    sync_folder(self._archive.root)
+                    _durable.add(target.parent)
                 if objects is not None and fetched is None:
                     self._archive.trim_at_times()
                 return StoredFile(sha256, self._octets, target)

@@ -111,6 +111,31 @@ def test_octets_that_show_no_frame_are_ingested_after_a_rest_and_joined(
     assert hash_of(ground) == expected
 
 
+def test_a_lone_frame_after_whole_frames_is_ingested_without_a_rest(
+    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frames before it tell its length; a part of a frame waits for the rest of it."""
+    monkeypatch.setattr("ground_service.ingest.live._holds_a_unit", lambda octets: len(octets) > CADU)
+    monkeypatch.setattr("ground_service.links.runner.REST_S", 1000.0)
+    declare(ground, station.link().replace("silence_s = 1.0", "silence_s = 1000.0"))
+    with operated(ground) as runner:
+        connection = station.accept()
+        for start, stop in ((0, 5), (5, 6), (6, 7)):
+            connection.sendall(stream[start * CADU : stop * CADU])
+            until(lambda stop=stop: received_of(ground) == stop * CADU, f"{stop} frames in the archive")
+        connection.sendall(stream[7 * CADU : 8 * CADU - 9])
+        until(lambda: runner._spool.size == CADU - 9, "a part of a frame in the spool")
+        looks: list[float] = []
+        monkeypatch.setattr(runner, "_show_state", lambda: looks.append(0.0))
+        until(lambda: len(looks) > 9, "looks at the connection")
+        connection.sendall(stream[8 * CADU - 9 : 8 * CADU])
+        until(lambda: received_of(ground) == 8 * CADU, "8 frames in the archive")
+    with ground.database.reading() as connection_:
+        octets = [one.octets for one in connection_.execute(select(repository.PIECES.c.octets))]
+    assert octets[-3:] == [CADU, CADU, CADU]
+    assert sum(octets) == 8 * CADU
+
+
 def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
     either: Ground, station: Station, stream: bytes, expected: str
 ) -> None:

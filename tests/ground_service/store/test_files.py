@@ -48,10 +48,15 @@ def test_a_file_that_another_process_stored_is_synchronised_too(
 ) -> None:
     files = FileArchive(tmp_path)
     files.put_octets(b"telemetry")
+    monkeypatch.setattr("ground_service.store.files._durable", set())  # as in another process
     synchronised: list[str] = []
     monkeypatch.setattr(os, "fsync", lambda fd: synchronised.append(os.readlink(f"/proc/self/fd/{fd}")))
     stored = files.put_octets(b"telemetry")
     assert synchronised[-2:] == [str(stored.path.parent), str(tmp_path)]
+    synchronised.clear()
+    files.put_octets(b"telemetry")
+    assert len(synchronised) == 2, "octets and folder; the folder itself was synchronised before"
+    assert synchronised[-1] == str(stored.path.parent)
 
 
 def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, ended_process: int) -> None:
