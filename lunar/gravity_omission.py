@@ -69,6 +69,9 @@ _NEAR_SIDE_DEGREE, _FAR_SIDE_DEGREE = 87, 27
 REFERENCE_ALTITUDE_M = 30_000.0
 """Reference altitude of the densities in `FieldNoise`."""
 
+MEASURED_ALTITUDES_M = (10_000.0, 100_000.0)
+"""Altitude range in which the decrease of the noise with altitude was measured."""
+
 
 @dataclass(frozen=True, slots=True)
 class FieldNoise:
@@ -117,6 +120,23 @@ def field_noise(name: str, degree: int) -> FieldNoise:
     (near, near_height), (far, far_height) = sides
     oblique = _at_reference(_FAR_SIDE_OBLIQUE_M2_S3, _scale_height_m(_FAR_SIDE_DEGREE))
     return FieldNoise(near, far, oblique, near_height, far_height)
+
+
+def densities_at(noise: FieldNoise, position_mcmf_m: FloatArray, velocity_mcmf_m_s: FloatArray) -> FloatArray:
+    """Return the spectral densities (n, 3; R, T, N) at places (n, 3) of orbits with inertial velocities (n, 3)."""
+    radius_m = np.linalg.norm(position_mcmf_m, axis=1)
+    normal = np.cross(position_mcmf_m, velocity_mcmf_m_s)
+    cosine = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
+    far = (position_mcmf_m[:, 0] <= FAR_SIDE_COSINE * radius_m)[:, None]
+    densities = np.where(
+        far,
+        np.array(noise.far_psd_m2_s3) + cosine[:, None] * np.array(noise.far_oblique_psd_m2_s3),
+        np.array(noise.near_psd_m2_s3),
+    )
+    height_m = np.where(far[:, 0], noise.far_scale_height_m, noise.near_scale_height_m)
+    altitude_m = np.clip(radius_m - MOON_RADIUS_M, *MEASURED_ALTITUDES_M)
+    factor = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / height_m)
+    return np.asarray(factor[:, None] * densities, dtype=np.float64)
 
 
 def _scale_height_m(degree: float) -> float:

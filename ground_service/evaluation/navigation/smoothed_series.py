@@ -16,7 +16,7 @@ from ground_service.passes.samples import NavigationSamples
 from lunar.arrays import FloatArray
 from lunar.frames import Orientation, mcmf_from_spherical
 from lunar.gravity import GravityField
-from lunar.gravity_omission import omission_psd_m2_s3
+from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel
 from reports.values import NavigationSeries
 
@@ -27,10 +27,15 @@ SMOOTHER_DEGREE = 100
 def smoother_model(
     gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...]
 ) -> SmootherModel:
-    """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field."""
+    """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field.
+
+    The process noise is that of the filter: that of the field, by its name.
+    """
     degree = min(SMOOTHER_DEGREE, gravity.degree)
     return SmootherModel(
-        ForceModel(gravity, orientation, degree), white_psd_m2_s3=omission_psd_m2_s3(degree), burns=burns
+        ForceModel(gravity, orientation, degree),
+        burns=burns,
+        field_noise=field_noise(gravity.name, degree),
     )
 
 

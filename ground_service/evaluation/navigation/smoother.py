@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.frames import rtn_from_inertial
+from lunar.gravity_omission import FieldNoise, densities_at
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import tdb_s_from_utc_ns
 
@@ -91,7 +92,10 @@ class SmootherModel:
     forces
         Gravity field with Earth and Sun.
     white_psd_m2_s3
-        Power spectral density of the white acceleration (R, T, N), for gravity above the degree of the field.
+        Power spectral density of the white acceleration (R, T, N), if there is no `field_noise`.
+    field_noise
+        Error of the gravity field by side of the Moon, inclination and altitude, as white acceleration. It must be that
+        of the filter: with less noise over a coast than the filter had, the states before the coast count too much.
     markov_sigma_m_s2, correlation_s
         Standard deviation (R, T, N) and correlation time of the empirical acceleration.
     burns
@@ -103,6 +107,17 @@ class SmootherModel:
     markov_sigma_m_s2: tuple[float, float, float] = (2e-6, 2e-6, 2e-6)
     correlation_s: float = 900.0
     burns: tuple[CommandedBurn, ...] = ()
+    field_noise: FieldNoise | None = None
+
+    def densities(self, tdb_s: FloatArray, state: FloatArray) -> FloatArray:
+        """Return the spectral densities (n, 3; R, T, N) at times (n,) in states (n, 9)."""
+        if self.field_noise is None:
+            return np.tile(self.white_psd_m2_s3, (len(state), 1))
+        rotation = self.forces.orientation.mcmf_from_icrf(tdb_s)
+        position = np.einsum("nij,nj->ni", rotation, state[:, _POSITION])
+        return densities_at(
+            self.field_noise, position, np.einsum("nij,nj->ni", rotation, state[:, _VELOCITY])
+        )
 
 
 def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
@@ -206,7 +221,7 @@ def _step(
     transition[:, _ACCELERATION, _ACCELERATION] = decay[:, None, None] * np.eye(3)
     carried = np.concatenate([position, velocity, decay[:, None] * state[:, _ACCELERATION]], axis=1)
     carried[:, :6] += (push @ state[:, _ACCELERATION, None])[..., 0]
-    density = axes @ np.diag(model.white_psd_m2_s3) @ _turned(axes)
+    density = (axes * model.densities(tdb_s, state)[:, None, :]) @ _turned(axes)
     noise = np.zeros((len(state), SIZE, SIZE))
     noise[:, _POSITION, _POSITION] = density * length**3 / 3.0
     noise[:, _POSITION, _VELOCITY] = noise[:, _VELOCITY, _POSITION] = density * length**2 / 2.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.association import detection_variance_px2
 from payload_emulator.flight.navigation.filter import FilterState, Update
-from payload_emulator.flight.navigation.identification import Identification
+from payload_emulator.flight.navigation.identification import GATE, Identification
 from payload_emulator.flight.navigation.prediction import is_usable
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting
 from payload_emulator.flight.vision.detections import Detections
@@ -51,6 +51,8 @@ def correct(
 ) -> Fix | None:
     """Return the fix of identified craters; None where it contradicts the prediction as a whole.
 
+    Pairs of a reacquisition that all others contradict are left out, worst first, as long as enough remain.
+
     Parameters
     ----------
     altitude_m
@@ -60,9 +62,45 @@ def correct(
     if len(identification) > parameters.crater_limit:
         surest = np.argsort(variance[identification.detection], kind="stable")
         identification = identification.select(np.sort(surest[: parameters.crater_limit]))
+    while identification.believed or not reacquired:
+        fix = _fix(
+            prior,
+            pose,
+            found,
+            identification,
+            sighting,
+            landmarks,
+            camera,
+            parameters,
+            altitude_m,
+            reacquired,
+        )
+        if fix is None:
+            return None
+        worst = int(np.argmax(fix.update.contradiction))
+        # Pairs of a search by association were tested in this way already, those of votes were not.
+        if not reacquired or fix.update.contradiction[worst] < GATE:
+            return fix if _is_credible(prior, fix, parameters.limits) else None
+        identification = identification.select(np.delete(np.arange(len(identification)), worst))
+    return None
+
+
+def _fix(
+    prior: FilterState,
+    pose: Pose,
+    found: Detections,
+    identification: Identification,
+    sighting: Sighting,
+    landmarks: LandmarkMap,
+    camera: PinholeCamera,
+    parameters: AnchoredParameters,
+    altitude_m: float,
+    reacquired: bool,
+) -> Fix | None:
+    """Return the fix of identified craters without a test; None where the numbers allow none."""
     index = sighting.index[identification.sighted]
     uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
-    variance = variance[identification.detection]
+    variance = detection_variance_px2(found, parameters)[identification.detection]
     persistence = detection_persistence(found, parameters)[identification.detection]
     sigma_m = crater_sigma_m(landmarks.sigma_m[index], variance * persistence, altitude_m, camera, parameters)
     update = kalman.update(
@@ -76,12 +114,27 @@ def correct(
         camera,
         parameters.errors,
     )
-    limits = parameters.limits
-    if update is None or update.nis > frame_limit(2 * len(identification), limits.frame_gate_sigmas):
+    if update is None:
         return None
-    if not is_plausible(prior, update.state, limits):
-        return None
-    return Fix(identification, index, update, reacquired)
+    state = kalman.widened(update.state, 0.0, curvature_m_s(prior, update.state))
+    return Fix(identification, index, replace(update, state=state), reacquired)
+
+
+def _is_credible(prior: FilterState, fix: Fix, limits: AnchoredLimits) -> bool:
+    """Return whether a fix agrees with the prediction as a whole."""
+    limit = frame_limit(2 * len(fix.index), limits.frame_gate_sigmas)
+    return fix.update.nis <= limit and is_plausible(prior, fix.update.state, limits)
+
+
+def curvature_m_s(prior: FilterState, posterior: FilterState) -> float:
+    """Return the error of the velocity that a linear correction leaves: v (d / r)^2 / 2 for a position moved by d.
+
+    The velocity turns with the position about the Moon's centre. A correction of 60 km leaves 1 m/s, one of 1 km 0.3
+    mm/s.
+    """
+    position = prior.mean[kalman.POSITION]
+    turned = float(np.linalg.norm(posterior.mean[kalman.POSITION] - position) / np.linalg.norm(position))
+    return 0.5 * turned**2 * float(np.linalg.norm(prior.mean[kalman.VELOCITY]))
 
 
 def crater_sigma_m(

@@ -13,7 +13,12 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M
 from lunar.gravity import GravityField, packed, packed_gradient
-from lunar.gravity_omission import FAR_SIDE_COSINE, REFERENCE_ALTITUDE_M, field_noise
+from lunar.gravity_omission import (
+    FAR_SIDE_COSINE,
+    MEASURED_ALTITUDES_M,
+    REFERENCE_ALTITUDE_M,
+    field_noise,
+)
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from tmtc.cuc import TICKS_PER_SECOND
@@ -24,8 +29,6 @@ from tmtc.tables import BurnTable, GravityTable, OrientationTable
 _ARC_S = 60.0
 # RK4 at 5 s differs from 1 s by less than a millimetre over an orbit.
 _STEP_S = 5.0
-# Altitude range in which the decrease of the noise with altitude was measured.
-_LOWEST_M, _HIGHEST_M = 10_000.0, 100_000.0
 # The gradient of a field of degree 12 is right to a few parts in a thousand at 15 km.
 _GRADIENT_DEGREE = 12
 # Keeps the cosine of an inclination finite for a state without motion, which is no orbit.
@@ -169,7 +172,8 @@ class OrbitModel:
             height_m = noise.far_side_scale_height_m
         if height_m is None:
             return psd
-        altitude_m = min(max(radius_m - MOON_RADIUS_M, _LOWEST_M), _HIGHEST_M)
+        lowest_m, highest_m = MEASURED_ALTITUDES_M
+        altitude_m = min(max(radius_m - MOON_RADIUS_M, lowest_m), highest_m)
         factor = float(np.exp((REFERENCE_ALTITUDE_M - altitude_m) / height_m))
         return factor * psd[0], factor * psd[1], factor * psd[2]
 

@@ -170,6 +170,9 @@ class Update:
         it and of what lasts about the worst axis.
     rotation
         What the innovations say about a rotation of the camera.
+    contradiction
+        Squared normalised innovation of each sighting after the update with all the others, shape (n,): chi-square of
+        two degrees of freedom.
     """
 
     state: FilterState
@@ -179,6 +182,7 @@ class Update:
     attitude_rad: FloatArray
     attitude_sigma_rad: float
     rotation: RotationEvidence
+    contradiction: FloatArray
 
 
 def initial_filter_state(
@@ -395,7 +399,18 @@ def update(
         mean[turn : turn + 3],
         float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
         rotation,
+        _contradiction(spread, innovation),
     )
+
+
+def _contradiction(spread: FloatArray, innovation: FloatArray) -> FloatArray:
+    """Return how far each pair of innovations (2 n,) contradicts all others, shape (n,)."""
+    count = innovation.size // 2
+    inverse = np.linalg.inv(spread)
+    pull = (inverse @ innovation).reshape(count, 2)
+    each = np.arange(count)
+    blocks = inverse.reshape(count, 2, count, 2)[each, :, each]
+    return np.asarray(np.einsum("ka,kab,kb->k", pull, np.linalg.inv(blocks), pull), dtype=np.float64)
 
 
 def corrected_covariance(

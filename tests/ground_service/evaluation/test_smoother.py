@@ -7,16 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ground_service.evaluation.navigation.smoothed_series import smoother_model
 from ground_service.evaluation.navigation.smoother import (
     CommandedBurn,
     FilterStates,
     SmootherModel,
+    _carried,
     _legs,
     smooth,
 )
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import GravityField, builtin_gravity
+from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 
@@ -310,3 +313,23 @@ def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
         pytest.approx(45.0, abs=1e-5),
         pytest.approx(90.0, abs=1e-5),
     )
+
+
+def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> None:
+    field = replace(builtin_gravity(), name="LP165P")
+    model = smoother_model(field, IauOrientation(), ())
+    assert model.field_noise == field_noise("LP165P", min(100, field.degree))
+    tdb_s = float(tdb_s_from_utc_ns(EPOCH))
+    axes = IauOrientation().mcmf_from_icrf(tdb_s)
+    # Over 0 and 180 degrees of longitude, going north.
+    states = [np.r_[side * 1_767.4e3 * axes[0], 1_650.0 * axes[2], np.zeros(3)] for side in (1.0, -1.0)]
+    near, far = model.densities(np.full(2, tdb_s), np.array(states))
+    np.testing.assert_allclose(near, model.field_noise.near_psd_m2_s3, rtol=1e-6)
+    np.testing.assert_allclose(far, model.field_noise.far_psd_m2_s3, rtol=1e-3)
+    # The noise of a step is that of the place at its beginning.
+    carried = [
+        _carried(state[None], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9]), model)[2][0]
+        for state in states
+    ]
+    ratio = np.trace(carried[1][3:6, 3:6]) / np.trace(carried[0][3:6, 3:6])
+    assert ratio == pytest.approx(far.sum() / near.sum(), rel=0.02)

@@ -25,6 +25,7 @@ from payload_emulator.flight.navigation.anchored import (
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.correction import Fix, frame_limit
 from payload_emulator.flight.navigation.filter import FilterState
+from payload_emulator.flight.navigation.identification import Identification
 from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.lost_in_space import Place
 from payload_emulator.flight.navigation.outcomes import Outcome
@@ -457,6 +458,51 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     recovery.search_by_votes(prior, pose, *chosen, 90_000.0)
     assert acquired[1][4] == 28_000.0
     np.testing.assert_array_equal(corrected[1][0][0].covariance, prior.covariance)
+
+
+def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit: Orbit) -> None:
+    navigator = orbit.navigator()
+    prior, found = navigator.estimate, orbit.detections(0)
+    landmarks, camera, parameters = navigator.state.landmarks, orbit.case.camera, navigator.setup.parameters
+    pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    sighting = in_view(landmarks, pose, camera, 0.0)
+    true = Pose(
+        orbit.states[0, :3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3)
+    )
+    seen = in_view(orbit.map, true, camera, 0.0).index.tolist()
+    pairs = [(seen.index(crater), k) for k, crater in enumerate(sighting.index.tolist()) if crater in seen]
+    detection, sighted = (np.array(column) for column in zip(*pairs, strict=True))
+    count = len(pairs)
+    shifted = found.u_px.copy()
+    shifted[detection[2]] += 25.0
+    wrong = replace(found, u_px=shifted)
+
+    def fix(needed: int, given: Detections, reacquired: bool = True) -> Fix | None:
+        pairs = Identification(detection, sighted, count, needed)
+        return correction.correct(
+            prior, pose, given, pairs, sighting, landmarks, camera, parameters, 30e3, reacquired=reacquired
+        )
+
+    kept = fix(count - 1, wrong)
+    assert kept is not None and kept.index.tolist() == np.delete(sighting.index[sighted], 2).tolist()
+    assert kept.update.contradiction.max() < 13.8
+    # Without it too few pairs remain, or no pair is left out.
+    assert fix(count, wrong) is None
+    whole = fix(count, found)
+    assert whole is not None and len(whole.index) == count
+
+
+def test_a_long_correction_leaves_the_curvature_of_the_orbit_to_the_velocity() -> None:
+    prior = at_altitude(30e3)
+    moved = prior.mean.copy()
+    moved[3:6] = [0.0, 1_650.0, 0.0]
+    prior = replace(prior, mean=moved)
+    after = replace(prior, mean=moved + np.r_[[0.0, 60e3, 0.0], np.zeros(15)])
+    radius = np.linalg.norm(prior.mean[:3])
+    # What the velocity turned by the angle differs by along its first direction: 1 - cos.
+    exact = 1_650.0 * (1.0 - np.cos(60e3 / radius))
+    assert correction.curvature_m_s(prior, after) == pytest.approx(exact, rel=1e-3)
+    assert correction.curvature_m_s(prior, prior) == 0.0
 
 
 def test_the_time_since_the_last_fix_goes_into_the_widened_search(

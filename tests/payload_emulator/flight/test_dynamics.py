@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
+from lunar.gravity_omission import densities_at, field_noise
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, process_noise
@@ -89,6 +91,19 @@ def test_outside_the_orientation_table_there_is_no_prediction() -> None:
 def test_less_gravity_on_board_means_more_process_noise() -> None:
     densities = [process_noise(degree).white_psd_m2_s3[0] for degree in (8, 20, 50, 70, 100)]
     assert densities == sorted(densities, reverse=True)
+
+
+@pytest.mark.parametrize("field", ["LP165P", "GRGM660PRIM"])
+def test_the_filter_and_the_smoother_have_the_same_noise(field: str) -> None:
+    rng = np.random.default_rng(4)
+    positions = (1_737_400.0 + rng.uniform(5e3, 150e3, 40))[:, None] * np.eye(3)[rng.integers(0, 3, 40)]
+    positions = (Rotation.random(40, rng=rng).as_matrix() @ positions[:, :, None])[:, :, 0]
+    velocities = 1_650.0 * rng.standard_normal((40, 3))
+    flown = model(process_noise(50, field))
+    expected = [flown._white_psd(*one) for one in zip(positions, velocities, strict=True)]
+    np.testing.assert_allclose(
+        densities_at(field_noise(field, 50), positions, velocities), expected, rtol=1e-12
+    )
 
 
 POLAR_M_S = np.array([0.0, 0.0, 1_665.0])

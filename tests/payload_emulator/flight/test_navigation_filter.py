@@ -151,6 +151,30 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance() -> None:
     assert found.attitude_sigma_rad == pytest.approx(np.sqrt(np.linalg.eigvalsh(total)[-1]), rel=1e-3)
     assert found.state.craters.tolist() == index.tolist()
     assert found.state.ticks == prior.ticks
+    # Each sighting against the update with the others alone: its own variance is as good as infinite there.
+    for k in range(index.size):
+        alone = np.where(np.arange(index.size) == k, 1e12, variance)
+        x, p, _, _ = dense_update(prior, landmarks, index, uv, alone)
+        design = np.empty((2, x.size))
+        for column in range(x.size):
+            width = np.sqrt(p[column, column]) * 0.1
+            change = np.eye(x.size)[column] * width
+            ends = [projected(y[:size], landmarks, index, y[size:])[k] for y in (x + change, x - change)]
+            design[:, column] = (ends[0] - ends[1]) / (2.0 * width)
+        off = uv[k] - projected(x[:size], landmarks, index, x[size:])[k]
+        expected = off @ np.linalg.solve(design @ p @ design.T + variance[k] * np.eye(2), off)
+        assert found.contradiction[k] == pytest.approx(expected, rel=0.02)
+    # A rotation of the camera: gradient and information of the innovations.
+    errors = replace(ERRORS, attitude_noise_rad=1e-3 * ERRORS.attitude_noise_rad)
+    free = kalman.update(
+        prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors
+    )
+    assert free is not None and free.rotation.sigma_rad == errors.attitude_noise_rad
+    # With a small attitude noise the estimated rotation is the gradient times its variance.
+    np.testing.assert_allclose(
+        free.attitude_rad, errors.attitude_noise_rad**2 * free.rotation.gradient, rtol=0.05, atol=1e-12
+    )
+    assert np.all(np.linalg.eigvalsh(free.rotation.information) > 0.0)
 
 
 def test_what_all_craters_share_is_told_apart_from_the_position_by_its_prior_alone() -> None:
