@@ -28,6 +28,7 @@ from ground_service.http.front import HEARTBEAT
 from ground_service.http.origins import LOOPBACK
 from ground_service.http.proxies import TrustedProxies
 from ground_service.logs import logging_config
+from ground_service.memory import limit_heaps
 from ground_service.settings import Settings
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ def serve(settings: Settings) -> None:
     """
     import uvicorn
 
+    limit_heaps()
     with ground_from_settings(settings) as ground:
         if settings.host not in LOOPBACK and not has_users(ground):
             raise ServerError(

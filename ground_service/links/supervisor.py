@@ -13,6 +13,7 @@ from ground_service.ground import Ground
 from ground_service.links import service
 from ground_service.links.runner import LEASE_NS, LinkRunner, ended_holder
 from ground_service.links.service import DeclaredLink
+from ground_service.memory import give_back, limit_heaps
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +50,7 @@ class LinkSupervisor:
 
     def start(self) -> None:
         """Look after the links in a thread."""
+        limit_heaps()
         self._thread.start()
 
     def stop(self) -> None:
@@ -88,6 +90,7 @@ class LinkSupervisor:
                 log.warning("links could not be looked after: %s", error)
             except Exception:  # outermost loop of the thread
                 log.exception("links could not be looked after")
+            give_back()
             self._stopping.wait(LOOK_S)
 
     def _begin(self, declared: DeclaredLink) -> None:

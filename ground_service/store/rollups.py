@@ -270,26 +270,27 @@ def _few_stored(
     connection: Connection, found: Sequence[tuple[Mapping[str, int], _Level]]
 ) -> dict[tuple[int, int], list[Any]]:
     """Return the stored buckets of the levels with few, by part and level, with one query."""
-    values: dict[str, int] = {}
-    count = 0
-    for key, level in found:
-        if level[0].size <= _FEW:
-            for bucket in level[0].tolist():
-                values |= {
-                    f"part_{count}": key["part"],
-                    f"level_{count}": key["level"],
-                    f"bucket_{count}": bucket,
-                }
-                count += 1
+    wanted = [
+        (key["part"], key["level"], bucket)
+        for key, level in found
+        if level[0].size <= _FEW
+        for bucket in level[0].tolist()
+    ]
     stored: dict[tuple[int, int], list[Any]] = {}
-    if count:
-        values |= {name: found[0][0][name] for name in _KEY[:3]}
+    if wanted:
+        # Few texts of the query, because each one is kept by the program and by the server: the last bucket is repeated
+        # up to the next power of two.
+        count = 1 << (len(wanted) - 1).bit_length()
+        wanted += wanted[-1:] * (count - len(wanted))
+        values = {name: found[0][0][name] for name in _KEY[:3]}
+        for number, place in enumerate(wanted):
+            values |= dict(zip((f"part_{number}", f"level_{number}", f"bucket_{number}"), place, strict=True))
         for part, level_number, *row in connection.execute(_buckets_query(count), values):
             stored.setdefault((part, level_number), []).append(row)
     return stored
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=16)
 def _buckets_query(count: int) -> Any:
     """Return the query for `count` buckets by their whole key, each of which both databases find by the index."""
     common = [_TABLE.c[name] == bindparam(name) for name in _KEY[:3]]

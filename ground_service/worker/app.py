@@ -19,6 +19,7 @@ from kombu.exceptions import OperationalError
 from ground_service.errors import PASSING, SettingsError
 from ground_service.ground import Ground, ground_from_settings
 from ground_service.logs import logging_config
+from ground_service.memory import limit_heaps
 from ground_service.settings import Settings, start_tracing
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import run_job
@@ -161,6 +162,7 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
     """
     if settings.resolved_broker_url() is None:
         raise SettingsError("LINNA_BROKER_URL", "a broker such as redis://localhost:6379/0", "nothing")
+    limit_heaps()
     _ground_of(settings).close()
 
     @setup_logging.connect(weak=False)

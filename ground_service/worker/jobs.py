@@ -30,6 +30,7 @@ from ground_service.jobs import store
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
+from ground_service.memory import give_back
 from ground_service.passes.archive_zip import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.tracing import span
@@ -160,7 +161,10 @@ def _run_alone(ground: Ground, job_id: str) -> Job:
     if job.state in FINISHED:
         return job
     with span(f"job {job.kind}", parent=job.traceparent, attributes={"linna.job": job_id}) as further:
-        done = _attempt(ground, job_id)
+        try:
+            done = _attempt(ground, job_id)
+        finally:
+            give_back()
         further["linna.state"] = done.state
         return done
 

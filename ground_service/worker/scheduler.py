@@ -18,6 +18,7 @@ from ground_service.errors import GroundError
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.links.supervisor import process_name
+from ground_service.memory import give_back
 from ground_service.planning.standing import needs_plan
 from ground_service.store import leases
 from ground_service.worker.actions import repeat_due
@@ -91,6 +92,7 @@ class Scheduler:
                 log.warning("recurring work could not be done: %s", error)
             except Exception:  # outermost loop of the thread
                 log.exception("recurring work could not be done")
+            give_back()
         self._release()
 
     def tick(self) -> bool:

@@ -4,13 +4,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import delete
+from sqlalchemy import delete, event, select
 
 from ground_service.ground import Ground
 from ground_service.ingest.store import store_samples
 from ground_service.passes import series
 from ground_service.passes.service import trend_series
 from ground_service.passes.span import PassSpan
+from ground_service.store import rollups
 from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES, build_rollups
 from ground_service.store.vehicles import vehicle_id
@@ -175,3 +176,30 @@ def test_trends_of_a_spacecraft_need_no_pass(ground: Ground, synthetic_pass: Any
     assert found.samples == 40
     assert found.buckets.low.min() == pytest.approx(20.0)
     assert found.buckets.high.max() == pytest.approx(23.9)
+
+
+def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground: Ground) -> None:
+    """Each text is kept by the program and by the server, so their number must not grow with the numbers of buckets."""
+    columns = states()
+    vehicle = stored(ground, columns, [np.arange(COUNT)])
+    texts: set[str] = set()
+    event.listen(ground.database.engine, "before_cursor_execute", lambda *given: texts.add(given[2]))
+    with ground.database.reading() as connection:
+        rows = connection.execute(
+            select(ROLLUPS.c.bucket).where(ROLLUPS.c.vehicle_id == vehicle, ROLLUPS.c.level == 0).limit(40)
+        )
+        buckets = np.unique(list(rows.scalars()))
+        texts.clear()
+        key = {
+            "vehicle_id": vehicle,
+            "dictionary_version": DICTIONARY.version,
+            "kind": 2,
+            "part": 0,
+            "level": 0,
+        }
+        for count in range(1, 25):
+            wanted = [(key, (buckets[start : start + 4], *[np.zeros(0)] * 4)) for start in range(0, count, 4)]
+            whole = {(0, 0): sorted({b for _, (some, *_) in wanted for b in some.tolist()})}
+            found = rollups._few_stored(connection, wanted)
+            assert {place: sorted(row[0] for row in rows) for place, rows in found.items()} == whole
+    assert len(texts) == 4, "for 4, 8, 16 and 32 buckets"
