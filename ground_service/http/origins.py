@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Iterable
+from functools import lru_cache
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
@@ -118,6 +119,7 @@ def _same(origin: str, host: tuple[str, int | None]) -> bool:
         return False
 
 
+@lru_cache(maxsize=256)
 def _host_and_port(text: str) -> tuple[str, int | None] | None:
     """Return name and port of a Host header; None if it is invalid."""
     try:
@@ -135,6 +137,7 @@ def _host_and_port(text: str) -> tuple[str, int | None] | None:
         return None
 
 
+@lru_cache(maxsize=256)
 def _plain(host: str) -> str:
     """Return the normalised host name: lower case, no final dot, canonical form of addresses."""
     name = host.strip().strip("[]").rstrip(".").lower()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Sequence
+from functools import lru_cache
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -34,7 +35,7 @@ class TrustedProxies:
         self._networks = parse_networks(texts)
 
     def __contains__(self, host: object) -> bool:
-        address = _address(str(host))
+        address = _address(str(host)) if self._networks else None
         return address is not None and any(address in network for network in self._networks)
 
     def client(self, peer: str, forwarded_for: str) -> str:
@@ -92,6 +93,7 @@ def address_key(host: str) -> str:
     return host if address is None else str(address)
 
 
+@lru_cache(maxsize=256)
 def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     """Return the address in a text such as 10.0.0.1, 10.0.0.1:80, ::1 or [::1]:80."""
     if text.startswith("["):
