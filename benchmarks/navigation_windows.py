@@ -10,6 +10,9 @@ Parameters of the filter were chosen on `tuning` only.
 - `shipped`: the list registered by place, filter as shipped.
 
 The filter as before has a pixel bias of 0.25 px (1 sigma) and a catalogue offset that never changes.
+
+A second table compares the shipped filter with the smoother of the ground (`--smoother`), a third shows the filter with
+attitudes that are noisier than declared (`--attitude-noise-deg`).
 """
 
 from __future__ import annotations
@@ -25,17 +28,22 @@ from typing import Any
 import numpy as np
 
 from linna.data import data_folder
+from lunar.datafolder import default_orientation
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.session.scenario import Scenario, load_scenario
 from studies.navigation_windows import (
     Recording,
+    SmootherRow,
     WindowRow,
     fly,
     load_recording,
     moved,
     record,
     save_recording,
+    smoothed_position_m,
+    smoother_rows,
     window_rows,
+    with_attitude_noise,
 )
 from tmtc.tables import CatalogueTable, unpack_catalogue_table
 
@@ -58,11 +66,32 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument(
         "--recordings", type=Path, required=True, help="folder of recordings, made where missing"
     )
+    parser.add_argument("--smoother", action="store_true", help="only the table of the smoother")
+    parser.add_argument(
+        "--attitude-noise-deg",
+        type=float,
+        nargs="+",
+        metavar="A",
+        help="only the table of attitudes with this noise in addition to the declared 0.01 degrees",
+    )
+    parser.add_argument(
+        "--no-monitor", action="store_true", help="attitudes without the monitor of the attitude"
+    )
     arguments = parser.parse_args(words)
     arguments.recordings.mkdir(parents=True, exist_ok=True)
+    recordings = [_recording(arguments.recordings, place) for place in PLACES[arguments.set]]
+    if arguments.smoother:
+        _print_smoother(recordings)
+    elif arguments.attitude_noise_deg:
+        _print_attitudes(recordings, arguments.attitude_noise_deg, not arguments.no_monitor)
+    else:
+        _print_variants(recordings)
+    return 0
+
+
+def _print_variants(recordings: Sequence[Recording]) -> None:
     rows: dict[str, list[WindowRow]] = {name: [] for name in VARIANTS}
-    for place in PLACES[arguments.set]:
-        recording = _recording(arguments.recordings, place)
+    for recording in recordings:
         for name in VARIANTS:
             table, parameters = variant(name, recording)
             rows[name] += window_rows(recording, fly(recording, parameters, table))
@@ -83,7 +112,58 @@ def main(words: Sequence[str]) -> int:
     print("|" + "---|" * (1 + len(_TOGETHER)))
     for name in VARIANTS:
         print(f"| {name} | " + " | ".join(together(rows[name]).values()) + " |")
-    return 0
+
+
+def _print_smoother(recordings: Sequence[Recording]) -> None:
+    """Print the errors of filter and smoother at the start of the windows (20 frames) and over all of them."""
+    orientation = default_orientation(data_folder())
+    rows: list[SmootherRow] = []
+    print("| window | start, filter m | smoother m | ratio | whole window, filter m | smoother m | ratio |")
+    print("|" + "---|" * 7)
+    for recording in recordings:
+        flight = fly(recording, AnchoredParameters())
+        found = smoother_rows(recording, flight, smoothed_position_m(recording, flight, orientation))
+        rows += found
+        for number, row in enumerate(found, 1):
+            print(f"| {row.recording} {number} | {_pair(*row.start_m)} | {_pair(*row.whole_m)} |", flush=True)
+    for name, pairs in (
+        ("start of windows", np.array([row.start_m for row in rows if np.isfinite(row.start_m[0])])),
+        ("whole windows", np.array([row.whole_m for row in rows])),
+    ):
+        ratios, (filtered, smoothed) = pairs[:, 0] / pairs[:, 1], np.sqrt(np.mean(pairs**2, axis=0))
+        print(
+            f"\n{name}: {len(pairs)} windows, root mean square {filtered:.0f} m and {smoothed:.0f} m, ratio "
+            f"{filtered / smoothed:.2f}; median ratio {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
+        )
+
+
+def _print_attitudes(recordings: Sequence[Recording], noises_deg: Sequence[float], monitored: bool) -> None:
+    """Print the figures of the shipped filter with noisier attitudes."""
+    print("| added noise deg | degraded from frame | estimated noise deg | " + " | ".join(_TOGETHER) + " |")
+    print("|" + "---|" * (3 + len(_TOGETHER)))
+    parameters = AnchoredParameters()
+    if not monitored:
+        never = replace(parameters.monitor, least_frames=1_000_000)
+        parameters = replace(parameters, monitor=never)
+    for noise_deg in noises_deg:
+        rows: list[WindowRow] = []
+        first, estimates = [], []
+        for recording in recordings:
+            noisy = with_attitude_noise(recording, math.radians(noise_deg), recording.seed)
+            flight = fly(noisy, parameters)
+            rows += window_rows(noisy, flight)
+            degraded = np.flatnonzero(flight.attitude_noise_rad)
+            first.append(str(degraded[0]) if degraded.size else "never")
+            if degraded.size:
+                estimates.append(f"{np.degrees(np.median(flight.attitude_noise_rad[degraded])):.2f}")
+        cells = " | ".join(together(rows).values())
+        print(f"| {noise_deg:g} | {', '.join(first)} | {', '.join(estimates)} | {cells} |", flush=True)
+
+
+def _pair(filtered_m: float, smoothed_m: float) -> str:
+    if not math.isfinite(filtered_m):
+        return " | | "
+    return f"{filtered_m:.0f} | {smoothed_m:.0f} | {filtered_m / smoothed_m:.2f}"
 
 
 def variant(name: str, recording: Recording) -> tuple[CatalogueTable, AnchoredParameters]:

@@ -14,12 +14,21 @@ from typing import Any
 
 import numpy as np
 
+from ground_service.evaluation.navigation.smoothed_series import smoother_model
+from ground_service.evaluation.navigation.smoother import FilterStates, smooth
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
-from lunar.frames import matrix_from_quaternion, rtn_from_inertial, spherical_from_mcmf
+from lunar.frames import (
+    Orientation,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rtn_from_inertial,
+    spherical_from_mcmf,
+)
+from lunar.gravity import GravityField
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.navigation import anchored
@@ -27,6 +36,7 @@ from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored import Observation
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.prediction import predicted
+from payload_emulator.flight.navigation.sighting import turned_by
 from payload_emulator.flight.onboard.loads import FlightTables
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
@@ -216,6 +226,8 @@ class Flight:
         Normalised innovation squared of the fix and its degrees of freedom; NaN and 0 without one.
     state, covariance
         Orbit as downlinked, shapes (n, 9) and (n, 9, 9), ICRF axes of the payload.
+    attitude_noise_rad
+        Noise of the attitude that the monitor estimates; 0 while it is as declared.
     """
 
     error_rtn: FloatArray
@@ -225,6 +237,7 @@ class Flight:
     degrees: IntArray
     state: FloatArray
     covariance: FloatArray
+    attitude_noise_rad: FloatArray
 
     @property
     def position_m(self) -> FloatArray:
@@ -236,6 +249,15 @@ def arcs(recording: Recording) -> list[slice]:
     cuts = np.flatnonzero(np.diff(recording.utc_ns) > _ARC_GAP_NS) + 1
     edges = [0, *cuts.tolist(), recording.utc_ns.size]
     return [slice(first, stop) for first, stop in itertools.pairwise(edges)]
+
+
+def with_attitude_noise(recording: Recording, noise_rad: float, seed: int) -> Recording:
+    """Return the recording with more noise in the attitude messages, one sigma per axis in each frame."""
+    rng, attitude = np.random.default_rng(seed), recording.attitude.copy()
+    for row in attitude:
+        known = matrix_from_quaternion(row[:4] / np.linalg.norm(row[:4]))
+        row[:4] = quaternion_from_matrix(turned_by(noise_rad * rng.standard_normal(3)) @ known)
+    return replace(recording, attitude=attitude)
 
 
 def fly(
@@ -255,7 +277,7 @@ def fly(
         unpack_burn_table(tables.burns) if tables.burns else no_burns(),
     )
     total = recording.ticks.size
-    own, covariance = np.zeros((total, 9)), np.zeros((total, 9, 9))
+    own, covariance, noise_rad = np.zeros((total, 9)), np.zeros((total, 9, 9)), np.zeros(total)
     nis, degrees, before = np.full(total, np.nan), np.zeros(total, np.int64), np.full((total, 6), np.nan)
     starts = {part.start for part in arcs(recording)} - {0}
     for number, tick in enumerate(recording.ticks.tolist()):
@@ -269,13 +291,63 @@ def fly(
         own[number] = state.estimate.mean[kalman.ORBIT]
         covariance[number] = state.estimate.covariance[kalman.ORBIT, kalman.ORBIT]
         nis[number], degrees[number] = report.nis, 2 * report.matched
+        noise_rad[number] = report.attitude_noise_rad
     to_truth = turns(recording.mcmf_from_icrf, orientation, recording.ticks)
     rtn = rtn_from_inertial(recording.truth[:, :3], recording.truth[:, 3:])
     error = rtn_errors(own[:, :6], recording.truth, to_truth, rtn)
     own_error = np.einsum("nji,nkj->nki", to_truth, halves(turned(own[:, :6], to_truth) - recording.truth))
     coast = np.linalg.norm(rtn_errors(before, recording.truth, to_truth, rtn)[:, :3], axis=1)
     squares = normalised_squares(own_error.reshape(-1, 6), covariance[:, :6, :6])
-    return Flight(error, squares, coast, nis, degrees, own, covariance)
+    return Flight(error, squares, coast, nis, degrees, own, covariance, noise_rad)
+
+
+def smoothed_position_m(recording: Recording, flight: Flight, orientation: Orientation) -> FloatArray:
+    """Return the position errors (n,) of a flight smoothed on the ground, as the evaluation of a pass does."""
+    tables = recording.tables
+    table = unpack_gravity_table(tables.gravity)
+    gravity = GravityField(table.name, table.gm_m3_s2, table.radius_m, table.c_bar, table.s_bar)
+    states = FilterStates(recording.utc_ns, flight.state, flight.covariance)
+    state = smooth(states, smoother_model(gravity, orientation, ())).state[:, :6]
+    to_truth = turns(recording.mcmf_from_icrf, unpack_orientation_table(tables.orientation), recording.ticks)
+    rtn = rtn_from_inertial(recording.truth[:, :3], recording.truth[:, 3:])
+    error = rtn_errors(state, recording.truth, to_truth, rtn)
+    return np.asarray(np.linalg.norm(error[:, :3], axis=1), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class SmootherRow:
+    """Root mean square of the position error (m) of filter and smoother at the start of a window and over all of it."""
+
+    recording: str
+    start_m: tuple[float, float]
+    whole_m: tuple[float, float]
+
+
+def smoother_rows(
+    recording: Recording, flight: Flight, smoothed_m: FloatArray, skipped: int = 20, start: int = 20
+) -> list[SmootherRow]:
+    """Return a row for each window; the start of the first, which follows no coast, is NaN.
+
+    Parameters
+    ----------
+    skipped
+        Frames of the first window that count nowhere.
+    start
+        Frames at the start of a window.
+    """
+
+    def rms(part: slice) -> tuple[float, float]:
+        return (
+            float(np.sqrt(np.mean(flight.position_m[part] ** 2))),
+            float(np.sqrt(np.mean(smoothed_m[part] ** 2))),
+        )
+
+    rows = []
+    for number, part in enumerate(arcs(recording)):
+        whole = slice(part.start + (skipped if number == 0 else 0), part.stop)
+        first = rms(slice(part.start, part.start + start)) if number else (np.nan, np.nan)
+        rows.append(SmootherRow(recording.name, first, rms(whole)))
+    return rows
 
 
 @dataclass(frozen=True, slots=True)

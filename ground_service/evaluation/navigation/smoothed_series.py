@@ -22,6 +22,8 @@ from reports.values import NavigationSeries
 
 SMOOTHED = "smoothed"
 SMOOTHER_DEGREE = 100
+MAP_SIGMA_RTN_M, MAP_CORRELATION_RAD = (10.0, 15.0, 15.0), float(np.radians(30.0))
+"""Remainder of the registration of the catalogue, as in the filter (`CommonErrors`)."""
 
 
 def smoother_model(
@@ -29,13 +31,15 @@ def smoother_model(
 ) -> SmootherModel:
     """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field.
 
-    The process noise is that of the filter: that of the field, by its name.
+    The process noise is that of the filter: of the field, by its name, and of the map.
     """
     degree = min(SMOOTHER_DEGREE, gravity.degree)
     return SmootherModel(
         ForceModel(gravity, orientation, degree),
         burns=burns,
         field_noise=field_noise(gravity.name, degree),
+        map_sigma_rtn_m=MAP_SIGMA_RTN_M,
+        map_correlation_rad=MAP_CORRELATION_RAD,
     )
 
 

@@ -100,6 +100,9 @@ class SmootherModel:
         Standard deviation (R, T, N) and correlation time of the empirical acceleration.
     burns
         Commanded burns in time order.
+    map_sigma_rtn_m, map_correlation_rad
+        Shift of the map that the positions of the filter contain, and the angle at the Moon's centre over which it is
+        similar (1/e): positions over other ground have another shift, which looks like noise of the motion.
     """
 
     forces: ForceModel
@@ -108,6 +111,8 @@ class SmootherModel:
     correlation_s: float = 900.0
     burns: tuple[CommandedBurn, ...] = ()
     field_noise: FieldNoise | None = None
+    map_sigma_rtn_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    map_correlation_rad: float = 1.0
 
     def densities(self, tdb_s: FloatArray, state: FloatArray) -> FloatArray:
         """Return the spectral densities (n, 3; R, T, N) at times (n,) in states (n, 9)."""
@@ -226,6 +231,12 @@ def _step(
     noise[:, _POSITION, _POSITION] = density * length**3 / 3.0
     noise[:, _POSITION, _VELOCITY] = noise[:, _VELOCITY, _POSITION] = density * length**2 / 2.0
     noise[:, _VELOCITY, _VELOCITY] = density * length
+    cosine = np.einsum("ni,ni->n", position, state[:, _POSITION])
+    cosine /= np.linalg.norm(position, axis=1) * np.linalg.norm(state[:, _POSITION], axis=1)
+    turned_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+    renewed = (1.0 - np.exp(-2.0 * turned_rad / model.map_correlation_rad))[:, None]
+    shift = renewed * np.square(model.map_sigma_rtn_m)
+    noise[:, _POSITION, _POSITION] += (axes * shift[:, None, :]) @ _turned(axes)
     noise[:, _ACCELERATION, _ACCELERATION] = np.diag(model.markov_sigma_m_s2) ** 2 * (
         1.0 - decay[:, None, None] ** 2
     )

@@ -17,11 +17,12 @@ from ground_service.evaluation.navigation.smoother import (
     smooth,
 )
 from lunar.elements import Elements, icrf_state_from_elements
-from lunar.frames import IauOrientation
+from lunar.frames import IauOrientation, rtn_from_inertial
 from lunar.gravity import GravityField, builtin_gravity
 from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from payload_emulator.flight.navigation.filter import CommonErrors
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 STEP_S, STATES = 60.0, 30
@@ -333,3 +334,25 @@ def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> N
     ]
     ratio = np.trace(carried[1][3:6, 3:6]) / np.trace(carried[0][3:6, 3:6])
     assert ratio == pytest.approx(far.sum() / near.sum(), rel=0.02)
+
+
+def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
+    """A share 1 - exp(-2 angle / 30 degrees) of its variance is new after a step; 10, 15 and 15 m."""
+    model = smoother_model(builtin_gravity(), IauOrientation(), ())
+    without = replace(model, map_sigma_rtn_m=(0.0, 0.0, 0.0))
+    state, at, after = start_state(), np.array([EPOCH]), np.array([EPOCH + 60 * 10**9])
+    nine = np.concatenate([state, np.zeros(3)])[None]
+    (carried, _, noise), (_, _, plain) = _carried(nine, at, after, model), _carried(nine, at, after, without)
+    before, behind = state[:3], carried[0, :3]
+    angle = np.arccos(before @ behind / np.linalg.norm(before) / np.linalg.norm(behind))
+    added = noise[0] - plain[0]
+    axes = rtn_from_inertial(behind, carried[0, 3:6])
+    share = 1.0 - np.exp(-2.0 * angle / np.radians(30.0))
+    np.testing.assert_allclose(
+        axes @ added[:3, :3] @ axes.T, share * np.diag([100.0, 225.0, 225.0]), atol=1e-6
+    )
+    np.testing.assert_allclose(added[3:], 0.0, atol=1e-12)
+    errors = CommonErrors()
+    east_m, north_m, up_m = errors.catalogue_offset_m
+    assert model.map_sigma_rtn_m == (up_m, north_m, east_m)
+    assert model.map_correlation_rad == errors.catalogue_correlation_rad
