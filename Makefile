@@ -53,9 +53,10 @@ deploy/openmct/node_modules/.package-lock.json: deploy/openmct/package.json depl
 	npm ci --prefix deploy/openmct --ignore-scripts --no-audit --no-fund
 	touch $@
 
-# Pictures of the pages in the documentation, taken by the test of a shift.
+# Pictures of the pages in the documentation, taken by tests.
 pictures: $(VENV)/.dev
-	LINNA_PICTURES=docs/pictures $(BIN)/python -m pytest -q tests/ground_service/web/test_shift.py
+	LINNA_PICTURES=docs/pictures $(BIN)/python -m pytest -q tests/ground_service/web/test_shift.py \
+	  tests/ground_service/web/test_flight.py tests/ground_service/web/test_page_state.py -k "shift or flight or planner_opens"
 
 # Table of the pages by width, colours, font and data, written by the test of all pages.
 page-table: $(VENV)/.dev

@@ -233,7 +233,7 @@ class LimitsBroken(Event):
 
 
 class AlarmChanged(Event):
-    """An alarm was raised, acknowledged, shelved, unshelved or cleared."""
+    """An alarm was raised, acknowledged, shelved, unshelved or cleared, or its condition ended or returned."""
 
     event_kind = "alarm"
     id: int

@@ -196,6 +196,8 @@ def _update(connection: Connection, vehicle: int, found: tuple[Condition, ...]) 
         if state != row.state:
             _move(connection, row, state, now)
             store.note_change(connection, row.id, now, TELEMETRY, state)
+        elif active != row.active:
+            _publish(connection, row, "condition returned" if active else "condition ended")
 
 
 def _cleared_later(connection: Connection, vehicle: int, condition: Condition) -> AlarmRow | None:

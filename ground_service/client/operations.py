@@ -293,10 +293,17 @@ class Client(Connection):
         return self._list(Image, path, paged=False, start=start, stop=stop, instance=instance)
 
     def get_thumbnail(
-        self, spacecraft_id: int, ticks: int, target: Path, *, instance: str = "flight"
+        self,
+        spacecraft_id: int,
+        ticks: int,
+        target: Path,
+        *,
+        instance: str = "flight",
+        detections: bool = False,
     ) -> None:
         """Download a downlinked thumbnail as PNG into a file."""
-        self._download(f"/spacecraft/{spacecraft_id}/thumbnails/{ticks}", target, instance=instance)
+        path = f"/spacecraft/{spacecraft_id}/thumbnails/{ticks}"
+        self._download(path, target, instance=instance, detections=detections)
 
     def get_image(self, pass_id: int, frame_number: int, target: Path, *, detections: bool = False) -> None:
         """Download a frame of a pass archive as PNG into a file."""

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
+from ground_service.missions import store as missions
 from ground_service.passes import store
 from ground_service.passes.model import Image
 from ground_service.passes.span import PassSpan, pass_span, vehicle_span
 from ground_service.store.vehicles import find_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray
+from lunar.timescales import TICKS_PER_SECOND
 from tmtc.dictionary import APID_LARGE_DATA, DICTIONARY
 from tmtc.errors import ValueRefused
 from tmtc.large_data import LargeDataReceiver
@@ -25,6 +28,12 @@ IMAGES_LIMIT = 2000
 """Largest number of images in a list; the newest of an interval are listed."""
 
 ORANGE_BGR = (0, 159, 230)
+
+DRAWN_PX = 512
+"""Least width of a thumbnail with detections: circles of a few pixels show nothing."""
+
+FRAME_MARGIN_S = 1
+"""A frame and the report of its detections have times that differ by less."""
 
 DAY_NS = 86_400_000_000_000
 DAYS_LIMIT = 31
@@ -76,7 +85,14 @@ def archived_image(ground: Ground, pass_id: int, frame_number: int, *, detection
     if sha256 is None:
         raise NotFound(f"pass {pass_id}: image of frame", frame_number)
     octets = ground.files.get(sha256)
-    return octets if found is None else _drawn(octets, found)
+    if found is None:
+        return octets
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(octets, dtype=np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise InvalidInput("archived image", "", "a PNG image", "another file")
+    return _drawn(picture, found)
 
 
 def _circles(connection: Connection, span: PassSpan, frame_number: int) -> FloatArray:
@@ -91,25 +107,28 @@ def _circles(connection: Connection, span: PassSpan, frame_number: int) -> Float
     return circles
 
 
-def _drawn(octets: bytes, circles: FloatArray) -> bytes:
+def _drawn(picture: NDArray[np.uint8], circles: FloatArray) -> bytes:
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(octets, dtype=np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise InvalidInput("archived image", "", "a PNG image", "another file")
     for u_px, v_px, diameter_px in circles.tolist():
         cv2.circle(picture, (round(u_px), round(v_px)), max(round(diameter_px / 2.0), 1), ORANGE_BGR, 1)
     _, drawn = cv2.imencode(".png", picture)
     return drawn.tobytes()
 
 
-def thumbnail_image(ground: Ground, spacecraft_id: int, instance: str, ticks: int) -> bytes:
+def thumbnail_image(
+    ground: Ground, spacecraft_id: int, instance: str, ticks: int, *, detections: bool = False
+) -> bytes:
     """Return the thumbnail of the frame with an on-board time as PNG.
+
+    With `detections` it is enlarged to at least `DRAWN_PX`, with circles around the detections of the payload.
 
     Raises
     ------
     NotFound
         There is no such spacecraft, or no such thumbnail was received completely.
+    InvalidInput
+        Detections cannot be drawn because the mission description does not state the width of the camera.
     """
     import cv2
 
@@ -118,10 +137,35 @@ def thumbnail_image(ground: Ground, spacecraft_id: int, instance: str, ticks: in
         time_ns = int(vehicle_span(connection, vehicle, None, None).utc_ns([ticks])[0])
         span = vehicle_span(connection, vehicle, time_ns, time_ns + DELAY_NS)
         found = next((one for one in _thumbnails(connection, span) if one.ticks == ticks), None)
-    if found is None:
-        raise NotFound("thumbnail", ticks)
+        if found is None:
+            raise NotFound("thumbnail", ticks)
+        if detections:
+            width_px = _camera_width_px(connection, vehicle)
+            if width_px is None:
+                raise InvalidInput("detections", "camera.width_px", "a stated value", "not stated")
+            margin_ns = FRAME_MARGIN_S * 1_000_000_000
+            span = vehicle_span(connection, vehicle, time_ns - margin_ns, time_ns + margin_ns)
+            return _enlarged(found, _circles(connection, span, found.frame_number), width_px)
     _, octets = cv2.imencode(".png", found.levels)
     return octets.tobytes()
+
+
+def _enlarged(thumbnail: Thumbnail, circles: FloatArray, width_px: int) -> bytes:
+    """Return a thumbnail with squares as pixels, and circles given in pixels of the whole image."""
+    import cv2
+
+    columns = thumbnail.levels.shape[1]
+    factor = max(-(-DRAWN_PX // columns), 1)
+    picture = cv2.cvtColor(np.kron(thumbnail.levels, np.ones((factor, factor), np.uint8)), cv2.COLOR_GRAY2BGR)
+    # Pixels of the thumbnail are means of whole squares; what is left over at the edge is missing.
+    scale = factor / max(width_px // columns, 1)
+    drawn = np.column_stack([(circles[:, :2] + 0.5) * scale - 0.5, circles[:, 2] * scale])
+    return _drawn(picture, drawn)
+
+
+def _camera_width_px(connection: Connection, vehicle: int) -> int | None:
+    mission = missions.mission_of_vehicle(connection, vehicle)
+    return None if mission is None else mission.camera.width_px
 
 
 def _archived(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int) -> Iterator[Image]:
@@ -141,6 +185,7 @@ def _archived(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_
                 source="archive",
                 pass_id=record.id,
                 address=address,
+                overlay=f"{address}?detections=true",
             )
 
 
@@ -153,9 +198,14 @@ def _downlinked(
     stop_utc_ns: int,
 ) -> Iterator[Image]:
     span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns + DELAY_NS)
+    rows = store.samples(connection, span, "detections", ("frame_number", "ticks"))
+    reported = np.array([rows["frame_number"], rows["ticks"]], dtype=np.int64)
+    drawable = _camera_width_px(connection, vehicle) is not None
     for one in {found.ticks: found for found in _thumbnails(connection, span)}.values():
         time_ns = int(utc_ns_of_ticks(np.array([one.ticks]), span.correlations)[0][0])
         address = f"/api/v1/spacecraft/{spacecraft_id}/thumbnails/{one.ticks}?instance={instance}"
+        of_frame = reported[1, reported[0] == one.frame_number]
+        known = drawable and bool((np.abs(of_frame - one.ticks) <= FRAME_MARGIN_S * TICKS_PER_SECOND).any())
         yield Image.of(
             {},
             frame_number=one.frame_number,
@@ -163,6 +213,7 @@ def _downlinked(
             source="thumbnail",
             pass_id=None,
             address=address,
+            overlay=f"{address}&detections=true" if known else None,
         )
 
 
@@ -176,6 +227,8 @@ def _thumbnails(connection: Connection, span: PassSpan) -> Iterator[Thumbnail]:
         whole = receiver.accept(name, values) if name.startswith("large_data_") else None
         if whole is not None and whole.table == THUMBNAIL:
             try:
-                yield unpack_thumbnail(whole.octets)
+                found = unpack_thumbnail(whole.octets)
             except ValueRefused:
                 continue  # the parts of two transfers with one number
+            if found.levels.size:
+                yield found

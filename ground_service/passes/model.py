@@ -199,6 +199,9 @@ class Image(Entity):
     source: Literal["thumbnail", "archive"]
     pass_id: int | None = Field(description="Pass of the archive; null for a thumbnail")
     address: str = Field(description="Address of the image as PNG", examples=["/api/v1/passes/1/images/12"])
+    overlay: str | None = Field(
+        description="Address of the image with the detections of the payload; null: they, or the camera, are not known"
+    )
 
 
 class SpacecraftEvent(Event):

@@ -318,9 +318,12 @@ def get_thumbnail(
     spacecraft_id: SpacecraftId,
     ticks: Annotated[int, Path(ge=0, lt=1 << 48, description="On-board time of the frame, 2^-16 s")],
     instance: Instance = FLOWN,
+    detections: Annotated[
+        bool, Query(description="Enlarge it and draw the detections of the payload")
+    ] = False,
 ) -> Response:
     """Return a downlinked thumbnail as PNG."""
-    octets = images.thumbnail_image(ground, spacecraft_id, instance, ticks)
+    octets = images.thumbnail_image(ground, spacecraft_id, instance, ticks, detections=detections)
     return Response(octets, media_type="image/png")
 
 

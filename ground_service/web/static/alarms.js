@@ -1,16 +1,16 @@
 import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, element, figure, pager, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
+import { acting, byId, element, figure, pager, parameterName, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
 
 const OPEN = ["raised", "acknowledged", "shelved"];
 const HOUR_MS = 3600e3;
-const words = (name) => name.replaceAll("_", " ");
+const nameOf = (alarm) => parameterName(alarm.name, alarm.unit);
 
 async function showHistory(id) {
   const alarm = await get(`alarms/${id}`);
   byId("history-section").hidden = false;
   state({ alarm: id });
-  byId("history-title").textContent = `History of alarm ${id}: ${words(alarm.name)}`;
+  byId("history-title").textContent = `History of alarm ${id}: ${nameOf(alarm)}`;
   show(
     "history",
     table(
@@ -49,7 +49,7 @@ const reload = pager(async (limit, offset) => {
     table(
       "Alarms",
       [
-        ["Alarm", (row) => words(row.name)],
+        ["Alarm", nameOf],
         ["Severity", (row) => stateMark(row.severity)],
         ["State", (row) => stateMark(row.state)],
         ["Condition", (row) => (row.active ? "continues" : "has ended")],

@@ -8,6 +8,7 @@ const REFRESH_MS = 250; // pictures come as fast as they can; numbers, map and c
 const context = byId("frame").getContext("2d");
 const history = { times: [], names: [], errors: {}, altitude: [] };
 let socket = null;
+let ended = false; // stays on the page until another payload answers
 let map = null;
 let lines = {};
 let paths = {};
@@ -22,14 +23,14 @@ function connect() {
   const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/payload`;
   socket = new WebSocket(url);
   let ready = true; // until a refusal says why
-  socket.onopen = () => say("connecting");
+  socket.onopen = () => ended || say("connecting");
   socket.onmessage = (event) => {
     const message = JSON.parse(event.data);
     ready = message.kind !== "error";
     take(message);
   };
   socket.onclose = () => {
-    if (ready) say("not connected");
+    if (ready && !ended) say("not connected");
     setTimeout(connect, 5000);
   };
 }
@@ -40,15 +41,16 @@ const say = (text) => {
 
 function take(message) {
   if (message.kind === "error") {
-    say(message.text);
+    if (!ended) say(message.text);
+    return;
+  }
+  ended = message.kind === "end";
+  if (ended) {
+    say("the scenario has ended");
     return;
   }
   if (message.kind === "connected") {
     say("connected");
-    return;
-  }
-  if (message.kind === "end") {
-    say("the scenario has ended");
     return;
   }
   say(message.paused ? "paused" : "running");

@@ -1,8 +1,10 @@
 import { finished, get, request } from "./api.js";
-import { acting, byId, element, figure, notice, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, figure, notice, parameterName, show, stateMark, table, timeText, trouble, watch } from "./page.js";
 
 const number = (label, value, note) =>
   element("div", {}, element("dt", {}, label), element("dd", { class: "number" }, value), element("dd", { class: "note" }, note));
+
+const alarmName = (alarm) => parameterName(alarm.name, alarm.unit);
 
 async function load() {
   const [passes, windows, jobs, alarms] = await Promise.all([
@@ -16,7 +18,7 @@ async function load() {
   show("glance", [
     number("Passes", figure(passes.total), passes.items.length ? `latest ${timeText(passes.items[0].start)}` : "none yet"),
     number("Windows", figure(windows.total), `${windows.items.filter((one) => one.state === "draft").length} of the latest are drafts`),
-    number("Open alarms", figure(alarms.total), alarms.total ? `latest: ${alarms.items[0].name.replaceAll("_", " ")}` : "none"),
+    number("Open alarms", figure(alarms.total), alarms.total ? `latest: ${alarmName(alarms.items[0])}` : "none"),
     number("Jobs under way", figure(running), failed ? `${failed} of the latest failed` : "none of the latest failed"),
   ]);
   show(
@@ -50,7 +52,7 @@ async function load() {
     table(
       "Open alarms",
       [
-        ["Alarm", (row) => row.name.replaceAll("_", " ")],
+        ["Alarm", alarmName],
         ["Last", (row) => timeText(row.last)],
         ["Severity", (row) => stateMark(row.severity)],
         ["State", (row) => stateMark(row.state)],

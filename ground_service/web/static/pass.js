@@ -62,7 +62,7 @@ function showReport(report, id) {
           "div",
           {},
           element("dt", {}, one.label),
-          element("dd", { class: "number" }, figure(one.value), one.unit ? element("small", {}, ` ${one.unit}`) : null),
+          element("dd", { class: "number" }, headline(one.value), one.unit ? element("small", {}, ` ${one.unit}`) : null),
           element("dd", { class: "note" }, one.note),
         ),
       ),
@@ -87,6 +87,12 @@ function showReport(report, id) {
       element("a", { class: "button", href: `/api/v1/reports/${id}?format=${format}`, download: `pass-${passId}.${format}` }, format.toUpperCase()),
     ),
   );
+}
+
+// As on the first page of the report.
+function headline(value) {
+  if (typeof value !== "number" || !value || Math.abs(value) >= 1e-3) return figure(value);
+  return value > 0 ? "< 0.001" : "> −0.001";
 }
 
 // Errors against the reference, estimators and baselines on one axis: mean within the band of each stretch.

@@ -181,6 +181,13 @@ def test_changes_are_published(ground: Ground, tmp_path: Path) -> None:
     assert [one.state for one in found] == ["raised", "cleared"]
 
 
+def test_the_end_and_the_return_of_a_condition_are_published(ground: Ground, tmp_path: Path) -> None:
+    for second, value in enumerate((70.0, 71.0, 20.0, 21.0, 72.0)):
+        receive(ground, tmp_path / "in", [housekeeping(second, value)])
+    found = [AlarmChanged.of(one) for one in read_events(ground.database, 0) if one.kind == "alarm"]
+    assert [one.state for one in found] == ["raised", "condition ended", "condition returned"]
+
+
 def test_events_of_low_severity_raise_no_alarm(ground: Ground, tmp_path: Path) -> None:
     receive(
         ground, tmp_path / "in", [event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0)]

@@ -11,6 +11,7 @@ import pytest
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
 from ground_service.passes import images, store
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import list_spacecraft
@@ -95,6 +96,7 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
     assert (found.frame_number, found.source, found.pass_id) == (3, "archive", pass_id)
     assert record.start_utc_ns < found.time.utc_ns < record.stop_utc_ns
     assert found.address == f"/api/v1/passes/{pass_id}/images/3"
+    assert found.overlay == f"{found.address}?detections=true"
     assert images.archived_image(ground, pass_id, 3) == png.tobytes()
     items, _ = detections(ground, pass_id, limit=1000, offset=0)
     own = [one for one in items if one.frame_number == 3]
@@ -107,6 +109,55 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
             assert tuple(picture[rim].tolist()) == images.ORANGE_BGR
     with pytest.raises(NotFound, match="image of frame"):
         images.archived_image(ground, pass_id, 4)
+
+
+MISSION = 'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nwidth_px = 96\nheight_px = 64\n'
+
+
+def detection(frame_number: int, ticks: int, count: int = 1) -> bytes:
+    """A report with detections at u = 55.5 and v = 31.5, with a diameter of 16 pixels."""
+    shape = {"u_px": 55.5, "v_px": 31.5, "diameter_px": 16.0, "score": 0.9, "size_class": 0, "sigma_px": 1.0}
+    items = {name: np.full(count, value) for name, value in shape.items()}
+    frame = {"frame_number": frame_number, "image_ticks": ticks, "image_quality": 0, "items": items}
+    return DICTIONARY.pack("detections", frame, ticks=ticks + 100, sequence_count=frame_number)
+
+
+def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(
+    ground: Ground, tmp_path: Path
+) -> None:
+    made, octets = thumbnail(1, TICKS)  # 12 by 8: one pixel for 8 by 8 of the camera
+    later = TICKS + 600 * SECOND
+    others = large_data(thumbnail(2, TICKS + 15 * SECOND)[1], 2, later + 200)
+    # A report of the same frame number from another time belongs to another frame.
+    reports = [detection(1, TICKS), detection(2, TICKS + 40 * SECOND)]
+    receive(ground, tmp_path, [*reports, *large_data(octets, 1, later), *others])
+    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert [one.overlay for one in found] == [None, None]
+    with pytest.raises(InvalidInput, match=r"camera\.width_px"):
+        images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    add_mission(ground, MISSION.encode(), actor="ann")
+    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert [one.overlay for one in found] == [f"{found[0].address}&detections=true", None]
+    png = images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (8 * 43, 12 * 43, 3)  # at least 512 wide
+    rim = np.argwhere((picture == images.ORANGE_BGR).all(axis=2))
+    scale = 43 / 8
+    np.testing.assert_allclose(rim.mean(axis=0)[::-1], [56.0 * scale - 0.5, 32.0 * scale - 0.5], atol=1.0)
+    np.testing.assert_allclose(np.ptp(rim, axis=0) + 1, 16.0 * scale, atol=2.0)
+    grey = picture[::43, ::43, 0]
+    np.testing.assert_array_equal(grey[:2], made.levels[:2])  # far from the circle
+
+
+def test_a_thumbnail_of_a_dark_frame_is_enlarged_without_circles(ground: Ground, tmp_path: Path) -> None:
+    add_mission(ground, MISSION.encode(), actor="ann")
+    made, octets = thumbnail(1, TICKS)
+    receive(ground, tmp_path, [detection(1, TICKS, count=0), *large_data(octets, 1, TICKS + SECOND)])
+    (found,) = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert found.overlay
+    png = images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(picture[::43, ::43, 0], made.levels)
 
 
 def test_states_of_each_estimator_are_parameters_of_the_spacecraft(

@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
+from ground_service.web import displays
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import format_oem
 from lunar.timescales import parse_utc
 
 CHROMIUM = "/usr/bin/chromium"
+OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
 START_S = 180.0
 PATIENCE_S = 60.0
 NS = 1_000_000_000
@@ -221,6 +226,38 @@ def serve() -> type[Service]:
     return Service
 
 
+@pytest.fixture(scope="session")
+def openmct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
+    if displays.FOLDER.is_dir():
+        return displays.FOLDER
+    folder = tmp_path_factory.mktemp("openmct")
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(OPENMCT / name, folder)
+    command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+    try:
+        subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=240)
+    except (OSError, subprocess.SubprocessError) as error:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(f"Open MCT cannot be installed: {error}")
+    return folder / "node_modules" / "openmct"
+
+
+class Pictures:
+    """Pictures of the pages in 256 colours, in the folder that LINNA_PICTURES names, otherwise in that of a test."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(os.environ.get("LINNA_PICTURES") or folder)
+
+    def take(self, page: Page, name: str, part: str = "body") -> None:
+        """Take the upper 800 px of a part of the page."""
+        picture = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
+        picture = picture.crop((0, 0, picture.width, min(picture.height, 800)))
+        assert np.asarray(picture).std() > 5.0, f"{name}: nothing but background"
+        picture.quantize(256).save(self.folder / f"{name}.png", optimize=True)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def patience() -> None:
     """Wait long for what pages show: a state that is reached ends the wait, and the machine may be busy."""
@@ -234,6 +271,27 @@ def browser() -> Iterator[Browser]:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield chromium
         chromium.close()
+
+
+@contextmanager
+def strict_page(browser: Browser, url: str) -> Iterator[Page]:
+    """Open a page that permits no error in the console, no violation of the policy and no request to another host."""
+    context = browser.new_context(base_url=url, viewport={"width": 1280, "height": 900})
+    opened = context.new_page()
+    opened.set_default_timeout(PATIENCE_S * 1e3)
+    opened.add_init_script(
+        "document.addEventListener('securitypolicyviolation', (event) =>"
+        " console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"
+    )
+    errors: list[str] = []
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    opened.on("request", lambda request: _note_foreign(request.url, url, errors))
+    try:
+        yield opened
+    finally:
+        context.close()
+    assert errors == []
 
 
 @pytest.fixture

@@ -4,13 +4,9 @@ import calendar
 import gzip
 import json
 import math
-import os
 import re
-import shutil
-import subprocess
 import urllib.error
 import urllib.request
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import TimeoutError as TimedOut
@@ -21,13 +17,12 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.web.conftest import wait_until
+from tests.ground_service.web.conftest import strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 WAIT_MS = 30_000
 AFTER = parse_utc("2029-08-07T06:15:00Z")
-SOURCE = Path(__file__).parents[3] / "deploy" / "openmct"
 
 
 def ask(url, **headers):
@@ -38,24 +33,6 @@ def ask(url, **headers):
     except urllib.error.HTTPError as error:
         with error:
             return error.code, error.read(), error.headers
-
-
-@pytest.fixture(scope="session")
-def openmct(tmp_path_factory):
-    """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
-    if displays.FOLDER.is_dir():
-        return displays.FOLDER
-    folder = tmp_path_factory.mktemp("openmct")
-    for name in ("package.json", "package-lock.json"):
-        shutil.copy(SOURCE / name, folder)
-    command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
-    try:
-        subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=240)
-    except (OSError, subprocess.SubprocessError) as error:
-        if os.environ.get("CI"):
-            raise
-        pytest.skip(f"Open MCT cannot be installed: {error}")
-    return folder / "node_modules" / "openmct"
 
 
 @pytest.fixture(scope="module")
@@ -72,21 +49,8 @@ def shown(tmp_path_factory, synthetic_pass, serve, openmct):
 @pytest.fixture
 def mct(browser, shown):
     """A page for the displays; the test fails on an error in the console or a violation of the policy."""
-    context = browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900})
-    opened = context.new_page()
-    opened.set_default_timeout(30_000)
-    opened.add_init_script(
-        "document.addEventListener('securitypolicyviolation', (event) =>"
-        " console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"
-    )
-    errors = []
-    opened.on("pageerror", lambda error: errors.append(str(error)))
-    opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    own = (shown.url, shown.url.replace("http", "ws", 1), "blob:", "data:")
-    opened.on("request", lambda request: request.url.startswith(own) or errors.append(request.url))
-    yield opened
-    context.close()
-    assert errors == []
+    with strict_page(browser, shown.url) as opened:
+        yield opened
 
 
 def alarm_states(url):

@@ -32,11 +32,11 @@ def housekeeping(second, temperature_c):
     return packet("housekeeping", second, structure_id=1, bus_voltage_v=12.0, temperature_c=temperature_c)
 
 
-def receive(page, packets):
-    """Upload packets as a downlink of spacecraft 77."""
+def receive(page, packets, spacecraft_id=77):
+    """Upload packets as a downlink of a spacecraft."""
     answer = page.request.post(
         f"/api/v1/telemetry?name={hash(tuple(packets)) & 0xFFFF}.cadu",
-        data=encode_cadus(packets, spacecraft_id=77),
+        data=encode_cadus(packets, spacecraft_id=spacecraft_id),
         headers={"Content-Type": "application/octet-stream"},
     )
     job = answer.json()["job_id"]

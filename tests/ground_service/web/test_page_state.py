@@ -17,7 +17,7 @@ from ground_service.planning.service import add_window
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc
-from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, wait_until
+from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, Pictures, wait_until
 from tests.ground_service.web.test_in_browser import answered, camera_fault, receive, settled
 from tmtc.downlink import encode_cadus
 
@@ -266,6 +266,7 @@ def test_the_planner_opens_in_the_time_of_the_ephemeris_and_searches_for_its_spa
         for row in range(rows.count()):
             least = rows.nth(row).locator("td").nth(4).inner_text().split(" to ")[0]
             assert float(least) >= -0.5, least  # degrees, rounded
+        Pictures(tmp_path).take(page, "planner-telephone")
         page.get_by_role("button", name="Closer").click()
         expect(page).to_have_url(re.compile("view=2030-01-01"))
         expect(page).to_have_url(re.compile("latitude-min=-90"))
@@ -366,6 +367,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     page.locator("#selected").get_by_role("button", name="Change").click()
     wait_until(lambda: times(page, 1) == (62.0, 75.0), "not changed by the form")
     answered(page)
+    bar.scroll_into_view_if_needed()
     box = bar.locator("rect").bounding_box()
     page.mouse.move(box["x"] + 3, box["y"] + 5)  # the start
     page.mouse.down()
@@ -376,6 +378,27 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     wait_until(lambda: times(page, 1)[0] < 60.0, "not resized with the pointer")
     start, stop = times(page, 1)
     assert stop == 75.0 and start == pytest.approx(62.0 - 13.0 / 2, abs=0.3)
+
+
+def test_times_being_typed_survive_an_update_of_the_planner(planner):
+    page = planner
+    bar = page.locator('#timeline [data-window="1"]')
+    bar.press(" ")
+    expect(bar).to_be_focused()
+    field = page.locator("#selected").get_by_label("Start, UTC")
+    field.fill("2030-01-01T01:05:00Z")
+    assert page.request.patch("/api/v1/windows/2", data={"state": "approved"}).ok
+    expect(page.locator("#windows tbody tr", has_text="second")).to_contain_text("approved")
+    answered(page)
+    expect(field).to_have_value("2030-01-01T01:05:00Z")
+    expect(field).to_be_focused()
+    field.press("Enter")
+    wait_until(lambda: times(page, 1) == (65.0, 80.0), "not changed by the form")
+    answered(page)
+    expect(field).to_be_focused()
+    # A change that another operator made replaces what is shown.
+    assert page.request.patch("/api/v1/windows/1", data={"start": "2030-01-01T01:00:00Z"}).ok
+    expect(field).to_have_value("2030-01-01T01:00:00Z")
 
 
 def test_conflicts_and_refused_changes_are_explained_on_the_planner(planner):

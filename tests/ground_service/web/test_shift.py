@@ -5,8 +5,7 @@ LINNA_PICTURES=FOLDER keeps the pictures of the documentation: `make pictures`.
 
 from __future__ import annotations
 
-import io
-import os
+import json
 import re
 import socket
 import threading
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from ground_service.access.service import add_user
@@ -33,7 +31,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, end_socket, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, Pictures, end_socket, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
@@ -224,20 +222,6 @@ def shift(
     spacecraft.close()
 
 
-class Pictures:
-    """Pictures of the pages, 1280 px wide, in 128 colours."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def take(self, page: Page, name: str, part: str = "body") -> None:
-        """Take the upper 800 px of a part of the page."""
-        picture = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
-        picture = picture.crop((0, 0, picture.width, min(picture.height, 800)))
-        assert np.asarray(picture).std() > 5.0, f"{name}: nothing but background"
-        picture.quantize(128).save(self.folder / f"{name}.png", optimize=True)
-
-
 def dismiss_notices(page: Page) -> None:
     """Remove the notices, which are not part of a picture."""
     page.evaluate("document.querySelectorAll('#notices .notice').forEach((one) => one.remove())")
@@ -258,7 +242,7 @@ def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
 
 def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path) -> None:
     page, spacecraft = operator, shift.spacecraft
-    pictures = Pictures(Path(os.environ.get("LINNA_PICTURES") or tmp_path))
+    pictures = Pictures(tmp_path)
 
     # Sign in.
     page.goto("/")
@@ -301,10 +285,14 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     page.goto("/commands")
     row = page.locator("#links tbody tr", has_text="madrid")
     expect(row.get_by_role("button", name="Send now")).to_be_enabled()
+    pictures.take(page, "links", "section[aria-labelledby=links-title]")
     row.get_by_role("button", name="Send now").click()
-    # The planner uplinks approved windows that begin soon: its name is there if it was quicker.
-    named = re.compile(r"by (ann|planner)")
-    command = page.locator("#commands tbody tr", has_text="insert activity").filter(has_text=named).first
+    # The planner uplinks approved windows that begin soon: the page has the name that the service recorded.
+    recorded = json.loads(page.request.get("/api/v1/telecommands?limit=100").body())["items"]
+    (decider,) = {one["decided_by"] for one in recorded if one["name"] == "insert_activity"}
+    assert decider in ("ann", "planner")
+    command = page.locator("#commands tbody tr", has_text="insert activity").first
+    expect(command).to_contain_text(f" by {decider}")
     expect(command.locator(".state")).to_have_text("completed")
     expect(command.get_by_role("img", name="accepted, started, completed")).to_be_visible()
     pictures.take(page, "commands", "section[aria-labelledby=queue-title]")
@@ -316,15 +304,29 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=70.25)
     expect(value).to_contain_text("70.25 °C")
     expect(value.locator(".state.warning")).to_be_visible()
+    pictures.take(page, "telemetry", "section[aria-labelledby=live-title]")
+
+    # Series of a pass: two parameters in one chart, limits, and modes with their names.
+    page.goto("/telemetry?pass=1&chart=1:temperature_c,bus_voltage_v&chart=1:mode")
+    expect(page.locator("#charts canvas")).to_have_count(2)
+    expect(page.locator("#charts")).to_contain_text("CSV of all samples")
+    pictures.take(page, "charts", "section[aria-labelledby=series-title]")
 
     # An alarm.
     spacecraft.report("event_high", event_id=20, frame_number=7)
     page.goto("/alarms")
+    name = page.locator("td:first-child", has_text=re.compile("^temperature$"))
+    expect(page.locator("#alarms tbody tr").filter(has=name)).to_contain_text(re.compile(r"70\.[23] °C"))
     alarm = page.locator("#alarms tbody tr", has_text="camera fault")
     alarm.get_by_role("button", name="Acknowledge").click()
     page.get_by_label("State").select_option("cleared")  # the condition had ended
     expect(alarm).to_contain_text("ann")
     pictures.take(page, "alarms")
+
+    # Its event, with words.
+    page.goto("/events?severity=high")
+    expect(page.locator("#events tbody tr", has_text="camera fault")).to_contain_text("frame 7")
+    pictures.take(page, "events")
 
     # The report of a pass.
     page.goto("/passes")
@@ -335,13 +337,20 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     expect(page.locator("#verdict tr", has_text="detector recall")).to_contain_text(
         re.compile("^detector recall(met|not met)")
     )
+    assert not re.search(r"\de-\d", page.locator("#verdict .glance").inner_text())  # no powers of ten
     dismiss_notices(page)
     pictures.take(page, "pass")
     with page.expect_popup() as opened:
         page.get_by_role("link", name="Open report").click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
     assert re.search(r"/reports/[0-9a-f]{32}$", opened.value.url)
+    pictures.take(opened.value, "report-page")
     opened.value.close()
+    page.goto("/passes?search=synthetic")
+    row = page.locator("#passes tbody tr", has_text="synthetic pass")
+    expect(row.get_by_role("link", name="open")).to_be_visible()
+    expect(row.locator(".state").first).not_to_be_empty()
+    pictures.take(page, "passes")
 
     # A regression with its verdict.
     page.goto("/regression")

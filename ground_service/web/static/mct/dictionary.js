@@ -135,6 +135,24 @@ async function objectOf(key) {
   return parameter ? parameterObject(spacecraft, parameter) : undefined;
 }
 
+// Views of objects: Open MCT watches those of some types, of ours the plan.
+const observers = new Map(); // key -> functions that take the new state of the object
+function observe({ key }, callback) {
+  if (!observers.has(key)) observers.set(key, new Set());
+  observers.get(key).add(callback);
+  return () => observers.get(key).delete(callback);
+}
+
+// Read the shown objects of a kind again.
+export async function refreshObjects(kind) {
+  for (const [key, callbacks] of observers) {
+    if (!callbacks.size || parsed(key).kind !== kind) continue;
+    const found = await objectOf(key);
+    const now = Date.now();
+    callbacks.forEach((callback) => callback({ ...found, modified: now, persisted: now }));
+  }
+}
+
 async function childrenOf(key) {
   if (key === ROOT) return (await allSpacecraft()).map((one) => identifier(KEY.spacecraft(one)));
   const { kind, spacecraft, rest } = parsed(key);
@@ -165,7 +183,7 @@ export function installDictionary(openmct) {
     parse: (value) => (typeof value === "number" ? value : Number.parseInt(value, 16)),
     validate: (value) => /^[0-9a-f]+$/i.test(String(value)),
   });
-  openmct.objects.addProvider(NAMESPACE, { get: ({ key }) => objectOf(key), isReadOnly: () => true });
+  openmct.objects.addProvider(NAMESPACE, { get: ({ key }) => objectOf(key), isReadOnly: () => true, observe });
   openmct.objects.addRoot(identifier(ROOT), openmct.priority.HIGH);
   openmct.composition.addProvider({
     appliesTo: (one) => one.identifier.namespace === NAMESPACE && ["linna.spacecraft", "linna.packet"].includes(one.type),

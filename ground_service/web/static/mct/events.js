@@ -20,29 +20,41 @@ const COLOUR = { high: "is-limit--upr is-limit--red", medium: "is-limit--upr is-
 // Tables of Open MCT use the keys id and name themselves.
 const datum = (one) => ({ id: `${one.time} ${one.name} ${one.detail}`, utc: milliseconds(one.time), severity: one.severity, event: one.name.replaceAll("_", " "), detail: one.detail });
 
+// Of several data of the newest time, Open MCT 4.2 compares only the last with what follows, and would show the others
+// again. So events of one millisecond get times of their own, in their order: late ones are after those known before.
+function ordered(events) {
+  const numbers = new Map();
+  return events.map((one) => {
+    const found = datum(one);
+    const number = numbers.get(found.utc) ?? 0;
+    numbers.set(found.utc, number + 1);
+    return { ...found, utc: found.utc + Math.min(number, 999) / 1000 };
+  });
+}
+
 async function request({ spacecraft }, { start, end, size, signal }) {
   const wanted = Math.min(size ?? MOST, MOST);
   const query = { ...spacecraft, start: new Date(Math.max(start, 0)).toISOString(), stop: new Date(Math.max(end, 0)).toISOString() };
   const found = [];
   for (let offset = 0; offset < wanted; offset += PAGE) {
     const page = await get("events", { ...query, limit: Math.min(PAGE, wanted - offset), offset }, { signal });
-    found.push(...page.items.map(datum));
+    found.push(...page.items);
     if (found.length >= page.total) break;
   }
-  return found.reverse();
+  return ordered(found.reverse());
 }
 
 // From the start of what is shown: the interval ends after the newest telemetry, so its end would hide what follows.
 function subscribe(openmct, object, callback) {
   let from = openmct.time.getBounds().start;
-  let known = new Set(); // events at that time
+  let known = new Set(); // events from a millisecond before that time
   return afterTelemetry("events", async () => {
     try {
-      const found = await request(object, { start: from, end: FAR });
+      const found = await request(object, { start: from - 1, end: FAR });
       const fresh = found.filter((one) => !known.has(one.id));
       if (!fresh.length) return;
-      from = fresh.at(-1).utc;
-      known = new Set(found.filter((one) => one.utc >= from).map((one) => one.id));
+      from = Math.floor(fresh.at(-1).utc);
+      known = new Set(found.filter((one) => one.utc >= from - 1).map((one) => one.id));
       callback(fresh);
     } catch (error) {
       console.warn(`${object.name}: ${error.message}`);

@@ -40,7 +40,7 @@ function faultOf(alarm) {
       acknowledged: alarm.state === "acknowledged",
       shelved: alarm.state === "shelved",
       shortDescription: `${packets(alarm.count)}${limits}${alarm.active ? "" : ", condition ended"}`,
-      triggerTime: alarm.last,
+      triggerTime: `${alarm.last.slice(0, 10)} ${alarm.last.slice(11, 19)}Z`,
       triggerValueInfo: trigger,
       currentValueInfo: alarm.active ? trigger : { ...trigger, value: "ended", monitoringResult: "IN_LIMITS" },
     },
@@ -49,6 +49,7 @@ function faultOf(alarm) {
 
 export function installFaults(openmct, session) {
   const changed = new Set();
+  let asked = null; // the last request: the answer of an earlier one may come after its answer
   const notify = () => changed.forEach((callback) => callback(CHANGED));
   listen("alarm", notify);
 
@@ -64,7 +65,12 @@ export function installFaults(openmct, session) {
     supportsRequest: (object) => object.type === "faultManagement",
     supportsSubscribe: (object) => object.type === "faultManagement",
     async request() {
-      const found = await get("alarms", { state: ["raised", "acknowledged", "shelved"], limit: 1000 });
+      asked = get("alarms", { state: ["raised", "acknowledged", "shelved"], limit: 1000 });
+      let found = null;
+      for (let answered = null; answered !== asked; ) {
+        answered = asked;
+        found = await answered;
+      }
       return found.items.map(faultOf);
     },
     subscribe(_object, callback) {

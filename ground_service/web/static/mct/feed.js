@@ -32,8 +32,8 @@ export function startFeed() {
   );
 }
 
-// Do work after telemetry with samples of a kind (null: any): at once, then at most every AGAIN_MS, one at a time.
-export function afterTelemetry(kind, work) {
+// Do work after telemetry with samples of a kind (null: any): at once, then at most every `againMs`, one at a time.
+export function afterTelemetry(kind, work, againMs = AGAIN_MS) {
   let busy = false;
   let again = false;
   async function run() {
@@ -44,7 +44,7 @@ export function afterTelemetry(kind, work) {
     busy = true;
     do {
       again = false;
-      const pause = new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+      const pause = new Promise((resolve) => setTimeout(resolve, againMs));
       await work();
       await pause;
     } while (again);

@@ -14,7 +14,7 @@ const METADATA = {
 
 function datum(one, detections) {
   const name = `frame ${one.frame_number}, ${one.source}`;
-  const url = detections ? `${one.address}?detections=true` : one.address;
+  const url = detections ? one.overlay : one.address;
   return { name, utc: milliseconds(one.time), url, file: `${name.replaceAll(/[ ,]+/g, "-")}.png` };
 }
 
@@ -24,7 +24,7 @@ async function request({ spacecraft, detections }, { start, end, size, strategy,
   const from = Math.max(start, end - LONGEST_MS, 0);
   const query = { instance: spacecraft.instance, start: new Date(from).toISOString(), stop: new Date(Math.max(end, 0)).toISOString() };
   const { items } = await get(`spacecraft/${spacecraft.spacecraft_id}/images`, query, { signal });
-  const shown = detections ? items.filter((one) => one.source === "archive") : items;
+  const shown = detections ? items.filter((one) => one.overlay) : items;
   return (strategy === "latest" || size === 1 ? shown.slice(-1) : shown).map((one) => datum(one, detections));
 }
 

@@ -53,9 +53,13 @@ async function estimatorOf(spacecraft) {
   return found ? found.text.replaceAll(" ", "_") : "anchored";
 }
 
+async function matchingNames(spacecraft) {
+  return ["frames_processed", "detections_total", `navigation_state.${await estimatorOf(spacecraft)}.matched`];
+}
+
 async function navigationNames(spacecraft) {
   const estimator = await estimatorOf(spacecraft);
-  return ["altitude_m", "sigma_r_m", "nis", "matched"].map((value) => `navigation_state.${estimator}.${value}`);
+  return ["altitude_m", "sigma_r_m", "nis"].map((value) => `navigation_state.${estimator}.${value}`);
 }
 
 export const SHIFT = "pass-shift";
@@ -65,7 +69,7 @@ export function installLayouts(openmct) {
   addTable("shift-values", "Spacecraft state", ["mode", "temperature_c", "bus_voltage_v", "power_w", "storage_used_permille", "queue_depth", "clock_status", "boot_count", "telecommands_accepted", "telecommands_rejected", "packets_sent", "events_sent"]);
   addPlot("shift-plot", "Temperature, bus voltage, power", ["temperature_c", "bus_voltage_v", "power_w"]);
   addTable("payload-values", "Payload state", ["mode", "frames_processed", "frames_bad", "last_image_quality", "detections_total", "anchor_reads", "memory_used_kib", "model_hash", "parameters_hash", "catalogue_hash", "anchor_table_hash"]);
-  addPlot("payload-plot", "Frames and detections", ["frames_processed", "frames_bad", "detections_total"]);
+  addPlot("payload-plot", "Frames and detections", matchingNames);
   addPlot("payload-navigation", "On-board estimator", navigationNames);
   addLayout(SHIFT, "Layout: pass shift", [
     [64, [["shift-values", 36], ["shift-plot", 34], [FAULTS, 30]]],

@@ -73,12 +73,15 @@ async function history(object, options) {
   return samplesOf(buckets, options.strategy === "minmax" && !Object.keys(object.parameter.labels).length);
 }
 
-// Parameters whose packet is not among the newest values: what is later than the last value, after each reception.
+const KINDS = { housekeeping: "housekeeping", navigation_state: "navigation_states" }; // of samples, by packet
+const PLOT_AGAIN_MS = 1000; // shortest time between two requests of one plot
+
+// All values later than the last one, after each reception: newest values leave out those that came together.
 // The first request is that of the history: its interval ends after the newest telemetry, so its end would hide what follows.
 function followSeries(object, callback, since) {
   let last = since - 1;
   let points = 0;
-  return afterTelemetry(isNewest(object) ? null : "navigation_states", async () => {
+  const work = async () => {
     try {
       // Plots append what follows, so nothing of the history is repeated.
       if (!points) last = Math.max(last, shown.get(object.identifier.key) ?? last);
@@ -91,11 +94,15 @@ function followSeries(object, callback, since) {
     } catch (error) {
       console.warn(`${object.name}: ${error.message}`);
     }
-  });
+  };
+  return afterTelemetry(KINDS[object.parameter.packet] ?? null, work, isNewest(object) ? PLOT_AGAIN_MS : undefined);
 }
 
-function subscribe(openmct, object, callback) {
-  if (!isNewest(object)) return followSeries(object, callback, openmct.time.getBounds().start);
+// Tables of newest values ask for one value, plots for all.
+const isComplete = ({ size, strategy }) => strategy === "batch" && size !== 1;
+
+function subscribe(openmct, object, callback, options) {
+  if (!isNewest(object) || (object.parameter.series && isComplete(options))) return followSeries(object, callback, openmct.time.getBounds().start);
   let last = -Infinity;
   let stop = null;
   const warn = (error) => console.warn(`${object.name}: ${error.message}`);
@@ -140,7 +147,8 @@ export function installTelemetry(openmct) {
     supportsRequest: isParameter,
     request: history,
     supportsSubscribe: isParameter,
-    subscribe: (object, callback) => subscribe(openmct, object, callback),
+    supportsBatching: () => true,
+    subscribe: (object, callback, options) => subscribe(openmct, object, callback, options ?? {}),
     supportsLimits: (object) => isParameter(object) && Boolean(object.parameter.warning || object.parameter.alarm),
     getLimitEvaluator: ({ parameter }) => ({
       evaluate: (datum, metadata) => (metadata && typeof datum[metadata.key] === "number" ? limitOf(datum[metadata.key], parameter) : undefined),

@@ -1,0 +1,311 @@
+"""A payload flown live, seen in the telemetry displays and on the page of the live payload, in Chromium.
+
+LINNA_PICTURES=FOLDER keeps the pictures of the documentation: `make pictures`.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.ground import open_ground
+from ground_service.missions.service import add_mission
+from ground_service.planning.model import WindowEntry
+from ground_service.planning.service import add_window
+from lunar.datafolder import find_data
+from lunar.ephemeris import ephemeris_from_states
+from lunar.oem import save_oem
+from lunar.timescales import parse_utc
+from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
+from payload_emulator.session.live import LivePayload
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.world import build_world
+from tests.ground_service.conftest import circular_states
+from tests.ground_service.web.conftest import PATIENCE_S, Pictures, strict_page, wait_until
+from tmtc.dictionary import DICTIONARY
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T01:40:00Z")
+FRAMES = 16
+SCENARIO = """
+name = "live"
+seed = 3
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 240.0
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical", "anchored"]
+filter_gravity = "builtin"
+filter_degree = 8
+[faults]
+events = ["overheating at 60 for 45 size 60", "camera_lost at 150 for 30"]
+"""
+MISSION = """name = "selenita"
+[spacecraft]
+id = 76
+[camera]
+fov_deg = 120.0
+width_px = 512
+height_px = 512
+[link.stations.madrid]
+latitude_deg = 40.43
+longitude_deg = -4.25
+minimum_elevation_deg = 0.0
+[[links]]
+name = "madrid"
+kind = "tcp"
+station = "madrid"
+downlink = "127.0.0.1:{port}"
+silence_s = 1.0
+"""
+ORDERS = (
+    ("set_housekeeping_interval", {"structure_id": 1, "interval_s": 15}),
+    ("set_parameter", {"parameter_id": 21, "value": 2.0}),  # frames between thumbnails
+    ("set_parameter", {"parameter_id": 22, "value": 4.0}),  # pixels averaged along each axis
+)
+SOURCE = 3
+"""Source of these telecommands: each source has sequence counts of its own."""
+
+
+@dataclass
+class Flown:
+    """A service that received a flight over its link, and two pages that were open during the flight."""
+
+    url: str
+    layout: Page
+    live: Page
+
+    def ask(self, path: str, **query: Any) -> Any:
+        """Return an answer of the service."""
+        answer = self.layout.request.get(f"{self.url}/api/v1/{path}", params=query)
+        assert answer.ok, answer.text()
+        return answer.json()
+
+    def alarm(self, name: str) -> Any:
+        """Return the alarm with a name."""
+        (found,) = (one for one in self.ask("alarms")["items"] if one["name"] == name)
+        return found
+
+    def events(self) -> int:
+        """Return the number of events."""
+        return int(self.ask("events", spacecraft_id=76, instance="flight")["total"])
+
+    def newest(self) -> dict[str, Any]:
+        """Return the newest housekeeping values by name."""
+        items = self.ask("parameters", spacecraft_id=76, instance="flight")["items"]
+        return {one["name"]: one["value"] for one in items if one["packet"] == "housekeeping"}
+
+
+@pytest.fixture(scope="module")
+def flown(
+    tmp_path_factory: pytest.TempPathFactory, serve: Any, openmct: Path, browser: Browser
+) -> Iterator[Flown]:
+    """A payload flown live with its operator and `ORDERS`, started on the live page, followed in a layout."""
+    folder = tmp_path_factory.mktemp("flight")
+    data = find_data(None)
+    world = build_world(parse_scenario(SCENARIO), data)
+    spacecraft = new_spacecraft(world, load_scenario_payload(world, data)[0])
+    payload = LivePayload(world, spacecraft, rate=0.0, paused=True, stop_at_end=True)
+    thread = threading.Thread(target=payload.run, daemon=True)
+    home = prepared_home(folder, payload.ports["telemetry"])
+    thread.start()
+    service = serve(home, home / "serve.log", payload.ports["console"], openmct)
+    try:
+        with (
+            strict_page(browser, service.url) as layout,
+            strict_page(browser, service.url) as live,
+            socket.create_connection(("127.0.0.1", payload.ports["telecommand"])) as station,
+        ):
+            for count, (name, values) in enumerate(ORDERS):
+                packet = DICTIONARY.pack_command(name, values, sequence_count=count, source=SOURCE)
+                station.sendall(packet)
+            wait_until(lambda: len(payload._orders) == len(ORDERS), "no telecommands have arrived")
+            wait_until(lambda: bool(payload._servers["telemetry"].clients), "the link is not connected")
+            found = Flown(service.url, layout, live)
+            follow(found)
+            yield found
+    finally:
+        service.stop()
+        payload.stopping.set()
+        thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
+def prepared_home(folder: Path, telemetry_port: int) -> Path:
+    """Return the folder of a service with a mission description, an ephemeris and two windows."""
+    every = START + np.arange(-12 * 3600, 12 * 3600, 60, dtype=np.int64) * NS
+    save_oem(ephemeris_from_states(every, *circular_states(every)), folder / "orbits.oem")
+    home = folder / "home"
+    with open_ground(home) as ground:
+        add_mission(ground, MISSION.format(port=telemetry_port).encode(), actor="ann")
+        stored = ground.files.put_file(folder / "orbits.oem")
+        add_ephemeris(ground, stored, name="orbits", precedence=0, actor="ann")
+        for name, minute in (("morning", 0), ("noon", 60)):
+            start = START + minute * 60 * NS
+            add_window(ground, WindowEntry(name, start, start + 180 * NS, 15.0, 76), actor="ann")
+    return home
+
+
+def follow(flown: Flown) -> None:
+    """Start the flight on the live page, and wait until its last values are in the layout."""
+    flown.live.goto("/live")
+    expect(flown.live.locator("#state")).to_have_text("connected")
+    flown.layout.set_viewport_size({"width": 1280, "height": 800})
+    flown.layout.goto(address("pass-shift"))
+    expect(flown.layout.get_by_text("Live feed connected")).to_be_visible()
+    flown.live.get_by_role("button", name="Run").click()
+    expect(lad_row(flown.layout, "mode")).to_be_visible()
+    wait_until(lambda: flown.newest().get("frames_processed") == FRAMES, "not all frames were received")
+
+
+def lad_row(page: Page, name: str) -> Locator:
+    """Return the row of a table of newest values."""
+    return page.get_by_label("lad row").filter(has=page.get_by_text(name, exact=True))
+
+
+def address(kind: str) -> str:
+    """Return the address of an object of the spacecraft, with the time of the flight."""
+    objects = ("linna:spacecraft", "linna:vehicle~76~flight", f"linna:{kind}~76~flight")
+    return f"/mct#/browse/{'/'.join(objects)}?{SHOWN}"
+
+
+SHOWN = (
+    "tc.mode=newest&tc.startDelta=480000&tc.endDelta=60000&tc.timeSystem=utc&hideInspector=true&hideTree=true"
+)
+PLOT = ".gl-plot-display-area canvas"
+IMAGES_LOADED = """() => {
+    const images = [...document.querySelectorAll(".c-thumb__image")];
+    return images.length > 0 && images.every((one) => one.complete && one.naturalWidth > 0);
+}"""
+
+
+@pytest.fixture
+def opened(flown: Flown, browser: Browser) -> Iterator[Page]:
+    """A page of its own for the displays."""
+    with strict_page(browser, flown.url) as page:
+        page.set_viewport_size({"width": 1280, "height": 800})
+        yield page
+
+
+def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Path) -> None:
+    page = flown.layout
+    expect(lad_row(page, "packets sent")).to_contain_text(f"{flown.newest()['packets_sent']:.0f}")
+    expect(page.locator(PLOT)).to_have_count(2 * 3)  # of each plot, one for the lines and one for highlights
+    expect(event_rows(page)).to_have_count(flown.events())
+    # The value is within its limits again; the alarm is kept until somebody acknowledges it.
+    wait_until(lambda: not flown.alarm("temperature_c")["active"], "the condition of the alarm has not ended")
+    fault = fault_named(page, "temperature")
+    expect(fault).to_contain_text("ended")
+    fault.get_by_role("checkbox").check()
+    page.get_by_role("button", name="Acknowledge").click()
+    page.get_by_label("Save", exact=True).click()
+    expect(fault).to_have_count(0)
+    # Windows and contacts change while they are shown.
+    expect(activity(page, "morning, draft")).to_be_visible()
+    assert page.request.patch("/api/v1/windows/1", data={"state": "approved"}).ok
+    expect(activity(page, "morning, approved")).to_be_visible()
+    expect(page.get_by_text("Contacts, madrid").first).to_be_visible()
+    # The plot has the peak, which may have come together with later packets.
+    wait_until(lambda: highest_tick(page) >= 60.0, "the peak of the temperature is not shown")
+    Pictures(tmp_path).take(page, "displays-shift")
+
+
+def highest_tick(page: Page) -> float:
+    """Return the greatest value on the y axis of the first plot."""
+    labels = page.locator(".gl-plot").first.locator(".gl-plot-y-tick-label")
+    return max((float(one) for one in labels.all_inner_texts()), default=0.0)
+
+
+def fault_named(page: Page, name: str) -> Locator:
+    """Return an item of the list of faults."""
+    checkbox = page.get_by_label(f"Select fault: {name} in Spacecraft 76, flight", exact=True)
+    return page.get_by_role("listitem").filter(has=checkbox)
+
+
+def event_rows(page: Page) -> Locator:
+    """Return the rows of the table of events."""
+    return page.locator(".c-telemetry-table__body tr")
+
+
+def activity(page: Page, name: str) -> Locator:
+    """Return an activity of the plan."""
+    return page.locator(".c-plan__activity").filter(has_text=name)
+
+
+def test_the_layout_of_a_payload_engineer_shows_the_flight(
+    flown: Flown, opened: Page, tmp_path: Path
+) -> None:
+    opened.goto(address("payload-engineer"))
+    expect(lad_row(opened, "frames processed")).to_contain_text(str(FRAMES))
+    expect(opened.locator(PLOT)).to_have_count(2 * 6)
+    expect(event_rows(opened)).to_have_count(flown.events())
+    opened.wait_for_function(IMAGES_LOADED)
+    Pictures(tmp_path).take(opened, "displays-payload")
+
+
+def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Path) -> None:
+    expect(flown.live.locator("#numbers")).to_contain_text("matched")
+    expect(flown.live.locator("#state")).to_have_text("the scenario has ended")
+    Pictures(tmp_path).take(flown.live, "live")
+
+
+@pytest.mark.parametrize(("kind", "width_px"), [("images", 128), ("detections", 512)])
+def test_downlinked_images_are_shown(
+    flown: Flown, opened: Page, tmp_path: Path, kind: str, width_px: int
+) -> None:
+    opened.goto(address(kind))
+    # The camera gave no image of one of every second frame.
+    expect(opened.locator(".c-imagery__thumb")).to_have_count(FRAMES // 2 - 1)
+    opened.wait_for_function(IMAGES_LOADED)
+    widths = "[...document.querySelectorAll('.c-thumb__image')].map((one) => one.naturalWidth)"
+    assert set(opened.evaluate(widths)) == {width_px}
+    Pictures(tmp_path).take(opened, f"displays-{kind}")
+
+
+def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_path: Path) -> None:
+    opened.goto(address("events"))
+    expect(event_rows(opened)).to_have_count(flown.events())
+    listed = flown.ask("events", spacecraft_id=76, instance="flight", limit=100)["items"]
+    cells = "(rows) => rows.map((one) => [...one.querySelectorAll('td')].slice(-2).map((td) => td.textContent.trim()))"
+    shown = event_rows(opened).evaluate_all(cells)
+    assert shown == [[one["name"].replace("_", " "), one["detail"]] for one in listed]
+    expect(event_rows(opened).filter(has_text="temperature high").locator(".is-limit--yellow")).to_have_count(
+        1
+    )
+    Pictures(tmp_path).take(opened, "displays-events")
+
+
+def test_windows_and_contacts_are_a_plan(flown: Flown, opened: Page, tmp_path: Path) -> None:
+    span = {"since": "2029-08-07T01:00:00Z", "until": "2029-08-07T03:00:00Z"}
+    # The open contact of the link ends without telemetry; until then none is predicted after it.
+    wait_until(lambda: bool(flown.ask("contacts", **span)["contacts"]), "no contact is predicted")
+    start, stop = (int(parse_utc(one)) // 1_000_000 for one in span.values())
+    hours = f"tc.mode=fixed&tc.startBound={start}&tc.endBound={stop}&tc.timeSystem=utc"
+    opened.goto(address("plan").replace(SHOWN, f"{hours}&hideInspector=true&hideTree=true"))
+    expect(activity(opened, "madrid, predicted").first).to_be_visible()
+    Pictures(tmp_path).take(opened, "displays-plan")
+
+
+def test_faults_have_the_values_and_times_of_alarms(flown: Flown, opened: Page, tmp_path: Path) -> None:
+    opened.goto(f"/mct#/browse/faults.taxonomy:faultManagement.view?{SHOWN}")
+    fault = fault_named(opened, "temperature high")
+    alarm = flown.alarm("temperature_high")
+    expect(fault).to_contain_text(f"{alarm['last'][:10]} {alarm['last'][11:19]}Z")
+    expect(fault).to_contain_text("ended")
+    Pictures(tmp_path).take(opened, "displays-faults")
