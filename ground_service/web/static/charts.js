@@ -184,6 +184,33 @@ function zoomByKeys(box, plot) {
   });
 }
 
+// The legend shows and hides series, with the pointer (uPlot) and with keys. The band of a series goes with its line.
+function legendByKeys(plot) {
+  plot.root.querySelectorAll(".u-legend .u-series").forEach((row, index) => {
+    const label = row.querySelector(".u-label");
+    if (!index || plot.series[index].class === "hidden") return;
+    label.tabIndex = 0;
+    label.role = "button";
+    label.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      label.click();
+    });
+  });
+  seriesShown(plot);
+}
+
+function seriesShown(plot) {
+  const labels = plot.root.querySelectorAll(".u-legend .u-series .u-label");
+  let shown = true;
+  plot.series.forEach((one, index) => {
+    if (one.class !== "hidden") {
+      shown = one.show;
+      if (labels[index]?.role) labels[index].ariaPressed = String(shown);
+    } else if (one.show !== shown) plot.setSeries(index, { show: shown });
+  });
+}
+
 // Minutes are ruled at whole numbers of them.
 const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600].map((one) => 60 * one);
 
@@ -222,6 +249,7 @@ export function chart(place, title, unit, series, { logarithmic = false, elapsed
       legend: { live: true },
       hooks: {
         draw: [(drawn) => drawLimits(drawn, series, scaleOf)],
+        setSeries: [seriesShown],
         setScale: [(changed, key) => key === "x" && group && zoomed(changed, group)],
       },
     },
@@ -231,6 +259,7 @@ export function chart(place, title, unit, series, { logarithmic = false, elapsed
   box.plot = plot;
   if (group) joinGroup(group, plot);
   zoomByKeys(box, plot);
+  legendByKeys(plot);
   new ResizeObserver(() => plot.setSize({ width: box.clientWidth, height })).observe(box);
   return { box, plot };
 }

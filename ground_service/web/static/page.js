@@ -32,9 +32,40 @@ export function svg(name, attributes = {}, ...children) {
   return made;
 }
 
+// What the user has in hand in a place that is drawn again: keyboard focus, scroll positions, and text not yet sent.
+const FOCUSABLE = "a[href], button, input, select, textarea, summary, [tabindex]";
+const TEXTS = "input:not([type=checkbox], [type=radio], [type=file]), textarea";
+const rowOf = (one) => one.closest("[data-row]")?.dataset.row ?? "";
+const nameOf = (one) => [rowOf(one), one.tagName, one.id, one.name ?? "", one.getAttribute("aria-label") ?? one.textContent].join("\n");
+
+function inHand(place) {
+  const active = document.activeElement;
+  const focused = active !== place && place.contains(active) ? { name: nameOf(active), row: rowOf(active), isRow: active.matches("[data-row]") } : null;
+  const scrolled = [...place.querySelectorAll(".scroll")].map((one) => [one.getAttribute("aria-label"), one.scrollLeft, one.scrollTop]);
+  const typed = [...place.querySelectorAll(TEXTS)].filter((one) => one.value !== one.defaultValue).map((one) => [nameOf(one), one.defaultValue, one.value]);
+  return { focused, scrolled, typed };
+}
+
+function giveBack(place, { focused, scrolled, typed }) {
+  for (const [label, left, top] of scrolled) place.querySelector(`.scroll[aria-label="${CSS.escape(label)}"]`)?.scrollTo(left, top);
+  for (const one of typed.length ? place.querySelectorAll(TEXTS) : []) {
+    const kept = typed.find(([name, before]) => name === nameOf(one) && before === one.defaultValue);
+    if (kept) one.value = kept[2];
+  }
+  if (!focused) return;
+  const row = focused.row && [...place.querySelectorAll("[data-row]")].find((one) => one.dataset.row === focused.row);
+  const same = focused.isRow ? [row].filter(Boolean) : [...place.querySelectorAll(FOCUSABLE)].filter((one) => nameOf(one) === focused.name);
+  // Two controls with one name may do different things. Without the control, the next Tab continues from its row or place.
+  const next = same.length === 1 ? same[0] : row || place;
+  if (next.tabIndex < 0) next.tabIndex = -1;
+  next.focus({ preventScroll: true });
+}
+
 export function show(id, ...children) {
   const place = typeof id === "string" ? byId(id) : id;
+  const kept = inHand(place);
   place.replaceChildren(...children.flat().filter((child) => child !== null && child !== undefined));
+  giveBack(place, kept);
 }
 
 // columns: [heading, row => text or node, "num" for right-aligned numbers]
@@ -42,7 +73,7 @@ export function table(caption, columns, rows, empty) {
   if (!rows.length) return element("p", { class: "hint" }, empty);
   const head = columns.map(([heading, , kind]) => element("th", { scope: "col", class: kind }, heading));
   const body = rows.map((row) =>
-    element("tr", {}, columns.map(([, cell, kind]) => element("td", { class: kind }, cell(row) ?? ""))),
+    element("tr", { "data-row": row.id ?? row.name ?? row.start }, columns.map(([, cell, kind]) => element("td", { class: kind }, cell(row) ?? ""))),
   );
   return element(
     "div",
@@ -71,18 +102,19 @@ export function notice(text, kind = "good") {
 
 export const trouble = (error) => notice(error.message, "bad");
 
-// A listener whose failure is told, and which keeps its button from being pressed twice.
+// A listener whose failure is told, and which keeps its button from being pressed twice. A disabled button loses the focus.
 export function acting(task) {
   return async (event) => {
     event?.preventDefault?.();
     const button = event?.submitter ?? (event?.currentTarget instanceof HTMLButtonElement ? event.currentTarget : null);
-    if (button) button.disabled = true;
+    if (button?.ariaDisabled === "true") return;
+    if (button) button.ariaDisabled = "true";
     try {
       await task(event);
     } catch (error) {
       trouble(error);
     } finally {
-      if (button) button.disabled = false;
+      if (button) button.ariaDisabled = null;
     }
   };
 }
@@ -121,14 +153,17 @@ export const stateMark = (state) => element("span", { class: `state ${state}` },
 export function pager(load, size = 25) {
   let offset = Math.max(0, Math.floor(Number(stated("offset")) || 0));
   async function go(to) {
+    const pressed = [byId("previous"), byId("next")].find((one) => one === document.activeElement);
     offset = Math.max(0, to);
     state({ offset: offset || null });
     const page = await load(size, offset);
     byId("range").textContent = page.total
       ? `${offset + 1} to ${Math.min(offset + size, page.total)} of ${page.total}`
       : "none";
-    byId("previous").disabled = offset === 0;
-    byId("next").disabled = offset + size >= page.total;
+    const [previous, next] = [byId("previous"), byId("next")];
+    previous.disabled = offset === 0;
+    next.disabled = offset + size >= page.total;
+    if (pressed?.disabled) (pressed === next ? previous : next).focus(); // a disabled button loses the focus
   }
   byId("previous").addEventListener("click", acting(() => go(offset - size)));
   byId("next").addEventListener("click", acting(() => go(offset + size)));

@@ -157,7 +157,9 @@ function pressable(made, deed) {
   made.setAttribute("aria-label", made.querySelector("title").textContent);
   made.addEventListener("click", deed);
   made.addEventListener("keydown", (event) => {
-    if (event.key === "Enter" || event.key === " ") deed(event);
+    if (event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault(); // the space bar would scroll the page
+    deed(event);
   });
 }
 
@@ -171,6 +173,7 @@ function windowBar(row, x, top, scale) {
   text.textContent = row.name;
   made.append(text);
   made.dataset.window = row.id;
+  made.dataset.row = row.id;
   pressable(made, () => choose(row.id));
   if (row.state !== "draft" || !mayOperate()) return made;
   made.addEventListener("keydown", (event) => {
@@ -231,7 +234,6 @@ async function move(row, start, stop) {
   } finally {
     chosen = row.id;
     await load();
-    byId("timeline").querySelector(`[data-window="${row.id}"]`)?.focus();
   }
 }
 
@@ -288,7 +290,7 @@ function timesForm(row) {
   const field = (name, value) => element("input", { name, required: true, value: `${value.slice(0, 19)}Z`, pattern: "\\d{4}-\\d\\d-\\d\\dT\\d\\d:\\d\\d:\\d\\d(\\.\\d+)?Z", title: "UTC, such as 2029-08-07T06:00:00Z" });
   const [start, stop] = [field("start", row.start), field("stop", row.stop)];
   const change = acting(() => move(row, seconds(start.value), seconds(stop.value)));
-  return element("form", { class: "row", "data-needs": "operator", onsubmit: change }, element("label", {}, "Start, UTC ", start), element("label", {}, "Stop, UTC ", stop), element("button", {}, "Change"));
+  return element("form", { class: "row", "data-needs": "operator", "data-row": row.id, onsubmit: change }, element("label", {}, "Start, UTC ", start), element("label", {}, "Stop, UTC ", stop), element("button", {}, "Change"));
 }
 
 async function uplink(row) {

@@ -87,3 +87,26 @@ def test_after_sign_in_no_other_host_is_opened(stranger, guarded, next_page):
     sign_in(stranger, guarded[1])
     expect(stranger.locator("#user")).to_have_text("ada, viewer")
     assert stranger.url.startswith(guarded[0])
+
+
+def test_the_sign_in_is_used_with_the_keyboard(stranger, guarded):
+    stranger.goto("/licences")
+    dialog = stranger.get_by_role("dialog", name="Sign in")
+    expect(stranger.get_by_label("Token")).to_be_focused()
+    visited = []
+    for _ in range(8):
+        stranger.keyboard.press("Tab")
+        visited.append(
+            stranger.evaluate("document.activeElement.closest('dialog, main, header, footer')?.id")
+        )
+    assert "sign-in" in visited and set(visited) <= {"sign-in", None}  # None: controls of the browser
+    stranger.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
+    stranger.locator("#caller").press("Enter")
+    expect(stranger.get_by_label("Token")).to_be_focused()
+    stranger.keyboard.press("Escape")
+    expect(stranger.locator("#caller")).to_be_focused()
+    stranger.keyboard.press("Enter")
+    stranger.keyboard.type(guarded[1])
+    stranger.keyboard.press("Enter")
+    expect(stranger.locator("#user")).to_have_text("ada, viewer")
