@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -57,6 +57,7 @@ from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation
 from lunar.gravity import GravityField
+from lunar.timescales import format_utc
 from reports.text import count_text
 from reports.values import (
     AnchorRead,
@@ -192,6 +193,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     detector, gallery, worst, craters = _detector(inputs, missing, remarks)
     if not inputs.images:
         missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
+    remarks += attitude_remarks(inputs.events)
     accounting = _frame_accounting(inputs)
     table = requirements(
         inputs.limits,
@@ -234,6 +236,22 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         remarks=tuple(remarks),
         not_available=missing,
     )
+
+
+def attitude_remarks(events: Sequence[PassEvent]) -> list[str]:
+    """Return a remark for each time in which the payload judged its attitude noisier than declared."""
+    found: list[str] = []
+    lasting = False
+    for one in sorted(events, key=lambda event: event.utc_ns):
+        if one.name == "attitude_degraded":
+            found.append(
+                f"attitude judged noisier than declared from {format_utc(one.utc_ns)} on ({one.detail}): the payload "
+                "used the estimated noise"
+            )
+        elif one.name == "attitude_restored" and lasting:
+            found[-1] += f", until {format_utc(one.utc_ns)}"
+        lasting = one.name == "attitude_degraded" or (lasting and one.name != "attitude_restored")
+    return found
 
 
 def summary_of(report: PassReport) -> dict[str, Any]:
