@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from ground_service.errors import GroundError
+from ground_service.links import service as links
 from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
@@ -22,6 +24,7 @@ from studies.mission_run.kills import PHASES, Keeper, Kill, PlannedKill, plan_ki
 from studies.mission_run.parts import Part, PidFile, PostgresServer, runs
 from studies.mission_run.processes import Usage, family_cpu_s, family_mib
 from studies.mission_run.run import RunTerms, run_mission
+from studies.mission_run.spacecraft import SpacecraftProcess
 
 HOUR_NS = 3_600_000_000_000
 
@@ -46,8 +49,8 @@ estimators = ["spherical"]
 
 KILLED = (
     ("started", "database", 0.0),
-    ("started", "link", 0.3),
-    ("ended", "spacecraft", 0.1),
+    ("started", "spacecraft", 0.1),
+    ("ended", "link", 0.3),
     ("ended", "worker", 0.0),
     ("settled", "broker", 0.2),
     ("settled", "api", 0.0),
@@ -57,6 +60,19 @@ KILLED = (
 def needs_servers() -> None:
     if not shutil.which("redis-server") or not list(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
         pytest.skip("PostgreSQL or Redis is not installed")
+
+
+def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the ground wait for the stations of a spacecraft that is killed meanwhile."""
+    was_restarted = threading.Event()
+    restart, unsent = SpacecraftProcess.restart, links.unsent
+
+    def note_restart(spacecraft: SpacecraftProcess) -> None:
+        restart(spacecraft)
+        was_restarted.set()
+
+    monkeypatch.setattr(SpacecraftProcess, "restart", note_restart)
+    monkeypatch.setattr(links, "unsent", lambda *given: unsent(*given) or int(not was_restarted.is_set()))
 
 
 @pytest.mark.slow
@@ -71,6 +87,7 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
         PlannedKill(scenario.epoch_utc_ns, phase, part, delay_s, 0.1) for phase, part, delay_s in KILLED
     )
     monkeypatch.setattr("studies.mission_run.run.plan_kills", lambda *_: planned)
+    hold_telecommands_until_the_spacecraft_was_killed(monkeypatch)
     folder = tmp_path / "killed"
     killing = replace(terms, distributed=True, kill_seed=1, kills=len(planned))
     killed = run_mission(scenario, data, folder, killing, print)

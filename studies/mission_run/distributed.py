@@ -57,6 +57,7 @@ class DistributedGround(MissionGround):
     """The service as separate processes, `parts` by name."""
 
     def __init__(self, folder: Path, data: DataFolder, clock_file: Path, servers: Servers) -> None:
+        self.while_waiting = lambda: None
         self.parts: dict[str, Part] = {}
         self.pids = PidFile(folder / "processes.json")
         self.pids.end_left_over()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +55,13 @@ class MissionGround:
     ----------
     ground
         Database and files of the service, to see whether it is idle, and for the closing figures.
+    while_waiting
+        Called during each wait; an error that it raises ends the wait, as the end of the spacecraft with its stations.
     """
 
     ground: Ground
     client: Client
+    while_waiting: Callable[[], object] = field(default=lambda: None, init=False)
 
     def add_mission(self, text: bytes) -> None:
         """Add the mission description, and wait for its links."""
@@ -166,6 +169,7 @@ class MissionGround:
     def _wait(self, is_done: Callable[[], bool], what: str) -> None:
         until = time.monotonic() + SETTLE_S
         while not self._holds(is_done):
+            self.while_waiting()
             if time.monotonic() > until:
                 raise GroundError(f"mission run: expected {what} within {SETTLE_S:.0f} s, found none")
             time.sleep(POLL_S)

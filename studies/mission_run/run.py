@@ -233,6 +233,8 @@ class MissionRun:
         if isinstance(ground, DistributedGround):
             self._keeper = self._made_keeper(spacecraft, ground)
             self._keeper.start()
+            # A killed spacecraft takes the stations with it: what the ground waits for may need them.
+            ground.while_waiting = spacecraft.check_killed
         try:
             while True:
                 try:

@@ -100,16 +100,16 @@ class SpacecraftProcess:
             for line in self._lines:
                 yield json.loads(line)
         except (OSError, ValueError) as error:
-            self._check_killed()
+            self.check_killed()
             raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
-        self._check_killed()
+        self.check_killed()
 
     def order(self, word: str) -> None:
         """Send a word to the console."""
         try:
             self._console.sendall(word.encode() + b"\n")
         except OSError as error:
-            self._check_killed()
+            self.check_killed()
             raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
 
     def kill(self) -> None:
@@ -117,7 +117,8 @@ class SpacecraftProcess:
         self.was_killed = True
         kill_family(self.process.pid)
 
-    def _check_killed(self) -> None:
+    def check_killed(self) -> None:
+        """Raise `SpacecraftKilled` if `kill` was called since the last start."""
         if self.was_killed:
             self.process.wait(STOP_S)
             raise SpacecraftKilled("spacecraft: its process was killed")
@@ -125,7 +126,7 @@ class SpacecraftProcess:
     def mission_text(self) -> bytes:
         """Return the mission description that the spacecraft's operator hands over."""
         octets = b""
-        with socket.create_connection(("127.0.0.1", self.mission_port), timeout=ANSWER_S) as connection:
+        with self._connected(self.mission_port) as connection:  # opened after the console
             while block := connection.recv(65_536):
                 octets += block
         return octets
