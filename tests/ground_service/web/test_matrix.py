@@ -1,11 +1,13 @@
 """Every page at three widths, light and dark, with two fonts, with and without data: layout, barriers, keyboard.
 
 LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `make page-table`.
+LINNA_PAGE_PICTURES=FOLDER keeps a picture of each page, light and dark, at each width.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,7 +42,8 @@ SCHEMES = ("light", "dark")
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
 
-AXE_RUNS = {("dark", 1280), ("light", 390)}
+AXE_WIDTHS = (1280, 390)
+COLUMNS = ("wider than the window", "axe", "console errors", "not reached by Tab", "without a focus mark")
 SIGN_IN = "sign-in"
 API_PAGE = "/docs"
 """Page of Swagger UI, which has tests of its own."""
@@ -57,13 +60,23 @@ USABLE = """() => {
     const all = [...place.querySelectorAll(usable)].filter(shown);
     window.linnaUsable = new Set(all.filter((one) => one.type !== "radio"));
     window.linnaVisited = new Set();
+    window.linnaUnmarked = [];
     return linnaUsable.size;
 }"""
+# The focus is seen by an outline of the element or of its button, or by the edge of a bar of the timeline.
 VISIT = """() => {
     const one = document.activeElement;
+    if (one === document.body) return false;
     const again = linnaVisited.has(one);
     linnaVisited.add(one);
-    return again && one !== document.body;
+    const css = (each) => getComputedStyle(each);
+    const outlined = (each) => each && css(each).outlineStyle !== "none" && parseFloat(css(each).outlineWidth) >= 1;
+    const bar = one.querySelector(":scope > rect");
+    const box = one.getBoundingClientRect();
+    const inside = box.bottom > 0 && box.top < innerHeight && box.right > 0 && box.left < innerWidth;
+    const marked = outlined(one) || outlined(one.closest(".button")) || (bar && parseFloat(css(bar).strokeWidth) >= 3);
+    if (!again && !(marked && inside)) linnaUnmarked.push(one.outerHTML.slice(0, 120));
+    return again;
 }"""
 MISSED = """() => [...linnaUsable].filter((one) => one.isConnected && !linnaVisited.has(one))
     .map((one) => one.outerHTML.slice(0, 120))"""
@@ -183,12 +196,13 @@ class Faults:
         self.layout: list[str] = []
         self.barriers: list[str] = []
         self.keyboard: list[str] = []
+        self.unmarked: list[str] = []
 
-    def find(self, page: Page) -> None:
+    def find(self, page: Page, name: str) -> None:
         """Look at an opened page in all forms."""
         for scheme in SCHEMES:
             page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]  # one of its words
-            for name, family in FONTS.items():
+            for font, family in FONTS.items():
                 page.evaluate(
                     "(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", family
                 )
@@ -196,19 +210,30 @@ class Faults:
                     page.set_viewport_size({"width": width, "height": 844})
                     page.evaluate(FRAMES_DRAWN)
                     if (wide := page.evaluate(WIDTH)) > width:
-                        self.layout.append(f"{scheme}, {name}, {width} px: {wide} px wide")
-                    if name == "Arial" and (scheme, width) in AXE_RUNS:
+                        self.layout.append(f"{scheme}, {font}, {width} px: {wide} px wide")
+                    if font == "DejaVu" and (folder := os.environ.get("LINNA_PAGE_PICTURES")):
+                        page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png", full_page=True)
+                    if font == "Arial" and width in AXE_WIDTHS:
                         self.barriers += [f"{scheme}, {width} px: {one}" for one in barriers(page)]
-        self.keyboard = missed_by_keyboard(page)
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            self.tab_through(page, width)
+
+    def tab_through(self, page: Page, width: int) -> None:
+        """Find what the Tab key does not reach, from the start of the page to its end, and what it does not mark."""
+        count = page.evaluate(USABLE)
+        page.evaluate("document.activeElement.blur()")
+        for _ in range(min(count + 20, MOST_STEPS)):
+            page.keyboard.press("Tab")
+            if page.evaluate(VISIT):
+                break
+        self.keyboard += [f"{width} px: {one}" for one in page.evaluate(MISSED)]
+        self.unmarked += [f"{width} px: {one}" for one in page.evaluate("linnaUnmarked")]
 
     def columns(self) -> dict[str, list[str]]:
         """Return the faults by the name of their column."""
-        return {
-            "wider than the window": self.layout,
-            "axe": self.barriers,
-            "console errors": self.console,
-            "not reached by Tab": self.keyboard,
-        }
+        found = (self.layout, self.barriers, self.console, self.keyboard, self.unmarked)
+        return dict(zip(COLUMNS, found, strict=True))
 
 
 def barriers(page: Page) -> list[str]:
@@ -220,19 +245,6 @@ def barriers(page: Page) -> list[str]:
     ]
 
 
-def missed_by_keyboard(page: Page) -> list[str]:
-    """Return what the Tab key does not reach, from the start of the page to its end."""
-    page.set_viewport_size({"width": 1280, "height": 844})
-    count = page.evaluate(USABLE)
-    page.evaluate("document.activeElement.blur()")
-    for _ in range(min(count + 20, MOST_STEPS)):
-        page.keyboard.press("Tab")
-        if page.evaluate(VISIT):
-            break
-    missed: list[str] = page.evaluate(MISSED)
-    return missed
-
-
 @pytest.fixture(scope="module")
 def rows() -> Iterator[list[str]]:
     """Rows of the table, written at the end where a file is named."""
@@ -240,8 +252,8 @@ def rows() -> Iterator[list[str]]:
     yield lines
     if file := os.environ.get("LINNA_PAGE_TABLE"):
         head = Path(file).read_text().split("| page |")[0]
-        heading = "| page | data | wider than the window | axe | console errors | not reached by Tab |"
-        Path(file).write_text("\n".join([f"{head}{heading}", "|---" * 6 + "|", *lines, ""]))
+        heading = f"| page | data | {' | '.join(COLUMNS)} |"
+        Path(file).write_text("\n".join([f"{head}{heading}", "|---" * (2 + len(COLUMNS)) + "|", *lines, ""]))
 
 
 def record(rows: list[str], path: str, state: str, found: Faults) -> None:
@@ -250,6 +262,11 @@ def record(rows: list[str], path: str, state: str, found: Faults) -> None:
     counts = " | ".join(str(len(texts)) if texts else "none" for texts in columns.values())
     rows.append(f"| `{path}` | {state} | {counts} |")
     assert {kind: texts for kind, texts in columns.items() if texts} == {}
+
+
+def file_name(path: str, state: str) -> str:
+    """Return a file name for pictures of a page."""
+    return f"{re.sub('[^a-z_]+', '-', path).strip('-') or 'overview'}-{state}"
 
 
 def new_page(context: BrowserContext) -> Page:
@@ -295,7 +312,7 @@ def test_a_page_with_data_has_no_fault(
     found = Faults(page)
     settled(page, worked.paths.get(path, path))
     answered(page)
-    found.find(page)
+    found.find(page, file_name(path, "with"))
     page.close()
     record(rows, path, "with", found)
 
@@ -306,7 +323,7 @@ def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[s
     found = Faults(page)
     settled(page, path)
     answered(page)
-    found.find(page)
+    found.find(page, file_name(path, "without"))
     page.close()
     record(rows, path, "without", found)
 
@@ -318,6 +335,6 @@ def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[s
     expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
     answered(page)
     found = Faults(page)
-    found.find(page)
+    found.find(page, file_name(SIGN_IN, "with"))
     context.close()
     record(rows, SIGN_IN, "with", found)
