@@ -460,7 +460,9 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     np.testing.assert_array_equal(corrected[1][0][0].covariance, prior.covariance)
 
 
-def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit: Orbit) -> None:
+def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     navigator = orbit.navigator()
     prior, found = navigator.estimate, orbit.detections(0)
     landmarks, camera, parameters = navigator.state.landmarks, orbit.case.camera, navigator.setup.parameters
@@ -490,6 +492,12 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit: O
     assert fix(count, wrong) is None
     whole = fix(count, found)
     assert whole is not None and len(whole.index) == count
+    # What a linear correction leaves of the velocity is added to its uncertainty.
+    monkeypatch.setattr(correction, "curvature_m_s", lambda *_: 7.0)
+    bent = fix(count, found)
+    assert bent is not None
+    added = np.diag(bent.update.state.covariance - whole.update.state.covariance)
+    np.testing.assert_allclose(added[:6], [0.0, 0.0, 0.0, 49.0, 49.0, 49.0], rtol=1e-4)
 
 
 def test_a_long_correction_leaves_the_curvature_of_the_orbit_to_the_velocity() -> None:
@@ -517,6 +525,41 @@ def test_the_time_since_the_last_fix_goes_into_the_widened_search(
     assert navigator.state.fixed_ticks == orbit.ticks[2]
     navigator.step(int(orbit.ticks[4]), empty, orbit.attitude(4))
     assert [given[-1] for given in widened] == [np.inf, 30.0]
+
+
+def test_a_reset_of_the_filter_drops_the_predictions_of_the_window(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    navigator = orbit.navigator()
+    fly(orbit, navigator, 0, 4)
+    assert len(navigator.state.trusted) == 4 == len(navigator.state.attitude.window)
+    fix = replace(navigator.fix, reacquired=True)
+    monkeypatch.setattr(
+        anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 5, 5)
+    )
+    monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: None)
+    monkeypatch.setattr(anchored, "recovered", lambda state, *_: (state, fix))
+    navigator.step(int(orbit.ticks[4]), orbit.detections(4), orbit.attitude(4))
+    assert navigator.state.trusted == () and len(navigator.state.attitude.window) == 4
+
+
+def test_frames_under_examination_by_the_monitor_are_not_searched_widely(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    navigator = orbit.navigator(suspicion_frames=1, lost_frames=100)
+    fly(orbit, navigator, 0, 3)
+    evidence = replace(navigator.fix.update.rotation, trial=True)
+    monkeypatch.setattr(
+        anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 9, 9)
+    )
+    monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: evidence)
+    widened = recorded(monkeypatch, recovery, "search_widely")
+    searches = []
+    for k in range(3, 9):
+        navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
+        searches.append(len(widened))
+    # Four frames tell noise from a common rotation too poorly; from the fifth on the position is searched.
+    assert searches == [0, 0, 0, 0, 1, 2]
 
 
 def test_an_estimate_that_left_the_moon_starts_again_from_the_tables(orbit: Orbit) -> None:
