@@ -492,6 +492,12 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(
     assert fix(count, wrong) is None
     whole = fix(count, found)
     assert whole is not None and len(whole.index) == count
+    # The pairs as a whole must agree with the prediction.
+    limits = parameters.limits
+    limit = frame_limit(2 * count, limits.frame_gate_sigmas)
+    for nis, credible in ((0.999 * limit, True), (1.001 * limit, False)):
+        judged = replace(whole, update=replace(whole.update, nis=nis))
+        assert correction._is_credible(prior, judged, limits) is credible
     # What a linear correction leaves of the velocity is added to its uncertainty.
     monkeypatch.setattr(correction, "curvature_m_s", lambda *_: 7.0)
     bent = fix(count, found)
