@@ -2,13 +2,16 @@
 
 import calendar
 import gzip
+import io
 import json
 import math
 import re
 import urllib.error
 import urllib.request
 
+import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import TimeoutError as TimedOut
 from playwright.sync_api import expect
 
@@ -17,7 +20,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.web.conftest import strict_page, wait_until
+from tests.ground_service.web.conftest import Pictures, strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -237,8 +240,15 @@ def drag_over(page, area, keys):
         page.keyboard.up(key)
 
 
-def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser):
+def marked(area):
+    """Number of bright pixels of a plot: points with annotations have light cyan marks on its grey background."""
+    picture = np.asarray(Image.open(io.BytesIO(area.screenshot())).convert("RGB"))
+    return int((picture[..., 1:] > 252).all(axis=2).sum())
+
+
+def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser, tmp_path):
     area = open_plot(mct, shown.url)
+    assert marked(area) < 100
     drag_over(mct, area, ("Alt", "Shift"))
     mct.get_by_role("tab", name="Annotations").click()
     mct.locator(".js-add-tag-button").click()
@@ -254,6 +264,8 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser):
     other = browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900}).new_page()
     try:
         again = open_plot(other, shown.url)
+        wait_until(lambda: marked(again) > 2000, "the marks are not drawn")
+        Pictures(tmp_path).take(other, "displays-annotation")
         box = again.bounding_box()
         other.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"], steps=5)
         tag = other.locator(".c-tag__label", has_text="Anomaly")
