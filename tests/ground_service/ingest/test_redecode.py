@@ -16,7 +16,7 @@ from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_batch
-from ground_service.passes.service import define_pass, events, parameter_series, state_series
+from ground_service.passes.service import define_pass, list_events, parameter_series, state_series
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
@@ -59,7 +59,7 @@ def old(tmp_path: Path, synthetic_pass: Any) -> Iterator[Ground]:
 
 def looked_at(ground: Ground) -> tuple[int, int, int]:
     return (
-        len(events(ground, 1)),
+        list_events(ground, 1, limit=1, offset=0)[1],
         parameter_series(ground, 1, "power_w", 1000).samples,
         state_series(ground, 1, "spherical", ("altitude_m",), 100)[0].samples,
     )

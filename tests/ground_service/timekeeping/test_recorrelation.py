@@ -13,7 +13,7 @@ from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
-from ground_service.passes.service import define_pass, events
+from ground_service.passes.service import define_pass, list_events
 from ground_service.timekeeping import recorrelation
 from ground_service.timekeeping.model import Correlation
 from ground_service.timekeeping.recorrelation import (
@@ -126,8 +126,8 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
         stop_utc_ns=START + REPORTS * 60 * NS,
         spacecraft_id=SPACECRAFT,
     )
-    found = events(ground, key)
-    np.testing.assert_allclose([event.utc_ns for event in found], spacecraft.sent, atol=20_000)
+    found, _ = list_events(ground, key, limit=1000, offset=0)
+    np.testing.assert_allclose([event.time.utc_ns for event in found], spacecraft.sent, atol=20_000)
     assert [event.correlation_id for event in found] == [rows[0].id] * 15 + [rows[1].id] * 15
     left = residuals(ground, vehicle)
     assert len(left) == REPORTS
