@@ -277,7 +277,10 @@ def test_a_draft_is_dragged_and_taken_off_the_plan(page, day_of_orbits):
     bar = page.get_by_role("button", name="to be moved, draft")
     expect(bar).to_be_visible()
     before = bar.get_attribute("aria-label")
-    box = bar.bounding_box()
+    answered(page)
+    box = None
+    while box is None:  # the timeline is drawn again after each message
+        box = bar.bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] / 2 + 60, box["y"] + box["height"] / 2, steps=4)
