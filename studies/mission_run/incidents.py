@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ground_service.events import ContactMissed, ContactStarted, FollowUpFailed, LinkChanged, PlanChanged
+from ground_service.events import (
+    ContactMissed,
+    ContactStarted,
+    FollowUpFailed,
+    LinkChanged,
+    PlanChanged,
+    WindowChanged,
+)
 from ground_service.planning.model import Window
 from ground_service.store.events import LoggedEvent, read_events
 from lunar.timescales import format_utc
@@ -13,7 +20,8 @@ from studies.mission_run.ground import MissionGround
 
 LIMIT = 1_000_000
 KINDS = frozenset(
-    one.event_kind for one in (ContactMissed, ContactStarted, FollowUpFailed, LinkChanged, PlanChanged)
+    one.event_kind
+    for one in (ContactMissed, ContactStarted, FollowUpFailed, LinkChanged, PlanChanged, WindowChanged)
 )
 DOWN = ("waiting", "failed")
 
@@ -48,16 +56,23 @@ def _incident(utc: str, kind: str, text: str, recovery: str | None) -> dict[str,
 
 
 def _failed_windows(windows: Sequence[Window], events: Sequence[LoggedEvent]) -> Iterable[dict[str, Any]]:
+    """Yield the windows that have failed, also those that telemetry has shown as flown afterwards."""
     plans = [PlanChanged.of(one) for one in events if one.kind == PlanChanged.event_kind]
+    changes = [WindowChanged.of(one) for one in events if one.kind == WindowChanged.event_kind]
+    ever_failed = {one.id for one in changes if one.state == "failed"}
     for window in windows:
-        if window.state != "failed":
+        is_failed = window.state == "failed"
+        if not is_failed and window.id not in ever_failed:
             continue
         after = next((one for one in plans if window.id in one.windows_failed), None)
-        recovery = None
+        recovered = []
         if after is not None:
-            recovery = f"planned instead: {', '.join(f'window {key}' for key in after.windows_added)}"
+            recovered.append(f"planned instead: {', '.join(f'window {key}' for key in after.windows_added)}")
+        if not is_failed:
+            recovered.append(f"{window.state} by later telemetry")
+        why = window.reason or "unknown" if is_failed else "concluded before all its telemetry was there"
         yield _incident(
-            str(window.start), "window failed", f"window {window.id}: {window.reason or 'unknown'}", recovery
+            str(window.start), "window failed", f"window {window.id}: {why}", "; ".join(recovered) or None
         )
 
 
