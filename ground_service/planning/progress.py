@@ -33,6 +33,11 @@ _EVENT_CODES = {name: code for code, name in EVENTS}
 STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
 REASON_LENGTH = 500
 HEARD_TICKS = 7 * 86_400 << 16
+AWAITED_TICKS = 12 * 3600 << 16
+"""On-board time for which missing packets of a window without images are expected after its end."""
+
+NEAR_TICKS = 6 * 3600 << 16
+"""Packets this far before and after a window show whether packets between them are missing."""
 
 
 def advance_windows(ground: Ground, vehicle: int) -> int:
@@ -100,6 +105,13 @@ def _facts(
     stop = ticks_of_utc_ns(window.stop.utc_ns + MARGIN_NS, correlations)
     events = store.event_ids(connection, vehicle, start, stop)
     frames = store.received_frames(connection, vehicle, start, stop)
+    heard_after = store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS)
+    awaited = (
+        frames == 0
+        and heard_after
+        and not store.has_reports_between(connection, vehicle, stop + AWAITED_TICKS, stop + HEARD_TICKS)
+        and _is_interrupted(connection, vehicle, start, stop)
+    )
     return WindowFacts(
         decision=window.decision,
         replaced=store.is_replaced(connection, window),
@@ -109,11 +121,26 @@ def _facts(
         frames=frames,
         started=STARTED in events,
         stopped=STOPPED in events,
-        heard_after=store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS),
+        heard_after=heard_after,
+        awaited=awaited,
         lost=_lost(connection, vehicle, start, stop) if frames else None,
         reported=window.pass_id is not None and store.has_report(connection, window.pass_id),
         closed=window.closed,
     )
+
+
+def _is_interrupted(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> bool:
+    """Return whether packets are missing between the last ones before a span and the first ones after it."""
+    headers = telemetry.packet_headers(connection, vehicle, start_ticks - NEAR_TICKS, stop_ticks + NEAR_TICKS)
+    for apid in set(headers["apid"].tolist()):
+        mine = headers["apid"] == apid
+        ticks, counts = headers["ticks"][mine], headers["sequence_count"][mine]
+        first = ticks[ticks < start_ticks].max(initial=start_ticks - NEAR_TICKS)
+        last = ticks[ticks > stop_ticks].min(initial=stop_ticks + NEAR_TICKS)
+        here = (ticks >= first) & (ticks <= last)
+        if account_sequence(ticks[here], counts[here]).lost:
+            return True
+    return False
 
 
 def _lost(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> int:

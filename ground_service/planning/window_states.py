@@ -41,6 +41,8 @@ class WindowFacts:
         Whether an event report or a verification report shows the start, and the end, of the observation.
     heard_after
         Whether telemetry from after its end has come down.
+    awaited
+        Whether packets of its time are missing that may still come down.
     lost
         Packets missing from its span; None where none came at all.
     reported
@@ -57,6 +59,7 @@ class WindowFacts:
     started: bool = False
     stopped: bool = False
     heard_after: bool = False
+    awaited: bool = False
     lost: int | None = None
     reported: bool = False
     closed: bool = False
@@ -81,7 +84,7 @@ def state_of(facts: WindowFacts) -> tuple[str, str | None]:
     if facts.predecessor_failed:
         return "failed", "its predecessor failed"
     sent = bool(facts.command_states) and not {"queued", "released", "carried"} & set(facts.command_states)
-    if sent and facts.heard_after:
+    if sent and facts.heard_after and not facts.awaited:
         return "failed", "telemetry from after its end shows no observation"
     return ("uplinked" if sent else "approved"), None
 

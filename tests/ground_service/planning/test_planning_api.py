@@ -210,6 +210,32 @@ def test_the_state_follows_telemetry_in_whatever_order_it_comes(
     assert client.get(f"{V1}/windows/{key}").json()["state"] == "processed"
 
 
+@pytest.mark.parametrize(
+    ("received", "last_s", "expected"),
+    [
+        ((8, 9), 600, "failed"),  # nothing is missing
+        ((1, 9), 600, "uplinked"),
+        ((1, 9), 13 * 3600, "failed"),  # what is missing is not expected any more
+    ],
+)
+def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
+    client: TestClient, received: tuple[int, int], last_s: int, expected: str
+) -> None:
+    key = approved(client, 1860, 1920)
+    client.post(f"{V1}/windows/{key}/uplink")
+    client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
+    for count, seconds in zip(received, (1700, 1920 + last_s), strict=True):
+        packet = DICTIONARY.pack(
+            "event_info",
+            {"event_id": "mode_changed", "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
+            ticks=int(ticks_from_utc_ns(START + seconds * NS)),
+            sequence_count=count,
+        )
+        stream = encode_cadus([packet], spacecraft_id=76)
+        assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
+    assert client.get(f"{V1}/windows/{key}").json()["state"] == expected
+
+
 def test_a_plan_goes_from_one_service_to_another(
     client: TestClient, synthetic_pass: Any, tmp_path_factory: Callable[..., Any]
 ) -> None:
