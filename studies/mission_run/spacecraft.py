@@ -57,7 +57,7 @@ class SpacecraftProcess:
 
     def restart(self) -> None:
         """Start the process after its end, from its last exact state and with the same ports of its stations."""
-        self._console.close()
+        self._disconnect()
         self._launch(keeps_ports=True)
 
     def _launch(self, *, keeps_ports: bool) -> None:
@@ -141,6 +141,11 @@ class SpacecraftProcess:
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
+        self._disconnect()
+
+    def _disconnect(self) -> None:
+        """Close the console; its socket stays open as long as its reader is."""
+        self._lines.close()
         self._console.close()
 
     def _connected(self, port: int) -> socket.socket:
