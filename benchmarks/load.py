@@ -1,9 +1,14 @@
-"""Load of many users during a downlink: python -m benchmarks.load [--seconds 600] [--users 50] [--rate 500].
+"""Load of many users during a downlink: python -m benchmarks.load [--seconds 600] [--users 50] [--rate 500]
+[--shared-buffers 128MB].
 
 PostgreSQL, Redis, one API process and two workers. Every second, `rate` packets are uploaded; each user makes one read
 every two seconds. After each minute the same packets come as those of another instance of the spacecraft, so that all
-are new. Latencies count from the moment at which a read is due, so that a held-up read is not hidden. The memory of
-every process is read every ten seconds; `mib_per_h` is the slope of a straight line after the first quarter.
+are new. Latencies count from the moment at which a read is due, so that a held-up read is not hidden.
+
+The memory of every part is read every ten seconds: private memory of its processes, shared memory segments (the buffers
+of PostgreSQL, each page counted once) and files (programs and libraries). `mib_per_h` is the slope of a straight line
+after the first quarter. Shared memory of PostgreSQL grows until every buffer was used once, and never beyond;
+`--shared-buffers` sets their size.
 """
 
 from __future__ import annotations
@@ -27,8 +32,10 @@ from benchmarks.campaigns._deployment import Deployment
 from benchmarks.ground import START, STEP_NS, mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
+from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
-from studies.mission_run.processes import family_cpu_s, family_mib
+from studies.mission_run.parts import descendants
+from studies.mission_run.processes import Memory, family_cpu_s, family_memory
 
 ROUND_S = 60
 EACH_USER_S = 2.0
@@ -45,7 +52,8 @@ class Run:
         self.times: list[float] = []
         self.by_path: dict[str, list[float]] = {path: [] for path in READS}
         self.errors: Counter[str] = Counter()
-        self.memory: dict[str, list[tuple[float, float]]] = {name: [] for name in service.parts}
+        self.memory: dict[str, list[tuple[float, Memory]]] = {name: [] for name in service.parts}
+        self.processes: dict[str, int] = {}
         self.uploads = 0
         self.last_job: str | None = None
         whole = mixed_downlink(rate * ROUND_S)
@@ -96,13 +104,23 @@ class Run:
     async def _watch(self, begin: float, seconds: float) -> None:
         while (now := time.perf_counter()) < begin + seconds:
             for name, part in self._service.parts.items():
-                self.memory[name].append((now - begin, family_mib(part.pid) or 0.0))
+                used = family_memory(part.pid)
+                if used is not None:
+                    self.memory[name].append((now - begin, used))
+                self.processes[name] = max(self.processes.get(name, 0), 1 + len(descendants(part.pid)))
             await asyncio.sleep(MEMORY_S)
 
 
-def memory_figures(samples: list[tuple[float, float]]) -> dict[str, float]:
-    """Return the first and last memory of a process, its maximum, and its growth after the first quarter."""
-    at, mib = np.array(samples).T
+def memory_figures(samples: list[tuple[float, Memory]]) -> dict[str, dict[str, float]]:
+    """Return for each kind of memory the first and last value, the maximum, and the growth after the first quarter."""
+    return {
+        kind: _course(np.array([(at, getattr(used, kind)) for at, used in samples]))
+        for kind in ("private", "shared", "files", "total")
+    }
+
+
+def _course(samples: FloatArray) -> dict[str, float]:
+    at, mib = samples.T
     late = at > at[-1] / 4
     slope = float(np.polyfit(at[late], mib[late], 1)[0]) * 3600.0 if late.sum() > 2 else float("nan")
     return {
@@ -123,9 +141,9 @@ def failed_jobs(client: httpx.Client) -> int:
     return found
 
 
-def measure(folder: Path, seconds: float, users: int, rate: int) -> dict[str, Any]:
+def measure(folder: Path, seconds: float, users: int, rate: int, shared_buffers: str) -> dict[str, Any]:
     """Run the load on a new deployment; return the figures."""
-    service = Deployment(folder, 1)
+    service = Deployment(folder, 1, database_settings={"shared_buffers": shared_buffers})
     try:
         with open_ground(service.home, database_url=service.url) as ground:
             token = add_user(ground, "ann", "operator")
@@ -168,7 +186,9 @@ def measure(folder: Path, seconds: float, users: int, rate: int) -> dict[str, An
         },
         "ingest_behind_at_end_s": round(behind_s, 1),
         "cores_busy": {name: round(one / seconds, 3) for name, one in spent.items()},
+        "shared_buffers": shared_buffers,
         "memory": {name: memory_figures(samples) for name, samples in run.memory.items()},
+        "processes": run.processes,
         "load_average": [round(one, 1) for one in load],
     }
 
@@ -179,9 +199,10 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--users", type=int, default=50)
     parser.add_argument("--rate", type=int, default=500, help="packets per second")
+    parser.add_argument("--shared-buffers", default="128MB", help="setting of PostgreSQL")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        figures = measure(Path(name), given.seconds, given.users, given.rate)
+        figures = measure(Path(name), given.seconds, given.users, given.rate, given.shared_buffers)
     print(json.dumps({"load": figures}, indent=1))
     return 1 if figures["errors"] or figures["failed_jobs"] else 0
 

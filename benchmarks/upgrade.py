@@ -1,4 +1,4 @@
-"""Upgrade under load: python -m benchmarks.upgrade [--drain 8] [--clients 4].
+"""Upgrade under load: python -m benchmarks.upgrade [--drain 8] [--clients 4] [--kill].
 
 Two API processes behind the reverse proxy of the compose file, a worker, PostgreSQL and Redis run this version. A copy
 of the program with one more migration, which expands the schema, is the next version. While clients read and upload
@@ -6,6 +6,9 @@ through the proxy, the schema is upgraded, then the API processes and the worker
 answer that is not a success and every broken connection counts as an error; clients repeat nothing. At the end every
 acknowledged upload must have been ingested in one attempt. The time from the start of a process to its first successful
 `/readyz` is measured as well.
+
+`--drain 0` and `--kill` show what the draining and the orderly end prevent: with the first, API processes end without
+draining, with the second, processes are killed (SIGKILL). Then errors are expected.
 """
 
 from __future__ import annotations
@@ -80,8 +83,8 @@ def next_version(folder: Path) -> Path:
 class Rolling:
     """Deployment of which each process can be replaced by one of another version."""
 
-    def __init__(self, folder: Path, drain_s: float) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, drain_s: float, kill: bool) -> None:
+        self._folder, self._kill = folder, kill
         self.database = PostgresServer(folder)
         self.parts: dict[str, Part] = {"database": self.database.part}
         self._ports = {f"api {number}": free_port() for number in (1, 2)}
@@ -114,7 +117,7 @@ class Rolling:
             self._start("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
             self.ready_s = [self.replace(name, ROOT) for name in self._ports]
             self.replace("worker", ROOT)
-            configuration = self._proxy_configuration(proxy, max(drain_s, 2.0))
+            configuration = self._proxy_configuration(proxy, drain_s)
             nginx = ["nginx", "-c", str(configuration), "-g", "daemon off;"]
             self._start("proxy", Part(nginx, folder / "nginx.log", lambda: listens(proxy)))
         except BaseException:
@@ -132,6 +135,8 @@ class Rolling:
         subprocess.run(script, check=True, env=environment, stdout=subprocess.DEVNULL)
         text = (ROOT / "deploy/nginx.conf").read_text()
         first, second = self._ports.values()
+        # Shorter than the draining; without one, as in the file.
+        kept_s = min(max(drain_s - 1.0, 1.0), 5.0) if drain_s else 5.0
         for old, new in (
             (" /tmp/", f" {self._folder}/"),
             ("worker_processes 2;", "worker_processes 1;" + ("user root;" if os.geteuid() == 0 else "")),
@@ -141,7 +146,7 @@ class Rolling:
             ("/run/secrets/", f"{secrets}/"),
             ("error_log /dev/stderr", f"error_log {self._folder}/nginx-errors.log"),
             ("rate=100r/s", "rate=10000r/s"),
-            ("keepalive_timeout 5s;", f"keepalive_timeout {min(drain_s - 1.0, 5.0):.0f}s;"),
+            ("keepalive_timeout 5s;", f"keepalive_timeout {kept_s:.0f}s;"),
         ):
             if old not in text:
                 raise SystemExit(f"deploy/nginx.conf: expected {old!r}, found no such text")
@@ -153,7 +158,10 @@ class Rolling:
     def replace(self, name: str, tree: Path) -> float:
         """Stop a process as a supervisor would, start it from another tree; return the time to ready, s."""
         if name in self.parts:
-            self.parts[name].finish()
+            if self._kill:
+                self.parts[name].kill()
+            else:
+                self.parts[name].finish()
         port = self._ports.get(name)
         words = ["worker"] if port is None else ["serve", "--port", str(port)]
         ready = (lambda: True) if port is None else functools.partial(is_ready, port)
@@ -256,10 +264,12 @@ def roll(
     clients: int,
     pause_s: float = 0.02,
     replaced: tuple[str, ...] = ("api 1", "api 2", "worker"),
+    *,
+    kill: bool = False,
 ) -> dict[str, Any]:
     """Upgrade a deployment under load, with these processes replaced; return the figures."""
     new = next_version(folder)
-    rolling = Rolling(folder, drain_s)
+    rolling = Rolling(folder, drain_s, kill)
     try:
         with open_ground(rolling.home, database_url=rolling.service_url) as ground:
             token = add_user(ground, "ann", "operator")
@@ -283,6 +293,7 @@ def roll(
         rolling.stop()
     return {
         "drain_s": drain_s,
+        "killed": kill,
         "clients": clients,
         "requests": sum(load.answers.values()),
         "requests_during_upgrade": during,
@@ -303,9 +314,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--drain", type=float, default=8.0, help="LINNA_DRAIN_S of the API processes")
     parser.add_argument("--clients", type=int, default=4)
+    parser.add_argument("--kill", action="store_true", help="kill the processes instead of ending them")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        figures = roll(Path(name), given.drain, given.clients)
+        figures = roll(Path(name), given.drain, given.clients, kill=given.kill)
     print(json.dumps({"upgrade": figures}, indent=1))
     return 1 if figures["errors"] or set(figures["jobs"]) != {"done"} else 0
 

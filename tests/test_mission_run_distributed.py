@@ -22,7 +22,7 @@ from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run.comparison import compare_reports
 from studies.mission_run.kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
 from studies.mission_run.parts import Part, PidFile, PostgresServer, runs
-from studies.mission_run.processes import Usage, family_cpu_s, family_mib
+from studies.mission_run.processes import Usage, family_cpu_s, family_memory, family_mib
 from studies.mission_run.run import RunTerms, run_mission
 from studies.mission_run.spacecraft import SpacecraftProcess
 
@@ -264,6 +264,25 @@ def test_a_family_has_the_memory_and_time_of_its_children(tmp_path: Path) -> Non
     finally:
         part.end()
     assert family_mib(part.pid) is None and family_cpu_s(part.pid) is None
+
+
+def test_private_and_shared_memory_are_told_apart_and_shared_pages_count_once(tmp_path: Path) -> None:
+    child = (
+        "import mmap, os, time; own = bytearray(60 << 20); common = mmap.mmap(-1, 90 << 20);"
+        "common.write(bytes(90 << 20)); os.fork() or common.seek(0) or common.read(); time.sleep(1);"
+        "os.write(1, b'.'); time.sleep(600)"
+    )
+    log = tmp_path / "log"
+    part = Part([sys.executable, "-c", child], log, lambda: log.exists() and log.read_text() == "..")
+    part.start()
+    try:
+        used = family_memory(part.pid)
+        assert used is not None
+        assert 60.0 <= used.private < 90.0 and 90.0 <= used.shared < 95.0
+        assert used.files > 0.0 and used.total == round(used.private + used.shared + used.files, 1)
+    finally:
+        part.end()
+    assert family_memory(part.pid) is None
 
 
 @pytest.mark.parametrize(

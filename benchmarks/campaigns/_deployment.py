@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,6 +68,8 @@ class Deployment:
     ----------
     cluster
         Pair of database servers that the caller starts and stops; default: one server of this deployment.
+    database_settings
+        Settings of that one server.
     """
 
     def __init__(
@@ -77,12 +79,13 @@ class Deployment:
         *,
         cluster: DatabaseCluster | None = None,
         schedulers: int = 0,
+        database_settings: Mapping[str, str] | None = None,
         **settings: str,
     ) -> None:
         self.parts: dict[str, Part] = {}
         self._database: PostgresServer | None = None
         if cluster is None:
-            self._database = PostgresServer(folder)
+            self._database = PostgresServer(folder, **(database_settings or {}))
             self.parts["database"] = self._database.part
             self.url = self._database.prepare_service()
         else:

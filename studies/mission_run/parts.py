@@ -214,9 +214,14 @@ class PostgresServer:
     """A PostgreSQL server on a private port, with a database `linna` and its files under `folder`.
 
     Its own files are in a folder of the user `postgres` outside of `folder` if this process runs as root.
+
+    Parameters
+    ----------
+    settings
+        Settings of the server, such as `shared_buffers`.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: str) -> None:
         found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
         if not found:
             raise GroundError("expected PostgreSQL on this machine, found none under /usr/lib/postgresql")
@@ -234,6 +239,7 @@ class PostgresServer:
         else:
             self._place = Path(note.read_text())
         words = ["-p", str(self._port), "-k", str(self._place), "-h", "127.0.0.1", "-c", "fsync=off"]
+        words += [word for name, value in settings.items() for word in ("-c", f"{name}={value}")]
         server = [*self._user, str(self._bin / "postgres"), "-D", str(self._place / "data"), *words]
         self.part = Part(server, folder / "postgres.log", self._answers, cwd=self._place)
         self.part.start()

@@ -44,14 +44,50 @@ def cpu_s(process: int) -> float | None:
         return None
 
 
-def family_mib(process: int) -> float | None:
-    """Return the memory of a process and its descendants in MiB, shared pages by their share; None if not known."""
-    octets = 0
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Memory of a process and its descendants in MiB, pages that several processes use by their share.
+
+    Attributes
+    ----------
+    private
+        Heaps and stacks.
+    shared
+        Shared memory segments, such as the buffers of PostgreSQL.
+    files
+        Programs and libraries.
+    """
+
+    private: float
+    shared: float
+    files: float
+
+    @property
+    def total(self) -> float:
+        """Their sum, MiB."""
+        return round(self.private + self.shared + self.files, 1)
+
+
+_KINDS = ("Pss_Anon", "Pss_Shmem", "Pss_File")
+
+
+def family_memory(process: int) -> Memory | None:
+    """Return the memory of a process and its descendants by kind; None if it is not known."""
+    octets = dict.fromkeys(_KINDS, 0)
     for pid in (process, *descendants(process)):
         with suppress(OSError, ValueError, IndexError):
-            rows = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-            octets += next(int(row.split()[1]) for row in rows if row.startswith("Pss:"))
-    return round(octets / 1024.0, 1) or None
+            rows = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+            known = {row.partition(":")[0]: int(row.split()[1]) for row in rows}
+            for kind in _KINDS:
+                octets[kind] += known.get(kind, 0)
+    found = Memory(*(round(octets[kind] / 1024.0, 1) for kind in _KINDS))
+    return found if found.total else None
+
+
+def family_mib(process: int) -> float | None:
+    """Return the memory of a process and its descendants in MiB, shared pages by their share; None if not known."""
+    found = family_memory(process)
+    return found.total if found else None
 
 
 def family_cpu_s(process: int) -> float | None:
