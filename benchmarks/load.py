@@ -5,10 +5,10 @@ PostgreSQL, Redis, one API process and two workers. Every second, `rate` packets
 every two seconds. After each minute the same packets come as those of another instance of the spacecraft, so that all
 are new. Latencies count from the moment at which a read is due, so that a held-up read is not hidden.
 
-The memory of every part is read every ten seconds: private memory of its processes, shared memory segments (the buffers
-of PostgreSQL, each page counted once) and files (programs and libraries). `mib_per_h` is the slope of a straight line
-after the first quarter. Shared memory of PostgreSQL grows until every buffer was used once, and never beyond;
-`--shared-buffers` sets their size.
+The memory of every part is read every ten seconds, in MiB: private memory of its processes, shared memory segments (the
+buffers of PostgreSQL, each page counted once), files (programs and libraries) and the private memory of the largest
+process; also the number of processes. `per_h` is the slope of a straight line after the first quarter, an hour. Shared
+memory of PostgreSQL grows until every buffer was used once; `--shared-buffers` sets their size.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
-from studies.mission_run.parts import descendants
 from studies.mission_run.processes import Memory, family_cpu_s, family_memory
 
 ROUND_S = 60
@@ -53,7 +52,6 @@ class Run:
         self.by_path: dict[str, list[float]] = {path: [] for path in READS}
         self.errors: Counter[str] = Counter()
         self.memory: dict[str, list[tuple[float, Memory]]] = {name: [] for name in service.parts}
-        self.processes: dict[str, int] = {}
         self.uploads = 0
         self.last_job: str | None = None
         whole = mixed_downlink(rate * ROUND_S)
@@ -107,27 +105,26 @@ class Run:
                 used = family_memory(part.pid)
                 if used is not None:
                     self.memory[name].append((now - begin, used))
-                self.processes[name] = max(self.processes.get(name, 0), 1 + len(descendants(part.pid)))
             await asyncio.sleep(MEMORY_S)
 
 
-def memory_figures(samples: list[tuple[float, Memory]]) -> dict[str, dict[str, float]]:
-    """Return for each kind of memory the first and last value, the maximum, and the growth after the first quarter."""
-    return {
-        kind: _course(np.array([(at, getattr(used, kind)) for at, used in samples]))
-        for kind in ("private", "shared", "files", "total")
-    }
+def memory_figures(samples: list[tuple[float, Memory]]) -> dict[str, Any]:
+    """Return the figures of each kind of memory, of the largest process, and of the number of processes."""
+    at = np.array([when for when, _ in samples])
+    used = [one for _, one in samples]
+    kinds = ("private", "shared", "files", "total", "largest", "processes")
+    return {kind: _course(at, np.array([float(getattr(one, kind)) for one in used])) for kind in kinds}
 
 
-def _course(samples: FloatArray) -> dict[str, float]:
-    at, mib = samples.T
+def _course(at: FloatArray, values: FloatArray) -> dict[str, float]:
+    """Return the first and last value, the maximum, and the growth an hour after the first quarter."""
     late = at > at[-1] / 4
-    slope = float(np.polyfit(at[late], mib[late], 1)[0]) * 3600.0 if late.sum() > 2 else float("nan")
+    slope = float(np.polyfit(at[late], values[late], 1)[0]) * 3600.0 if late.sum() > 2 else float("nan")
     return {
-        "first_mib": round(float(mib[0]), 1),
-        "last_mib": round(float(mib[-1]), 1),
-        "max_mib": round(float(mib.max()), 1),
-        "mib_per_h": round(slope, 1),
+        "first": round(float(values[0]), 1),
+        "last": round(float(values[-1]), 1),
+        "max": round(float(values.max()), 1),
+        "per_h": round(slope, 1),
     }
 
 
@@ -188,7 +185,6 @@ def measure(folder: Path, seconds: float, users: int, rate: int, shared_buffers:
         "cores_busy": {name: round(one / seconds, 3) for name, one in spent.items()},
         "shared_buffers": shared_buffers,
         "memory": {name: memory_figures(samples) for name, samples in run.memory.items()},
-        "processes": run.processes,
         "load_average": [round(one, 1) for one in load],
     }
 

@@ -21,8 +21,14 @@ secret database_password "${LINNA_DB_PASSWORD:-}"
 secret database_backup_password "${LINNA_DB_BACKUP_PASSWORD:-}"
 secret broker_password "${LINNA_REDIS_PASSWORD:-}"
 secret admin_token "${LINNA_ADMIN_TOKEN:-}"
+for pair in tls_certificate:tls_key tls_key:tls_certificate; do
+  if [ -s "$folder/${pair%:*}" ] && [ ! -s "$folder/${pair#*:}" ]; then
+    echo "secrets: expected $folder/${pair#*:} for $folder/${pair%:*}, found none" >&2
+    exit 2
+  fi
+done
 # Without a certificate of a certification authority, the proxy gets one that it signs itself, for this name.
-if [ ! -s "$folder/tls_certificate" ] || [ ! -s "$folder/tls_key" ]; then
+if [ ! -s "$folder/tls_certificate" ]; then
   name="${LINNA_HOST_NAME:-localhost}"
   rm -f "$folder/tls_certificate" "$folder/tls_key"
   said="$(openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=$name" \

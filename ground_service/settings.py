@@ -294,7 +294,7 @@ def load_settings(**given: object) -> Settings:
         url = values.get(name) or os.environ.get(f"LINNA_{name.upper()}")
         if password and url:
             values[name] = _with_password(
-                str(url), _secret(f"{name.removesuffix('_url')}_password", password)
+                f"LINNA_{name.upper()}", str(url), _secret(f"{name.removesuffix('_url')}_password", password)
             )
     try:
         return Settings(**values)  # type: ignore[arg-type]
@@ -319,20 +319,29 @@ def start_tracing(settings: Settings) -> None:
 
 
 def _secret(name: str, path: str) -> str:
+    variable = f"LINNA_{name.upper()}_FILE"
     try:
-        return Path(path).read_text(encoding="utf-8").strip()
+        value = Path(path).read_text(encoding="utf-8").strip()
     except OSError as error:
-        raise SettingsError(
-            f"LINNA_{name.upper()}_FILE", "a readable file", f"{path} ({error.strerror})"
-        ) from None
+        raise SettingsError(variable, "a readable file", f"{path} ({error.strerror})") from None
+    except ValueError:
+        raise SettingsError(variable, "a text file (UTF-8)", f"other octets in {path}") from None
+    if not value.isprintable():
+        raise SettingsError(variable, "one line", f"control characters or further lines in {path}")
+    if not value:
+        # Without a value, the service would continue with the default, such as SQLite.
+        raise SettingsError(variable, "a file with a value", f"an empty file {path}")
+    return value
 
 
-def _with_password(url: str, password: str) -> str:
+def _with_password(name: str, url: str, password: str) -> str:
     """Return the URL with this password if it has a user without a password."""
     scheme, mark, rest = url.partition("://")
-    user, at, place = rest.rpartition("@")
-    if not at or ":" in user:
+    user, _, place = rest.rpartition("@")
+    if ":" in user or scheme.startswith("sqlite"):
         return url
+    if not user:
+        raise SettingsError(name, "a URL with a user, for whom the password file is", repr(url))
     return f"{scheme}{mark}{user}:{quote(password, safe='')}@{place}"
 
 

@@ -279,6 +279,7 @@ def test_private_and_shared_memory_are_told_apart_and_shared_pages_count_once(tm
         used = family_memory(part.pid)
         assert used is not None
         assert 60.0 <= used.private < 90.0 and 90.0 <= used.shared < 95.0
+        assert used.processes == 2 and 30.0 <= used.largest < 60.0
         assert used.files > 0.0 and used.total == round(used.private + used.shared + used.files, 1)
     finally:
         part.end()

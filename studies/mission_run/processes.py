@@ -56,11 +56,17 @@ class Memory:
         Shared memory segments, such as the buffers of PostgreSQL.
     files
         Programs and libraries.
+    largest
+        Private memory of the process that has most of it.
+    processes
+        Number of processes.
     """
 
     private: float
     shared: float
     files: float
+    largest: float
+    processes: int
 
     @property
     def total(self) -> float:
@@ -73,15 +79,16 @@ _KINDS = ("Pss_Anon", "Pss_Shmem", "Pss_File")
 
 def family_memory(process: int) -> Memory | None:
     """Return the memory of a process and its descendants by kind; None if it is not known."""
-    octets = dict.fromkeys(_KINDS, 0)
+    rows: list[list[int]] = []
     for pid in (process, *descendants(process)):
         with suppress(OSError, ValueError, IndexError):
-            rows = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
-            known = {row.partition(":")[0]: int(row.split()[1]) for row in rows}
-            for kind in _KINDS:
-                octets[kind] += known.get(kind, 0)
-    found = Memory(*(round(octets[kind] / 1024.0, 1) for kind in _KINDS))
-    return found if found.total else None
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+            known = {line.partition(":")[0]: int(line.split()[1]) for line in lines}
+            rows.append([known.get(kind, 0) for kind in _KINDS])
+    if not any(map(sum, rows)):
+        return None
+    private, shared, files = (round(sum(column) / 1024.0, 1) for column in zip(*rows, strict=True))
+    return Memory(private, shared, files, round(max(row[0] for row in rows) / 1024.0, 1), len(rows))
 
 
 def family_mib(process: int) -> float | None:

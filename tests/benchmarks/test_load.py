@@ -5,17 +5,19 @@ from studies.mission_run.processes import Memory
 
 
 def test_growth_of_shared_memory_is_not_growth_of_private_memory() -> None:
-    samples = [(10.0 * number, Memory(40.0, min(5.0 * number, 128.0), 9.0)) for number in range(60)]
+    samples = [(10.0 * number, Memory(40.0, min(5.0 * number, 128.0), 9.0, 8.0, 5)) for number in range(60)]
     figures = memory_figures(samples)
-    assert figures["private"] == {"first_mib": 40.0, "last_mib": 40.0, "max_mib": 40.0, "mib_per_h": 0.0}
-    assert figures["shared"]["max_mib"] == 128.0 and figures["shared"]["mib_per_h"] > 0.0
-    assert figures["total"]["last_mib"] == 177.0
+    assert figures["private"] == {"first": 40.0, "last": 40.0, "max": 40.0, "per_h": 0.0}
+    assert figures["shared"]["max"] == 128.0 and figures["shared"]["per_h"] > 0.0
+    assert figures["total"]["last"] == 177.0
+    assert figures["largest"]["max"] == 8.0 and figures["processes"]["last"] == 5.0
 
 
 def test_growth_is_the_slope_after_the_first_quarter() -> None:
     samples = [
-        (36.0 * number, Memory(100.0 if number < 20 else 100.0 + number, 0.0, 0.0)) for number in range(101)
+        (36.0 * number, Memory(100.0 if number < 20 else 100.0 + number, 0.0, 0.0, 0.0, 1))
+        for number in range(101)
     ]
     start = [(at, one) for at, one in samples if at > 900.0]
     assert all(one.private == 100.0 + at / 36.0 for at, one in start)
-    assert memory_figures(samples)["private"]["mib_per_h"] == 100.0
+    assert memory_figures(samples)["private"]["per_h"] == 100.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -261,6 +262,98 @@ def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:
     )
     assert done.returncode == 1 and "secrets are in" not in done.stdout
     assert "no certificate was made for localhost:\na reason" in done.stderr
+
+
+HOLDERS = {
+    "redis.sh": ("redis-server", ("broker_password",)),
+    "postgres-roles.sh": (
+        "psql",
+        ("database_password", "database_owner_password", "database_backup_password"),
+    ),
+    "failover/patroni.sh": ("patroni", ("database_superuser_password", "database_replication_password")),
+}
+"""Scripts that read passwords, with the program that they start and the names of the passwords."""
+
+
+def start_script(
+    name: str, secrets: dict[str, str], folder: Path
+) -> tuple[subprocess.CompletedProcess[str], Path]:
+    """Run a script with these secrets and a program that only prints its arguments and its input."""
+    program, _ = HOLDERS[name]
+    programs = folder / "programs"
+    programs.mkdir()
+    (programs / program).write_text('#!/bin/sh\necho "started $*"; cat\n')
+    (programs / program).chmod(0o755)
+    (folder / "secrets").mkdir()
+    for secret, value in secrets.items():
+        (folder / "secrets" / secret).write_text(value)
+    written = folder / "written"
+    environment = {
+        "PATH": f"{programs}:{os.environ['PATH']}",
+        "LINNA_SECRETS": str(folder / "secrets"),
+        "LINNA_REDIS_USERS": str(written),
+        "LINNA_PATRONI_CONFIGURATION": str(written),
+        "POSTGRES_USER": "postgres",
+        "POSTGRES_DB": "linna",
+    }
+    done = subprocess.run(
+        ["sh", str(ROOT / "deploy" / name)],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done, written
+
+
+@pytest.mark.parametrize("is_empty", [True, False])
+@pytest.mark.parametrize(
+    ("name", "missing"), [(name, secret) for name, (_, secrets) in HOLDERS.items() for secret in secrets]
+)
+def test_a_server_does_not_start_with_an_empty_password(
+    name: str, missing: str, is_empty: bool, tmp_path: Path
+) -> None:
+    secrets = {secret: "given" for secret in HOLDERS[name][1] if secret != missing}
+    done, _ = start_script(name, secrets | ({missing: ""} if is_empty else {}), tmp_path)
+    assert done.returncode == 2 and "started" not in done.stdout
+    (line,) = done.stderr.splitlines()
+    assert f"secrets/{missing}: " in line
+
+
+def test_passwords_may_have_any_character(tmp_path: Path) -> None:
+    odd = """two words, 'quotes' "and" \\ #%s"""
+    (tmp_path / "patroni").mkdir()
+    (tmp_path / "redis").mkdir()
+    secrets = dict.fromkeys(HOLDERS["failover/patroni.sh"][1], odd)
+    done, written = start_script("failover/patroni.sh", secrets, tmp_path / "patroni")
+    assert done.returncode == 0, done.stderr
+    found = yaml.safe_load(written.read_text())
+    assert {one["password"] for one in found["postgresql"]["authentication"].values()} == {odd}
+    assert found["restapi"]["authentication"]["password"] == odd
+    done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path / "redis")
+    assert done.returncode == 0, done.stderr
+    assert (
+        f" #{hashlib.sha256(odd.encode()).hexdigest()} " in written.read_text()
+        and odd not in written.read_text()
+    )
+
+
+@pytest.mark.parametrize("name", CERTIFICATE)
+def test_a_certificate_without_its_key_is_refused_and_kept(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("of a certification authority")
+    done = subprocess.run(
+        ["sh", str(ROOT / "deploy/secrets.sh")],
+        env={"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    (other,) = set(CERTIFICATE) - {name}
+    assert done.returncode == 2
+    assert done.stderr == f"secrets: expected {tmp_path}/{other} for {tmp_path}/{name}, found none\n"
+    assert (tmp_path / name).read_text() == "of a certification authority"
+    assert not (tmp_path / other).exists()
 
 
 def test_nothing_stays_of_a_base_backup_that_fails(tmp_path: Path) -> None:

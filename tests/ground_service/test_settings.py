@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ground_service.errors import SettingsError
-from ground_service.settings import load_settings, normalised_url
+from ground_service.settings import SECRETS, URLS, load_settings, normalised_url
 
 
 @pytest.fixture(autouse=True)
@@ -75,6 +75,40 @@ def test_a_wrong_setting_is_named(
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsError, match=message):
         load_settings()
+
+
+@pytest.mark.parametrize("name", [*URLS, *SECRETS, "database_password", "broker_password"])
+@pytest.mark.parametrize(
+    ("octets", "message"),
+    [
+        (b"", "expected a file with a value, found an empty file"),
+        (b" \n", "expected a file with a value, found an empty file"),
+        (b"\xff\xfe\x00", r"expected a text file \(UTF-8\), found other octets"),
+        (b"one\ntwo\n", "expected one line, found control characters or further lines"),
+    ],
+)
+def test_an_unusable_secret_is_refused_in_one_line_and_never_replaced_by_a_default(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, octets: bytes, message: str
+) -> None:
+    (tmp_path / "secret").write_bytes(octets)
+    monkeypatch.setenv(f"LINNA_{name.upper()}_FILE", str(tmp_path / "secret"))
+    monkeypatch.setenv("LINNA_BROKER_URL", "redis://linna@broker:6379/0")
+    if name == "database_password":
+        monkeypatch.setenv("LINNA_DATABASE_URL", "postgresql://linna@db/linna")
+    with pytest.raises(SettingsError, match=f"^LINNA_{name.upper()}_FILE: {message}") as error:
+        load_settings()
+    assert str(tmp_path / "secret") in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_password_without_a_user_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "password").write_text("geheim")
+    monkeypatch.setenv("LINNA_BROKER_PASSWORD_FILE", str(tmp_path / "password"))
+    monkeypatch.setenv("LINNA_BROKER_URL", "redis://broker:6379/0")
+    with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a URL with a user") as error:
+        load_settings()
+    assert "geheim" not in str(error.value)
+    monkeypatch.setenv("LINNA_BROKER_URL", "redis://:other@broker:6379/0")
+    assert load_settings().resolved_broker_url() == "redis://:other@broker:6379/0"
 
 
 @pytest.mark.parametrize("spelling", ["postgres://h/d", "postgresql://h/d", "postgresql+psycopg://h/d"])

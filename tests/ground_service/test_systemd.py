@@ -17,6 +17,9 @@ EXPOSURE = 2.5
 PRIVATE_PIDS_SINCE = 257
 """First version of systemd that knows PrivatePIDs."""
 
+CREDENTIALS_FOLDER_SINCE = 251
+"""First version of systemd that replaces %d by the folder of the credentials."""
+
 
 @pytest.fixture
 def units(tmp_path: Path) -> Path:
@@ -49,6 +52,17 @@ def test_a_wrong_directive_is_noticed(units: Path) -> None:
         ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, check=False
     )
     assert "ProtectHom" in done.stderr
+
+
+def test_the_documentation_states_the_versions_that_the_units_need() -> None:
+    text = (UNITS.parents[1] / "docs/deployment.md").read_text()
+    assert (
+        f"The units need systemd {CREDENTIALS_FOLDER_SINCE} or later, the runner {PRIVATE_PIDS_SINCE} or later"
+        in text
+    )
+    newer = {name for name in SERVICES if "PrivatePIDs" in settings(name)}
+    assert newer == {"linna-runner.service"}
+    assert "%d" in settings("linna-api.service")["Environment"]
 
 
 @pytest.mark.parametrize("name", SERVICES)
