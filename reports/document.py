@@ -25,12 +25,29 @@ class Paragraph:
     small: bool = False
 
 
+VERDICT_ROLES = {
+    "met": "green",
+    "partly met": "orange",
+    "unknown": "orange",
+    "not met": "vermillion",
+    "pass": "green",
+    "inconclusive": "orange",
+    "fail": "vermillion",
+}
+"""Levels of verdicts of passes and runs, then of gates, and their colours."""
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The judgement of the whole, in words."""
+    """The judgement of the whole: a sentence, and a key of `VERDICT_ROLES` or ""."""
 
     text: str
     level: str = ""
+
+    @property
+    def word(self) -> str:
+        """Heading of the sentence."""
+        return f"Verdict: {self.level}" if self.level else "Verdict"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from itertools import groupby
 
 from reports.document import (
     EVIDENCE_LEVELS,
+    VERDICT_ROLES,
     Absent,
     Block,
     Bullets,
@@ -33,7 +34,6 @@ from reports.drawings import Drawings
 from reports.stylesheet import page_style
 from reports.text import NOT_A_VALUE, headline_text
 
-VERDICT_WORDS = {"good": "Verdict: good", "caution": "Verdict: with reservations", "bad": "Verdict: not met"}
 _SHORT_TABLE_ROWS = 14
 
 
@@ -95,10 +95,9 @@ def _plain(block: Block) -> str:
             return f"\n<h3>{escape(text)}</h3>"
         case Paragraph(text, small):
             return f"\n<p{' class=small' if small else ''}>{escape(text)}</p>"
-        case Verdict(text, level):
-            word = VERDICT_WORDS.get(level, "Verdict")
-            known = level if level in VERDICT_WORDS else ""
-            return f'\n<div class="verdict {known}"><p class="word">{word}</p><p class="says">{escape(text)}</p></div>'
+        case Verdict(text, level) as verdict:
+            role, word = VERDICT_ROLES.get(level, ""), escape(verdict.word)
+            return f'\n<div class="verdict {role}"><p class="word">{word}</p><p class="says">{escape(text)}</p></div>'
         case Headline():
             return _headline(block)
         case Facts(pairs, mono):

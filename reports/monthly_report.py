@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from reports.document import Block, Cell, Column, Document, Heading, NewPage, Paragraph, Picture, Table
+from reports.document import (
+    VERDICT_ROLES,
+    Block,
+    Cell,
+    Column,
+    Document,
+    Heading,
+    NewPage,
+    Paragraph,
+    Picture,
+    Table,
+)
 from reports.figures import monthly
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, number_text, percent_text, significant_text, utc_text
@@ -16,8 +27,6 @@ METRICS = {
     "median_error_m": ("median error", "m", 1.0, 0),
 }
 """Name, unit, scale and decimals of the metrics."""
-
-_SWATCHES = {"good": "green", "caution": "orange", "bad": "vermillion"}
 
 
 def monthly_document(report: MonthlyReportValue) -> Document:
@@ -165,7 +174,7 @@ def _groups(report: MonthlyReportValue) -> list[Block]:
 def _passes(report: MonthlyReportValue) -> Table:
     rows = tuple(
         (
-            Cell(str(one.pass_id), swatch=_SWATCHES.get(one.verdict_level, "")),
+            Cell(str(one.pass_id), swatch=VERDICT_ROLES.get(one.verdict_level, "")),
             utc_text(one.start_utc_ns),
             number_text(100.0 * one.recall, 1),
             number_text(one.drift_percent, 3),

@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from reports.document import (
+    VERDICT_ROLES,
     Absent,
     Block,
     Bullets,
@@ -39,7 +40,6 @@ from reports.document import (
 )
 from reports.drawings import Drawings
 from reports.figures.theme import LIGHT, color
-from reports.html_page import VERDICT_WORDS
 from reports.text import NOT_A_VALUE, headline_text
 
 _MOST_LISTING_LINES = 400
@@ -53,7 +53,6 @@ root, fonts, out = sys.argv[1:]
 typst.compile(root + "/main.typ", root=root, font_paths=[fonts], ignore_system_fonts=True, format="pdf", output=out)
 """
 
-_VERDICT_ROLES = {"good": "green", "caution": "orange", "bad": "vermillion"}
 _LONG_WORD = re.compile(r"\S{32}")
 _BREAK = "\u200b"
 _ROLE = re.compile(r"var\(--f-([a-z0-9]+)\)")
@@ -156,9 +155,9 @@ def _plain(block: Block) -> dict[str, Any]:
             return {"kind": "heading", "text": text}
         case Paragraph(text, small):
             return {"kind": "paragraph", "text": text, "small": small}
-        case Verdict(text, level):
-            word, role = VERDICT_WORDS.get(level, "Verdict"), _VERDICT_ROLES.get(level, "gray2")
-            return {"kind": "verdict", "word": word, "text": text, "color": color(role)}
+        case Verdict(text, level) as verdict:
+            role = VERDICT_ROLES.get(level, "gray2")
+            return {"kind": "verdict", "word": verdict.word, "text": text, "color": color(role)}
         case Headline():
             return _headline(block)
         case Facts(pairs):

@@ -27,9 +27,9 @@ h1{margin:0 0 .5rem;font-size:2.15rem;line-height:1.15;font-weight:650;letter-sp
 .verdict .word{margin:0 0 .25rem;font-size:.82rem;font-weight:650;letter-spacing:.06em;text-transform:uppercase;
  color:var(--f-muted)}
 .verdict .says{margin:0;font-size:1.28rem;line-height:1.42;letter-spacing:-.006em;text-wrap:pretty}
-.verdict.good{border-color:var(--f-green)}.verdict.good .word{color:var(--good)}
-.verdict.caution{border-color:var(--f-orange)}.verdict.caution .word{color:var(--caution)}
-.verdict.bad{border-color:var(--f-vermillion)}.verdict.bad .word{color:var(--bad)}
+.verdict.green{border-color:var(--f-green)}.verdict.green .word{color:var(--good)}
+.verdict.orange{border-color:var(--f-orange)}.verdict.orange .word{color:var(--caution)}
+.verdict.vermillion{border-color:var(--f-vermillion)}.verdict.vermillion .word{color:var(--bad)}
 .headline{display:grid;grid-template-columns:repeat(5,minmax(0,1fr));margin:0;border-top:1px solid var(--rule);
  border-bottom:1px solid var(--rule)}
 .headline>div{display:flex;flex-direction:column;padding:.85rem .9rem .8rem;border-left:1px solid var(--rule)}

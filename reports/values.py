@@ -506,7 +506,8 @@ class AnchorRead:
 class ReportCommon:
     """Content that every report has.
 
-    ``verdict_level`` is "good", "caution", "bad" or "" and sets the colour of the rule next to the verdict.
+    ``verdict_level`` is a key of `reports.document.VERDICT_ROLES` or "" and sets the colour of the
+    rule next to the verdict.
     ``evidence_level`` is the evidence level of the accuracy figures. ``not_available`` gives the reason why a section
     is missing; its keys are field names of the report.
     """

@@ -13,7 +13,7 @@ from studies.mission_run.document import mission_document, save_document
 TREND = [
     {
         "window": 1, "start": "2029-08-07T01:01:48.75Z", "state": "processed", "contacts_to_processed": 1, "frames": 33,
-        "packets_lost": 0, "verdict": "good", "recall": 0.5, "median_m": {"anchored": 90.0},
+        "packets_lost": 0, "verdict": "met", "recall": 0.5, "median_m": {"anchored": 90.0},
         "drift_percent": {"anchored": 0.01}, "nees_inside_percent": None, "not_met": ["consistency.nis"], "lacks": {},
         "evidence": "2",
     },
@@ -40,7 +40,7 @@ def figures(**changes: Any) -> dict[str, Any]:
         "requirements": {
             "a": {"met": 2}, "b": {"met": 1, "unknown": 1}, "c": {"met": 1, "not met": 1}, "d": {"not judged": 2},
         },
-        "verdicts": {"good": 1}, "trends": {}, "trend": TREND, "contacts": 3, "telecommands": 8,
+        "verdicts": {"met": 1}, "trends": {}, "trend": TREND, "contacts": 3, "telecommands": 8,
         "telecommand_octets_lost": 0, "spacecraft_resets": 0, "starts": 1, "incidents": [],
         "memory_mib": {"ground": MEMORY}, "memory_series_mib": {"ground": [100.0, 120.0, 110.0]},
         "memory_lives": {"ground": [[0.1, 7], [0.2, 7], [0.3, 9]]}, "cpu_s": {"ground": 12.0}, "wall_s": 20.0,
@@ -60,14 +60,14 @@ def table(given: dict[str, Any], caption: str) -> Table:
 @pytest.mark.parametrize(
     ("changes", "level"),
     [
-        ({}, "good"),
-        ({"interventions": 1}, "caution"),
-        ({"verdicts": {"bad": 1}}, "caution"),
-        ({"verdicts": {"good": 1, "unknown": 1}}, "caution"),
-        ({"reports_complete": 0}, "caution"),
-        ({"packets_lost": 1}, "bad"),
-        ({"windows": {**figures()["windows"], "flown": 2}}, "bad"),
-        ({"windows": {**figures()["windows"], "flown": 0, "processed": 0}}, "bad"),
+        ({}, "met"),
+        ({"interventions": 1}, "partly met"),
+        ({"verdicts": {"not met": 1}}, "partly met"),
+        ({"verdicts": {"met": 1, "unknown": 1}}, "partly met"),
+        ({"reports_complete": 0}, "partly met"),
+        ({"packets_lost": 1}, "not met"),
+        ({"windows": {**figures()["windows"], "flown": 2}}, "not met"),
+        ({"windows": {**figures()["windows"], "flown": 0, "processed": 0}}, "not met"),
     ],
 )
 def test_the_verdict_is_good_only_if_all_is_known_to_be_good(changes: dict[str, Any], level: str) -> None:

@@ -160,7 +160,7 @@ class Client(Connection):
     ) -> Listing[PassSummary]:
         """List the passes that match, newest first.
 
-        `search` is a part of the name; `verdict` is good, caution, bad, or "none" for passes without a report.
+        `search` is a part of the name; `verdict` is "met", "not met", "unknown", or "none" for passes without a report.
         """
         return self._list(
             PassSummary,

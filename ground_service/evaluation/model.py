@@ -62,7 +62,7 @@ class ReportSummary(Entity):
     pass_id: int
     created: UtcTime
     verdict: str
-    verdict_level: str = Field(examples=["good"])
+    verdict_level: str = Field(description="met, not met or unknown", examples=["met"])
     evidence_level: str
     estimator: str | None = Field(description="Estimator of the error", examples=["anchored"])
     median_error_m: float | None
@@ -189,7 +189,7 @@ class PassFigures(Entity):
     smoothed: dict[str, NavigationFigures] = Field(description="By smoothed estimator")
     baselines: dict[str, NavigationFigures]
     verdict: str
-    verdict_level: str = Field(examples=["good"])
+    verdict_level: str = Field(description="met, not met or unknown", examples=["met"])
     requirements: list[RequirementFigures]
     error_budget: dict[str, ErrorBudget]
     instruments: dict[str, InstrumentFigures] = Field(default_factory=dict)
@@ -209,7 +209,7 @@ class ReportOverview(Entity):
     report_id: str
     title: str
     verdict: str
-    verdict_level: str = Field(examples=["good"])
+    verdict_level: str = Field(description="met, not met or unknown", examples=["met"])
     evidence_level: str
     created_utc: str
     headline: list[dict[str, Any]]

@@ -88,15 +88,15 @@ def without_mission(table: Sequence[Requirement], remedy: str) -> tuple[Requirem
 
 
 def verdict_of(table: Sequence[Requirement]) -> tuple[str, str]:
-    """Return the sentence on a verdict table, failures first, and its level: "good", "caution" or "bad"."""
+    """Return the sentence on a verdict table, failures first, and its level: "met", "not met" or "unknown"."""
     judged = [one for one in table if one.status != "not judged"]
     failed = [one for one in judged if one.status == "not met"]
     unknown = [one for one in judged if one.status == "unknown"]
     met = len(judged) - len(failed) - len(unknown)
     if not judged:
-        return "No requirement has a limit in the mission description: nothing is judged.", "caution"
+        return "No requirement has a limit in the mission description: nothing is judged.", "unknown"
     if judged[0].key == NO_MISSION:
-        return f"Nothing can be judged: {judged[0].note}", "caution"
+        return f"Nothing can be judged: {judged[0].note}", "unknown"
     parts = []
     if failed:
         named = "; ".join(_said(one) for one in failed[:LARGEST_SENTENCE])
@@ -106,7 +106,7 @@ def verdict_of(table: Sequence[Requirement]) -> tuple[str, str]:
         names = ", ".join(one.name for one in unknown)
         parts.append(f"{count_text(len(unknown))} unknown: {names}.")
     parts.append(f"{_of(met, len(judged))} met.")
-    return " ".join(parts), "bad" if failed else "caution" if unknown else "good"
+    return " ".join(parts), "not met" if failed else "unknown" if unknown else "met"
 
 
 def _of(count: int, total: int) -> str:

@@ -75,7 +75,7 @@ FOLLOWS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Triggers that follow others without a rule: the service keeps derived data up to date."""
 
-VERDICTS: Final = ("good", "caution", "bad", "pass", "fail", "inconclusive")
+VERDICTS: Final = ("met", "not met", "unknown", "pass", "fail", "inconclusive")
 """Levels of the verdict of a report, and verdicts of a gate."""
 
 

@@ -101,7 +101,7 @@ def list_passes(
     spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
     instance: Instance | None = None,
     verdict: Annotated[
-        Literal["good", "caution", "bad", "none"] | None,
+        Literal["met", "not met", "unknown", "none"] | None,
         Query(description="Verdict of the newest report; none: without a report"),
     ] = None,
 ) -> PageOf[PassSummary]:

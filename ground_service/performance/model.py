@@ -26,7 +26,7 @@ class PassPerformance(Entity):
     frames: int | None
     packets: int
     packets_lost: int
-    verdict_level: str = Field(examples=["good"])
+    verdict_level: str = Field(description="met, not met or unknown", examples=["met"])
 
 
 class GroupFigures(Entity):

@@ -220,7 +220,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         baseline_passes=tuple(_campaign_pass(one, "baseline") for one in judged),
         changed_frames=tuple(changed_frames(ground, judged)),
         verdict=_verdict_text(outcome, troubled),
-        verdict_level={PASS: "good", FAIL: "bad", INCONCLUSIVE: "caution"}[outcome.verdict],
+        verdict_level=outcome.verdict,
         evidence_level=weakest_evidence([one.context.evidence for one in judged if one.context]),
         headline=_headline(outcome),
         provenance={

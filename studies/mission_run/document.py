@@ -81,8 +81,8 @@ def _verdict(figures: Figures) -> Verdict:
         f"{figures['interventions']} interventions",
         f"verdicts of the passes: {_counts(figures['verdicts']) or 'none'}",
     ]
-    clean = complete and not figures["interventions"] and set(figures["verdicts"]) == {"good"}
-    level = "bad" if not done else "good" if clean else "caution"
+    clean = complete and not figures["interventions"] and set(figures["verdicts"]) == {"met"}
+    level = "not met" if not done else "met" if clean else "partly met"
     return Verdict(", ".join(words) + ".", level)
 
 

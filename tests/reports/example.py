@@ -454,7 +454,7 @@ def pass_report(
         verdict="The catalogue filter held 51 m (median) without reading the anchor ephemeris once, five times better "
         "than propagating alone would have done by the end of a day; the published odometry drifted 1.7 % of path, "
         "as published.",
-        verdict_level="good",
+        verdict_level="met",
         generated_for="LINNA payload review",
         evidence_level="3",
         headline=(
@@ -631,7 +631,7 @@ def _campaign_pass(i: int, rng: np.random.Generator, build: str, gain: float = 1
         },
         anchor_reads_after_start={"paper": 0, "spherical": 0, "anchored": 0},
         baselines=("propagate only, degree 50",),
-        verdict_level="good",
+        verdict_level="met",
     )
 
 
@@ -643,7 +643,7 @@ def campaign_report(seed: int = 11, count: int = 40) -> CampaignReport:
         campaign_id="C-2029-08",
         passes=tuple(_campaign_pass(i, rng, "0.2.0" if i > count // 2 else "0.1.0") for i in range(count)),
         verdict="The catalogue filter held under 60 m in every pass; nothing trends.",
-        verdict_level="good",
+        verdict_level="met",
         evidence_level="3",
         headline=(
             HeadlineFigure("Median over passes, anchored", 41.0, "m"),
@@ -674,7 +674,7 @@ def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
         candidate_passes=tuple(_campaign_pass(i, new, "0.2.0", 0.85) for i in range(count)),
         baseline_passes=tuple(_campaign_pass(i, old, "0.1.0") for i in range(count)),
         verdict="One gate failed: recall of the smallest class in W-0007 fell below its limit.",
-        verdict_level="bad",
+        verdict_level="fail",
         evidence_level="3",
         headline=(
             HeadlineFigure("Gates failed", 1, "of 3"),
@@ -733,7 +733,7 @@ def detector_report(seed: int = 13) -> DetectorReport:
         cost={"Median latency": "6.4 ms, one thread", "Model": "3.8 MB", "Peak memory": "122 MB"},
         gallery=tuple(gallery_frame(seed + 7 * i, i) for i in range(3)),
         verdict="Every class beats the paper in precision, recall and localisation on held-out procedural terrain.",
-        verdict_level="caution",
+        verdict_level="partly met",
         evidence_level="2",
         headline=(
             HeadlineFigure("Precision", 0.853),
@@ -786,7 +786,7 @@ def dataset_report(seed: int = 14) -> DatasetReport:
         ),
         gallery=tuple(gallery_frame(seed + 3 * i, i) for i in range(3)),
         verdict="Whole but for one frame; classes follow the paper's shares within 2 %.",
-        verdict_level="caution",
+        verdict_level="partly met",
         headline=(
             HeadlineFigure("Frames", n),
             HeadlineFigure("Labels", 68_690),

@@ -1,6 +1,7 @@
 """Campaign, regression, detector and data-set reports: the same promises as the report of a pass."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -46,6 +47,7 @@ def test_the_page_is_whole_self_contained_and_repeatable(kind: str, text: str) -
 def test_the_verdict_and_the_figures_come_first(kind: str, text: str) -> None:
     report, words = _report(kind), Page(text).text
     assert report.verdict in words
+    assert f"Verdict: {report.verdict_level}" in words
     assert all(figure.label in words for figure in report.headline)
 
 
@@ -135,3 +137,15 @@ def test_predicted_uncertainty_stands_beside_what_it_should_be() -> None:
     table = words[words.index("Predicted uncertainty") :]
     for figure in ("14–20 km up", "1.33", "0.655", "0.941", "0.683"):
         assert figure in table
+
+
+@pytest.mark.parametrize(
+    ("level", "role"),
+    [("met", "green"), ("not met", "vermillion"), ("unknown", "orange"), ("fail", "vermillion"), ("", "")],
+)
+def test_a_verdict_is_named_by_its_level_and_has_its_colour(level: str, role: str) -> None:
+    text = render_html(replace(example.regression_report(), verdict_level=level))
+    heading = f"Verdict: {level}" if level else "Verdict"
+    assert f'<div class="verdict {role}"><p class="word">{heading}</p>' in text
+    if role:
+        assert f".verdict.{role} .word{{color:" in text

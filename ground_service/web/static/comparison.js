@@ -60,7 +60,7 @@ const missionOf = ({ pass }) =>
 
 function verdictOf({ report }) {
   if (!report) return "no report";
-  return element("span", {}, stateMark(report.verdict_level || "none"), ` ${report.verdict}`);
+  return element("span", {}, stateMark(report.verdict_level), ` ${report.verdict}`);
 }
 
 function showFigures() {

@@ -148,7 +148,9 @@ export function limitText([least, greatest]) {
   return greatest === null ? `below ${least}` : `outside ${least} to ${greatest}`;
 }
 
-export const stateMark = (state) => element("span", { class: `state ${state}` }, state);
+// Name of a state as a class of the style sheet: "not met" must not be shown as "met".
+export const stateClass = (state) => (state || "unknown").replaceAll(" ", "-");
+export const stateMark = (state, title) => element("span", { class: `state ${stateClass(state)}`, title }, state || "unknown");
 
 export function pager(load, size = 25) {
   let offset = Math.max(0, Math.floor(Number(stated("offset")) || 0));

@@ -3,7 +3,7 @@ import { finished, get, request, send } from "./api.js";
 import { chart, columns, solutionStyle } from "./charts.js";
 import { craterRims, layerItem, moonMap, terrain, track } from "./moon.js";
 import { drawParameters } from "./parameters.js";
-import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, parameterOptions, seconds, show, stateMark, table, timeText, trouble, unitText } from "./page.js";
+import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, parameterOptions, seconds, show, stateClass, stateMark, table, timeText, trouble, unitText } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
@@ -53,7 +53,7 @@ async function showExports() {
 function showReport(report, id) {
   show(
     "verdict",
-    element("p", { class: `verdict ${report.verdict_level || ""}` }, report.verdict),
+    element("p", { class: `verdict ${stateClass(report.verdict_level)}` }, stateMark(report.verdict_level), ` ${report.verdict}`),
     element(
       "dl",
       { class: "glance" },

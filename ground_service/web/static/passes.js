@@ -1,6 +1,6 @@
 import { keep, restore, state, statedAll } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, element, figure, lengthText, notice, pager, seconds, show, table, timeText, trouble } from "./page.js";
+import { acting, byId, element, figure, lengthText, notice, pager, seconds, show, stateMark, table, timeText, trouble } from "./page.js";
 
 restore("search", "verdict");
 
@@ -83,7 +83,7 @@ const load = pager(async (limit, offset) => {
 });
 
 // The whole verdict is a sentence: the list shows its level, and the sentence when pointed at.
-const verdict = (report) => (report ? element("span", { class: `state ${report.verdict_level}`, title: report.verdict }, report.verdict_level || "none") : "");
+const verdict = (report) => (report ? stateMark(report.verdict_level, report.verdict) : "no report");
 
 byId("find").addEventListener(
   "submit",

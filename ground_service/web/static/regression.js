@@ -12,7 +12,6 @@ async function upload(path, file) {
   return answer.json();
 }
 
-const verdictMark = (verdict) => stateMark({ pass: "passed", fail: "failed" }[verdict] ?? verdict);
 const OUTCOMES = ["fail", "inconclusive", "not judged", "pass"];
 
 // What would decide an open gate, or why its outcome does not count.
@@ -32,7 +31,7 @@ function gateRows(regression) {
       ["Candidate", (row) => figure(row.candidate), "num"],
       ["Limit", (row) => figure(row.limit), "num"],
       ["Pass", (row) => row.pass ?? "all"],
-      ["Outcome", (row) => verdictMark(row.outcome)],
+      ["Outcome", (row) => stateMark(row.outcome)],
       ["Remark", remarkOf],
     ],
     OUTCOMES.flatMap((outcome) => regression.result.gates.filter((gate) => gate.outcome === outcome)),
@@ -77,7 +76,7 @@ async function loadRegressions() {
         ["Entered", (row) => timeText(row.created)],
         ["Candidate", (row) => titleOf(row, "candidate")],
         ["Baseline", (row) => titleOf(row, "baseline")],
-        ["Verdict", (row) => (row.verdict ? verdictMark(row.verdict.verdict) : stateMark(row.job.state))],
+        ["Verdict", (row) => (row.verdict ? stateMark(row.verdict.verdict) : stateMark(row.job.state))],
         ["Outcome", outcomeOf],
         ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates"), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report")) : "")],
       ],

@@ -342,7 +342,8 @@ def _verdict(figures: dict[str, Any]) -> tuple[str, str]:
         f"strict F1 {on_board:.2f} on board and {balanced:.2f} at the balanced "
         f"threshold; {len(beaten)} of 3 size classes better than the paper in precision, recall and localisation"
     )
-    return text, "good" if max(on_board, balanced) >= STRICT_F1_GOAL and len(beaten) == 3 else "caution"
+    reached = (max(on_board, balanced) >= STRICT_F1_GOAL, len(beaten) == 3)
+    return text, "met" if all(reached) else "partly met" if any(reached) else "not met"
 
 
 def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:

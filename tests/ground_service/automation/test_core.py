@@ -22,8 +22,8 @@ from ground_service.missions.rules import DEFAULT_RULES, Conditions, Rule
         (Conditions(reevaluation=False), Occurrence("report done", reevaluation=True), False),
         (Conditions(requirement_failed=True), Occurrence("report done"), False),
         (
-            Conditions(verdict=("bad",), requirement_failed=True),
-            Occurrence("report done", verdict="bad", requirement_failed=False),
+            Conditions(verdict=("not met",), requirement_failed=True),
+            Occurrence("report done", verdict="not met", requirement_failed=False),
             False,
         ),
     ],

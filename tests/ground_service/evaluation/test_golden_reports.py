@@ -103,7 +103,7 @@ def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
         "resources.cpu": "unknown",
         "resources.temperature_max": "not met",
     }
-    assert report.verdict_level == "bad"
+    assert report.verdict_level == "not met"
     assert report.verdict.startswith("3 of 12 requirements not met: median 3-D error 130 m (at most 129);")
     assert report.verdict.endswith("1 unknown: CPU load. 8 of 12 requirements met.")
     assert report.evidence_level.startswith("3s (real terrain seen in training; 25 %")

@@ -484,7 +484,7 @@ def test_without_a_reference_the_report_says_what_was_flown_and_why_no_more() ->
     assert [one.name for one in report.navigation] == ["paper", "anchored"]
     assert np.isnan(series(report, "paper").error_rtn_m).all() and report.reference is None
     assert series(report, "paper").reset_trigger[6] == "safety_timeout"
-    assert report.verdict_level == "caution"
+    assert report.verdict_level == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -741,9 +741,9 @@ def test_one_sample_is_no_headline() -> None:
 
 
 def test_the_verdict_is_that_of_the_limits(report: PassReport) -> None:
-    assert (report.verdict, report.verdict_level) == ("1 of 1 requirement met.", "good")
+    assert (report.verdict, report.verdict_level) == ("1 of 1 requirement met.", "met")
     failed = evaluate_pass(inputs(limits=Limits(estimator="paper", median_error_m=499.0)))
-    assert failed.verdict_level == "bad"
+    assert failed.verdict_level == "not met"
     assert {one.key for one in report.requirements if one.status == "met"} == {"accuracy.median"}
 
 
@@ -784,7 +784,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
     paper_of = series(report, "paper")
     named = {
         "pass_id": "7", "frames": 11, "packets": 1900, "packets_lost": 100, "packets_expected": 2000,
-        "smoothed": {}, "baselines": {}, "verdict": report.verdict, "verdict_level": "good",
+        "smoothed": {}, "baselines": {}, "verdict": report.verdict, "verdict_level": "met",
         "evidence_level": "", "data": [],
     }  # fmt: skip
     assert {name: summary[name] for name in named} == named

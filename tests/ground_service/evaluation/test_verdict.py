@@ -117,7 +117,7 @@ def test_the_declared_estimator_is_judged_and_not_the_best_one() -> None:
     evaluated = found(series("anchored", median=70.0), series("spherical", median=30.0))
     limits = Limits(estimator="anchored", median_error_m=50.0)
     assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
-        70.0, "bad",
+        70.0, "not met",
     )  # fmt: skip
     undeclared = row("accuracy.median", replace(limits, estimator=None), evaluated)
     assert (undeclared.value, undeclared.status) == (None, "unknown")
@@ -179,14 +179,14 @@ def table(*statuses: str) -> list[Requirement]:
 @pytest.mark.parametrize(
     ("statuses", "level", "sentence"),
     [
-        (["met", "met", "not judged"], "good", "2 of 2 requirements met."),
+        (["met", "met", "not judged"], "met", "2 of 2 requirements met."),
         (
-            ["met", "unknown", "not met", "not judged"], "bad",
+            ["met", "unknown", "not met", "not judged"], "not met",
             "1 of 3 requirements not met: thing 2 2.00 m (at most 1.00). 1 unknown: thing 1. 1 of 3 requirements met.",
         ),
-        (["met", "unknown"], "caution", "1 unknown: thing 1. 1 of 2 requirements met."),
-        (["not judged"], "caution", "No requirement has a limit in the mission description: nothing is judged."),
-        ([], "caution", "No requirement has a limit in the mission description: nothing is judged."),
+        (["met", "unknown"], "unknown", "1 unknown: thing 1. 1 of 2 requirements met."),
+        (["not judged"], "unknown", "No requirement has a limit in the mission description: nothing is judged."),
+        ([], "unknown", "No requirement has a limit in the mission description: nothing is judged."),
     ],
 )  # fmt: skip
 def test_the_sentence_is_derived_from_the_table_and_names_failures_first(
@@ -327,4 +327,4 @@ def test_without_a_mission_description_every_requirement_is_unknown_and_the_reme
     assert {one.status for one in table} == {"unknown"}
     assert [one.key for one in table] == ["mission", *(one.key for one in plain)]
     assert [one.value for one in table[1:]] == [one.value for one in plain]
-    assert verdict_of(table) == ("Nothing can be judged: none is registered; enter one", "caution")
+    assert verdict_of(table) == ("Nothing can be judged: none is registered; enter one", "unknown")

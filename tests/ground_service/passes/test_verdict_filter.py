@@ -48,13 +48,13 @@ def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground)
             stop_utc_ns=start + 60 * NS,
             spacecraft_id=76,
         )
-    add_report(either, 1, "good", 2 * NS)
-    add_report(either, 1, "bad", 1 * NS)  # older
-    add_report(either, 2, "good", 1 * NS)
-    add_report(either, 2, "bad", 3 * NS)
-    assert listed(either, verdict="good") == ([1], 1)
-    assert listed(either, verdict="bad") == ([2], 1)
-    assert listed(either, verdict="caution") == ([], 0)
+    add_report(either, 1, "met", 2 * NS)
+    add_report(either, 1, "not met", 1 * NS)  # older
+    add_report(either, 2, "met", 1 * NS)
+    add_report(either, 2, "not met", 3 * NS)
+    assert listed(either, verdict="met") == ([1], 1)
+    assert listed(either, verdict="not met") == ([2], 1)
+    assert listed(either, verdict="unknown") == ([], 0)
     assert listed(either, verdict="none") == ([3], 1)
-    assert listed(either, verdict="good", search="pass 1") == ([], 0)
+    assert listed(either, verdict="met", search="pass 1") == ([], 0)
     assert listed(either) == ([1, 2, 3], 3)

@@ -89,7 +89,7 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
         "smoothed": {},
         "baselines": {},
         "verdict": "met",
-        "verdict_level": "good",
+        "verdict_level": "met",
         "requirements": [
             {
                 "key": values["key"], "name": "median 3-D error", "value": values["error"], "limit": values["limit"],
@@ -211,7 +211,7 @@ def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground
     for number in range(4):
         add_pass(ground, number, status="met" if number == 3 else "unknown")
     value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
-    assert value.verdict_level == "caution"
+    assert value.verdict_level == "unknown"
     assert (
         value.verdict
         == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
@@ -238,7 +238,7 @@ def test_requirements_that_the_newest_report_lacks_are_judged(ground: Ground) ->
     found = performance(ground, SPACECRAFT)
     rules = {one.key: (one.limit, one.met, one.not_met, one.unknown) for one in found.requirements}
     assert rules == {"accuracy.median": (100.0, 1, 0, 2), "old": (60.0, 0, 2, 1)}
-    assert monthly_value(found, "2029-08").verdict_level == "bad"
+    assert monthly_value(found, "2029-08").verdict_level == "not met"
 
 
 def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None:
@@ -257,14 +257,14 @@ def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None
 
 def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: Ground) -> None:
     add_pass(ground, 0)
-    assert monthly_value(performance(ground, SPACECRAFT), "2029-08").verdict_level == "good"
+    assert monthly_value(performance(ground, SPACECRAFT), "2029-08").verdict_level == "met"
     start = FIRST + DAY_NS
     define_pass(ground, name="no", start_utc_ns=start, stop_utc_ns=start + 10**12, spacecraft_id=SPACECRAFT)
     found = performance(ground, SPACECRAFT)
     assert (found.passes_in_span, len(found.passes)) == (2, 1)
     assert performance_lines(found)[0] == "1 passes with a report, 1 without"
     value = monthly_value(found, "2029-08")
-    assert value.verdict_level == "caution"
+    assert value.verdict_level == "unknown"
     assert value.verdict.endswith("; 1 of 2 passes have a report")
 
 

@@ -1,6 +1,7 @@
 """Passes side by side, in Chromium."""
 
 import re
+from urllib.parse import quote_plus
 
 import pytest
 from playwright.sync_api import expect
@@ -10,7 +11,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S
-from tests.ground_service.web.test_in_browser import answered, settled
+from tests.ground_service.web.test_in_browser import answered, colour_of, settled
 
 
 @pytest.fixture(scope="module")
@@ -124,9 +125,42 @@ def test_passes_are_filtered_by_their_verdict(view):
     expect(view.locator("#passes tbody tr")).to_have_count(1)
     expect(view.locator("#passes tbody tr")).to_contain_text("empty")
     view.get_by_label("Verdict").select_option(levels[1])
-    expect(view).to_have_url(re.compile(f"verdict={levels[1]}"))
+    expect(view).to_have_url(re.compile(re.escape(f"verdict={quote_plus(levels[1])}")))
     alike = [key for key, level in levels.items() if level == levels[1]]
     expect(view.locator("#passes tbody tr")).to_have_count(len(alike))
-    other = next(level for level in ("good", "caution", "bad") if level not in levels.values())
+    other = next(level for level in ("met", "unknown", "not met") if level not in levels.values())
     view.get_by_label("Verdict").select_option(other)
     expect(view.locator("#passes")).to_contain_text("No pass matches.")
+
+
+@pytest.mark.parametrize(
+    ("level", "colour"),
+    [("met", "--good"), ("not met", "--bad"), ("unknown", "--caution"), ("", "--caution")],
+)
+def test_a_verdict_has_the_same_word_and_colour_on_every_page(view, level, colour):
+    def with_level(route):
+        document = route.fetch().json()
+        for one in document.get("items", [document]):
+            one["verdict_level"] = level
+        route.fulfill(json=document)
+
+    view.route(re.compile(r"/api/v1/reports(\?|/[^/]+/overview)"), with_level)
+    word = level or "unknown"
+    for address, mark in (
+        ("/passes", "#passes tbody tr:has(a[href='/passes/1']) .state"),
+        ("/comparison?pass=1&pass=2", "#figures .state"),
+        ("/passes/1", "#verdict .state"),
+    ):
+        settled(view, address)
+        shown = view.locator(mark).first
+        expect(shown).to_have_text(word)
+        expect(shown).to_have_css("color", colour_of(view, colour))
+
+
+def test_the_report_of_a_pass_has_the_word_of_the_list(view):
+    settled(view, "/passes")
+    line = view.locator("#passes tbody tr").filter(has=view.locator('a[href="/passes/1"]'))
+    word = line.locator(".state").inner_text()
+    with view.expect_popup() as opened:
+        line.get_by_role("link", name="open").click()
+    expect(opened.value.locator(".verdict .word")).to_have_text(f"Verdict: {word}")

@@ -352,7 +352,7 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
         page.locator("#zip").set_input_files(file)
         page.get_by_role("button", name="Upload").click()
         expect(page.locator("#notices .good")).to_have_count(1 + files.index((kind, file)))
-    for candidate, verdict in (("good", "passed"), ("broken", "failed")):
+    for candidate, verdict in (("good", "pass"), ("broken", "fail")):
         for select, build in (("#candidate", candidate), ("#baseline", "good")):
             option = page.locator(f"{select} option", has_text=build)
             page.locator(select).select_option(option.get_attribute("value"))

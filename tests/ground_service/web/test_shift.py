@@ -359,7 +359,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
         page.locator(select).select_option(option.get_attribute("value"))
     page.get_by_role("button", name="Run", exact=True).click()
     verdict = page.locator("#regressions tbody tr").first
-    expect(verdict.locator(".state.failed, .state.inconclusive")).to_be_visible()
+    expect(verdict.locator(".state.fail, .state.inconclusive")).to_be_visible()
     expect(verdict).to_contain_text("broken")
     expect(verdict.locator(".reasons li").first).to_contain_text("exit")
     pictures.take(page, "regression")
