@@ -7,8 +7,9 @@ are new. Latencies count from the moment at which a read is due, so that a held-
 
 The memory of every part is read every ten seconds, in MiB: private memory of its processes, shared memory segments (the
 buffers of PostgreSQL, each page counted once), files (programs and libraries) and the private memory of the largest
-process; also the number of processes. `per_h` is the slope of a straight line after the first quarter, an hour. Shared
-memory of PostgreSQL grows until every buffer was used once; `--shared-buffers` sets their size.
+process; also the number of processes. `max_at_s` is the time of the first largest value, `per_h` the slope of a
+straight line after the first quarter, an hour. Shared memory of PostgreSQL grows until every buffer was used once;
+`--shared-buffers` sets their size.
 """
 
 from __future__ import annotations
@@ -117,13 +118,14 @@ def memory_figures(samples: list[tuple[float, Memory]]) -> dict[str, Any]:
 
 
 def _course(at: FloatArray, values: FloatArray) -> dict[str, float]:
-    """Return the first and last value, the maximum, and the growth an hour after the first quarter."""
+    """Return the first and last value, the maximum, its first time, and the growth an hour after the first quarter."""
     late = at > at[-1] / 4
     slope = float(np.polyfit(at[late], values[late], 1)[0]) * 3600.0 if late.sum() > 2 else float("nan")
     return {
         "first": round(float(values[0]), 1),
         "last": round(float(values[-1]), 1),
         "max": round(float(values.max()), 1),
+        "max_at_s": round(float(at[int(values.argmax())])),
         "per_h": round(slope, 1),
     }
 

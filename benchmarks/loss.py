@@ -1,4 +1,4 @@
-"""Loss of one process under ingest load: python -m benchmarks.loss [--only NAME ...].
+"""Loss of one process under ingest load: python -m benchmarks.loss [--only NAME ...] [--rate 2].
 
 Two API processes, two workers, a scheduler, Redis and a pair of PostgreSQL servers with automatic failover. Two clients
 upload pieces of a downlink. One part after another is killed (SIGKILL). A supervisor starts ended processes again after
@@ -6,7 +6,8 @@ a second, as the restart policy of the compose file does, but not the lost host 
 loss:
 
 - `uploads_s`: longest time without an acknowledged upload after the kill;
-- `jobs_s`: time from the kill until a job that was accepted after it is done;
+- `jobs_s`: time from the kill until a job that was accepted after it is done, and `started_s` until it started. The
+  jobs that wait at the kill and when that job is done are counted (`waiting`), because it also waits for these;
 - `complete_s`: time until every process runs again, with a scheduler and, but for a lost host, a standby.
 
 At the end every acknowledged job must be done and no packet may be missing or doubled.
@@ -22,7 +23,8 @@ import random
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,7 @@ from ground_service.access.service import add_user
 from ground_service.errors import GroundError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
+from ground_service.jobs.service import unfinished_jobs
 from ground_service.worker.scheduler import has_scheduler
 from studies.mission_run.parts import runs
 
@@ -45,7 +48,7 @@ LIMIT_S = 60.0
 
 PACKETS = 2_000
 PIECES = 60
-PAUSE_S = 1.0
+CLIENTS = 2
 
 
 class Supervisor(threading.Thread):
@@ -65,21 +68,24 @@ class Supervisor(threading.Thread):
 class Uploads:
     """Clients that upload pieces and repeat what was not acknowledged, with the same key."""
 
-    def __init__(self, session: Session, stream: bytes) -> None:
+    def __init__(self, session: Session, stream: bytes, rate: float) -> None:
+        self._pause_s = CLIENTS / rate
         self.acknowledged: list[tuple[float, float, str]] = []
         self.over = threading.Event()
         self._session = session
         self._pieces = cut_pieces(stream, PIECES, random.Random(1), "piece")
         self.threads = [
-            threading.Thread(target=self._run, args=(number,), daemon=True) for number in range(2)
+            threading.Thread(target=self._run, args=(number,), daemon=True) for number in range(CLIENTS)
         ]
 
     def _run(self, number: int) -> None:
+        due = time.monotonic()
         for turn in itertools.count():
-            if self.over.wait(PAUSE_S):
+            if self.over.wait(max(due - time.monotonic(), 0.0)):
                 return
-            piece = self._pieces[(2 * turn + number) % PIECES]
+            piece = self._pieces[(CLIENTS * turn + number) % PIECES]
             asked = time.monotonic()
+            due = max(due, asked - self._pause_s) + self._pause_s
             key = f"{number} {turn}"
             answer = self._session.ask("POST", "/telemetry?spacecraft_id=76", piece.octets, key)
             if answer.status != 202:
@@ -96,6 +102,7 @@ def loss_of(
     if primary is None:
         raise SystemExit(f"{name}: expected a primary before the kill, found none")
     before = {part: service.parts[part].pid for part in service.parts}
+    waiting = [len(unfinished_jobs(ground))]
     killed = time.monotonic()
     if name == SERVER:
         cluster.members[primary].kill_server()
@@ -114,6 +121,8 @@ def loss_of(
         lambda: session.get(f"/jobs/{accepted[2]}")["state"] == "done", f"job after the loss of {name}", 300.0
     )
     jobs_s = time.monotonic() - killed
+    took_s = _waited_s(session.get(f"/jobs/{accepted[2]}"))
+    waiting.append(len(unfinished_jobs(ground)))
 
     def complete() -> bool:
         if name in service.parts and service.parts[name].pid == before[name]:
@@ -135,12 +144,20 @@ def loss_of(
     return {
         "lost": name,
         "uploads_s": round(uploads_s, 1),
+        "started_s": round(accepted[1] - killed + took_s, 1),
         "jobs_s": round(jobs_s, 1),
+        "waiting": waiting,
         "complete_s": round(complete_s, 1),
     }
 
 
-def losses(folder: Path, names: tuple[str, ...]) -> dict[str, Any]:
+def _waited_s(job: Mapping[str, Any]) -> float:
+    """Return the time that a job waited for a worker, s."""
+    created, started = (datetime.fromisoformat(job[name]) for name in ("created", "started"))
+    return (started - created).total_seconds()
+
+
+def losses(folder: Path, names: tuple[str, ...], rate: float) -> dict[str, Any]:
     """Lose one part after another; return the figures."""
     stream = mixed_downlink(PACKETS)
     (folder / "whole.cadu").write_bytes(stream)
@@ -153,7 +170,7 @@ def losses(folder: Path, names: tuple[str, ...]) -> dict[str, Any]:
         try:
             with open_ground(service.home, database_url=service.url) as ground:
                 session = Session(service.apis, add_user(ground, "ann", "operator"))
-                uploads = Uploads(session, stream)
+                uploads = Uploads(session, stream, rate)
                 ready: Callable[[], bool] = lambda: has_scheduler(ground)  # noqa: E731
                 wait_until(ready, "scheduler")
                 supervisor.start()
@@ -171,6 +188,7 @@ def losses(folder: Path, names: tuple[str, ...]) -> dict[str, Any]:
             supervisor.over.set()
             service.stop()
     return {
+        "uploads_a_second": rate,
         "losses": rows,
         "acknowledged": len(uploads.acknowledged),
         "jobs": dict(states),
@@ -187,9 +205,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     every = (*PARTS, SERVER, HOST)
     parser.add_argument("--only", choices=every, nargs="+", default=every, help="parts to lose")
+    parser.add_argument("--rate", type=float, default=2.0, help="uploads a second")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        figures = losses(Path(name), tuple(given.only))
+        figures = losses(Path(name), tuple(given.only), given.rate)
     print(json.dumps({"loss": figures}, indent=1))
     slowest = max(max(row["uploads_s"], row["jobs_s"]) for row in figures["losses"])
     kept = figures["archive_identical"] and set(figures["jobs"]) == {"done"}

@@ -209,6 +209,14 @@ class Settings(BaseSettings):
     )
     upload_limit_mib: int = Field(default=4096, ge=1, description="Largest upload accepted, MiB")
 
+    @field_validator("broker_url")
+    @classmethod
+    def _broker(cls, value: SecretStr | None) -> SecretStr | None:
+        parts = urlsplit(value.get_secret_value() if value else "redis://none")
+        if parts.scheme not in ("redis", "rediss") or not parts.hostname:
+            raise ValueError("expected a URL such as redis://host:6379/0, found another one")
+        return value
+
     @field_validator("trusted_proxies")
     @classmethod
     def _networks(cls, value: tuple[str, ...]) -> tuple[str, ...]:
@@ -301,6 +309,9 @@ def load_settings(**given: object) -> Settings:
     except ValidationError as error:
         first = error.errors()[0]
         name = "LINNA_" + "_".join(str(part) for part in first["loc"]).upper()
+        if first["type"] == "value_error":
+            expected, _, found = str(first["ctx"]["error"]).removeprefix("expected ").partition(", found ")
+            raise SettingsError(name, expected, found) from None
         raise SettingsError(name, first["msg"].lower(), repr(first.get("input"))) from None
 
 

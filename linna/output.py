@@ -36,6 +36,13 @@ def as_json(figures: Mapping[str, Any]) -> str:
     return json.dumps(_plain(figures), allow_nan=False)
 
 
+def checked(is_good: bool, expected: str) -> int:
+    """Return the exit status of a check, with a line on stderr if it failed."""
+    if not is_good:
+        log(f"linna: expected {expected}, found none")
+    return 0 if is_good else 1
+
+
 def log(message: str) -> None:
     """One line of progress on stderr."""
     print(message, file=sys.stderr, flush=True)

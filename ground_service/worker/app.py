@@ -111,9 +111,16 @@ def _job_of(message: bytes) -> str | None:
 
 
 def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:
-    """Whether the worker of this machine answers over the broker."""
+    """Whether the worker of this machine answers over the broker.
+
+    Raises
+    ------
+    SettingsError
+        If no broker is set.
+    """
     from redis import RedisError
 
+    _require_broker(settings)
     name = f"celery@{socket.gethostname()}"
     inspect = _app_of(settings).control.inspect(destination=[name], timeout=timeout_s)
     try:
@@ -152,6 +159,11 @@ def _app_of(settings: Settings) -> Celery:
     return _apps[key]
 
 
+def _require_broker(settings: Settings) -> None:
+    if settings.resolved_broker_url() is None:
+        raise SettingsError("LINNA_BROKER_URL", "a broker such as redis://localhost:6379/0", "nothing")
+
+
 def run_worker(settings: Settings, concurrency: int = 1) -> None:
     """Do jobs until stopped.
 
@@ -160,8 +172,7 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
     SettingsError
         If no broker is set: jobs are then done by the service itself.
     """
-    if settings.resolved_broker_url() is None:
-        raise SettingsError("LINNA_BROKER_URL", "a broker such as redis://localhost:6379/0", "nothing")
+    _require_broker(settings)
     limit_heaps()
     _ground_of(settings).close()
 

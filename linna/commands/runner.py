@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from linna.output import checked
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -37,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--exchange: expected a folder shared with the service, found none")
     try:
         if arguments.check:
-            return 0 if alive(exchange) else 1
+            return checked(alive(exchange), f"a runner that serves {exchange}")
         logging.config.dictConfig(logging_config(settings.log_format))
         stopping = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of
+from linna.output import checked
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = settings_of(arguments, data=data_folder().root)
     with ground_from_settings(settings) as ground:
         if arguments.check:
-            return 0 if has_scheduler(ground) else 1
+            return checked(has_scheduler(ground), "a process with the lease of the recurring work")
         logging.config.dictConfig(logging_config(settings.log_format))
         stopping = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of
+from linna.output import checked
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +24,6 @@ def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
 
     if arguments.check:
-        return 0 if worker_answers(settings_of(arguments)) else 1
+        return checked(worker_answers(settings_of(arguments)), "an answer of the worker of this machine")
     run_worker(settings_of(arguments, data=data_folder().root), max(arguments.concurrency, 1))
     return 0

@@ -7,8 +7,9 @@ from studies.mission_run.processes import Memory
 def test_growth_of_shared_memory_is_not_growth_of_private_memory() -> None:
     samples = [(10.0 * number, Memory(40.0, min(5.0 * number, 128.0), 9.0, 8.0, 5)) for number in range(60)]
     figures = memory_figures(samples)
-    assert figures["private"] == {"first": 40.0, "last": 40.0, "max": 40.0, "per_h": 0.0}
-    assert figures["shared"]["max"] == 128.0 and figures["shared"]["per_h"] > 0.0
+    assert figures["private"] == {"first": 40.0, "last": 40.0, "max": 40.0, "max_at_s": 0, "per_h": 0.0}
+    assert (figures["shared"]["max"], figures["shared"]["max_at_s"]) == (128.0, 260)
+    assert figures["shared"]["per_h"] > 0.0
     assert figures["total"]["last"] == 177.0
     assert figures["largest"]["max"] == 8.0 and figures["processes"]["last"] == 5.0
 

@@ -66,6 +66,11 @@ def test_a_password_can_come_from_a_file_of_its_own(monkeypatch: pytest.MonkeyPa
     [
         ("LINNA_PORT", "seventy", "LINNA_PORT: expected input should be a valid integer"),
         ("LINNA_PORT", "70000", "LINNA_PORT: expected input should be less than or equal to 65535"),
+        (
+            "LINNA_TRUSTED_PROXIES",
+            "proxy",
+            "^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$",
+        ),
         ("LINNA_DATABASE_URL_FILE", "/does/not/exist", "LINNA_DATABASE_URL_FILE: expected a readable file"),
     ],
 )
@@ -98,6 +103,19 @@ def test_an_unusable_secret_is_refused_in_one_line_and_never_replaced_by_a_defau
     with pytest.raises(SettingsError, match=f"^LINNA_{name.upper()}_FILE: {message}") as error:
         load_settings()
     assert str(tmp_path / "secret") in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "url", ["nonsense", "amqp://linna:geheim@broker/0", "redis://", "//linna:geheim@broker"]
+)
+def test_a_broker_other_than_redis_is_refused_without_showing_its_password(
+    monkeypatch: pytest.MonkeyPatch, url: str
+) -> None:
+    monkeypatch.setenv("LINNA_BROKER_URL", url)
+    with pytest.raises(SettingsError) as error:
+        load_settings()
+    expected = "LINNA_BROKER_URL: expected a URL such as redis://host:6379/0, found another one"
+    assert str(error.value) == expected
 
 
 def test_a_password_without_a_user_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import update
 
 from ground_service.access import service as users
 from ground_service.access.security import SESSION_COOKIE
 from ground_service.app import create_app
 from ground_service.settings import Settings
+from ground_service.store import repository
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -79,6 +81,20 @@ def test_a_session_ends_with_the_validity_of_its_token(client: TestClient) -> No
     start(client, token)
     expires = {one.expires for one in users.list_tokens(ground, "bob")}
     assert len(expires) == 1
+
+
+def test_an_expired_session_is_refused_with_its_reason_and_changes_nothing(
+    client: TestClient, token: str
+) -> None:
+    ground = client.app.state.ground
+    start(client, token)
+    with ground.database.writing() as connection:
+        connection.execute(update(repository.TOKENS).values(expires_utc_ns=5))
+    for answer in (client.get("/api/v1/passes"), client.post("/api/v1/windows", json={}, headers=OWN)):
+        assert answer.status_code == 401 and "has expired" in answer.json()["detail"], answer.text
+    # The page to sign in again is there.
+    page = client.get("/", headers={"Accept": "text/html"})
+    assert page.status_code == 200 and "has expired" not in page.headers.get("set-cookie", "")
 
 
 def test_a_change_with_the_cookie_from_another_origin_is_refused(client: TestClient, token: str) -> None:

@@ -142,6 +142,44 @@ def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(
     assert "bea" in capsys.readouterr().out
 
 
+@pytest.fixture
+def empty(roles: Roles, new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
+    """Another database of the server, without tables."""
+    superuser = new_postgres_database()
+    service = make_url(superuser).set(username=SERVICE).render_as_string(hide_password=False)
+    yield Roles(superuser, superuser, service, "")
+    engine = create_engine(superuser, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"DROP OWNED BY {SERVICE}"))
+    engine.dispose()
+
+
+def test_the_role_of_the_service_restores_a_backup_into_an_upgraded_database(
+    empty: Roles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the documentation says for the compose file: upgrade, restore, then the administrator."""
+    monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("LINNA_ADMIN_TOKEN", "token of the administrator, long")
+    assert cli.run(["user", "ensure", "admin", "--role", "admin"]) == 0
+    assert cli.run(["user", "add", "bea", "--role", "viewer"]) == 0
+    assert cli.run(["db", "backup", "--out", str(tmp_path / "saved")]) == 0
+    monkeypatch.setenv("LINNA_HOME", str(tmp_path / "new"))
+    monkeypatch.setenv("LINNA_MIGRATION_DATABASE_URL", empty.owner)
+    monkeypatch.setenv("LINNA_DATABASE_URL", empty.service)
+    assert cli.run(["db", "upgrade"]) == 0
+    assert cli.run(["db", "restore", str(tmp_path / "saved")]) == 0
+    assert cli.run(["verify"]) == 0
+    assert cli.run(["user", "ensure", "admin", "--role", "admin"]) == 0
+    # The numbers of rows continue after those of the backup.
+    assert cli.run(["user", "add", "cid", "--role", "viewer"]) == 0
+    capsys.readouterr()
+    assert cli.run(["user", "list"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in ("admin", "bea", "cid"))
+    assert cli.run(["db", "restore", str(tmp_path / "saved")]) == 2
+    assert "expected an empty service, found rows in" in capsys.readouterr().err
+
+
 def test_granting_for_backups_takes_away_what_is_too_much(
     roles: Roles, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

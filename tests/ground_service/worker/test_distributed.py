@@ -168,6 +168,8 @@ def test_a_job_entered_twice_is_one_job(ground: Ground) -> None:
 def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
         run_worker(Settings(home=tmp_path))
+    with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
+        worker_answers(Settings(home=tmp_path))
 
 
 def test_jobs_that_the_broker_lost_are_sent_again(

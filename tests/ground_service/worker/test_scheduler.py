@@ -162,12 +162,14 @@ def test_a_night_that_was_missed_is_made_up_for_after_a_while(
 
 
 def test_the_command_has_the_lease_until_it_is_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     home = tmp_path / "home"
     monkeypatch.setenv("LINNA_HOME", str(home))
     with open_ground(home) as ground:
         assert cli.run(["scheduler", "--check"]) == 1
+        expected = "linna: expected a process with the lease of the recurring work, found none\n"
+        assert capsys.readouterr().err == expected
         process = subprocess.Popen([sys.executable, "-m", "linna", "scheduler"])
         try:
             wait_for(lambda: has_scheduler(ground), "the scheduler", 120.0)
