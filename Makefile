@@ -56,7 +56,7 @@ deploy/openmct/node_modules/.package-lock.json: deploy/openmct/package.json depl
 # Pictures of the pages in the documentation, taken by tests.
 pictures: $(VENV)/.dev
 	LINNA_PICTURES=docs/pictures $(BIN)/python -m pytest -q tests/ground_service/web/test_shift.py \
-	  tests/ground_service/web/test_flight.py tests/ground_service/web/test_page_state.py -k "shift or flight or planner_opens"
+	  tests/ground_service/web/test_flight.py tests/ground_service/web/test_page_state.py -k "shift or flight or planner_opens or map_of_a_pass"
 
 # Table of the pages by width, colours, font and data, written by the test of all pages.
 page-table: $(VENV)/.dev

@@ -11,6 +11,7 @@ from ground_service.commanding.core import DUPLICATE, STAGES, CommandFate
 from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
 from ground_service.http.times import UtcTime
 from ground_service.text import LINE_PATTERN_JSON
+from lunar.timescales import utc_ns_from_ticks
 from tmtc.codes import FAILURES
 
 _FAILURES = dict(FAILURES)
@@ -67,6 +68,9 @@ class Telecommand(Entity):
     sent: UtcTime | None
     window_id: int | None = Field(description="The planned window that it belongs to")
     carrier_id: int | None = Field(description="The telecommand that carries it into the on-board schedule")
+    release: UtcTime | None = Field(
+        default=None, description="Release by the on-board clock, not corrected; null: not time-tagged"
+    )
     reports: list[CommandReport]
     remark: str = Field(description="Why it failed, was rejected or timed out; empty: it did not")
 
@@ -143,6 +147,7 @@ class CommandView:
     @property
     def telecommand(self) -> Telecommand:
         """The telecommand as an entity."""
+        ticks = self.record.arguments.get("release_ticks")
         return Telecommand.of(
             dict(self.record),
             spacecraft_id=self.spacecraft_id,
@@ -151,6 +156,7 @@ class CommandView:
             timed_out=self.fate is not None and self.fate.timed_out,
             requested=self.record.created_utc_ns,
             remark=self.remark,
+            release=None if ticks is None else utc_ns_from_ticks(int(ticks)),
             reports=[
                 CommandReport(
                     stage=STAGES.get(report.subtype, str(report.subtype)),

@@ -211,6 +211,15 @@ function seriesShown(plot) {
   });
 }
 
+const DARK = matchMedia("(prefers-color-scheme: dark)");
+function redrawWithColours(box, plot) {
+  const redraw = () => {
+    if (box.isConnected) plot.redraw(false, true);
+    else DARK.removeEventListener("change", redraw);
+  };
+  DARK.addEventListener("change", redraw);
+}
+
 // Minutes are ruled at whole numbers of them.
 const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600].map((one) => 60 * one);
 
@@ -229,7 +238,8 @@ export function chart(place, title, unit, series, { logarithmic = false, elapsed
   if (axes.length > 2) throw new Error("A chart has two axes: choose parameters with at most two units.");
   const scaleOf = (one) => (axisOf(one) === axes[0][0] ? "y" : "second");
   const { lines, bands, data } = drawnSeries(series, scaleOf, elapsed);
-  const colours = { ink: style("--muted"), grid: { stroke: style("--grid"), width: 1 } };
+  // Asked for at each drawing: the colours of the page may change while it is open.
+  const colours = { ink: () => style("--muted"), grid: { stroke: () => style("--grid"), width: 1 } };
   const ruler = elapsed ? { values: minuteTexts, incrs: MINUTES, label: "minutes since the start", labelSize: 20 } : { values: clockTexts };
   const scales = { ...(elapsed && { x: { time: false } }), ...Object.fromEntries(axes.map(([, one]) => [scaleOf(one), one.labels ? CODES : logarithmic ? LOGARITHMIC : {}])) };
   const plot = new uPlot(
@@ -257,6 +267,7 @@ export function chart(place, title, unit, series, { logarithmic = false, elapsed
     box,
   );
   box.plot = plot;
+  redrawWithColours(box, plot);
   if (group) joinGroup(group, plot);
   zoomByKeys(box, plot);
   legendByKeys(plot);

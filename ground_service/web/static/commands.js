@@ -35,10 +35,22 @@ function showArguments() {
 
 // Arguments as words: octets of a packet by their number, items by their values, one after the other.
 function plain(value) {
+  if (typeof value === "number") return Number(value.toPrecision(9));
   if (!Array.isArray(value)) return value !== null && typeof value === "object" ? Object.values(value).join(" ") : value;
   if (value.length && value.every((item) => Object.keys(item).join() === "octet")) return `${value.length} octets`;
   const text = value.map((item) => plain(item)).join("; ");
   return text.length > 80 ? `${text.slice(0, 79)}…` : text;
+}
+
+// A time-tagged telecommand names its time and the telecommand that it carries, not ticks and octets.
+function argumentText(row, listed) {
+  const carried = row.release && listed.find((one) => one.carrier_id === row.id);
+  const texts = Object.entries(row.arguments).map(([key, value]) => {
+    if (key === "release_ticks" && row.release) return `release at ${timeText(row.release)} of the on-board clock`;
+    if (key === "items" && carried) return `carries telecommand ${carried.id}`;
+    return `${words(key)} ${plain(value)}`;
+  });
+  return texts.join(", ");
 }
 
 function argumentsOf(chosen) {
@@ -149,12 +161,12 @@ const load = pager(async (limit, offset) => {
       [
         ["No", (row) => String(row.id), "num"],
         ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
-        ["Arguments", (row) => Object.entries(row.arguments).map(([key, value]) => `${words(key)} ${plain(value)}`).join(", ")],
+        ["State", (row) => stateMark(row.state)],
+        ["Verification", lights],
+        ["Arguments", (row) => argumentText(row, page.items)],
         ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
         ["Decided", (row) => (row.decided_by ? `${timeText(row.decided)} by ${row.decided_by}` : "")],
-        ["State", (row) => stateMark(row.state)],
         ["Sent", (row) => (row.sent ? timeText(row.sent) : "")],
-        ["Verification", lights],
         ["", deeds],
       ],
       page.items,

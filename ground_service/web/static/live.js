@@ -130,7 +130,7 @@ function numbers(message) {
     fact("Mode", message.mode),
     fact("Altitude", `${figure(message.altitude_km, 4)} km`),
     fact("Detections", `${figure((message.detections ?? []).length)}, ${figure((message.detections ?? []).filter((one) => one.crater_id !== undefined).length)} matched`),
-    estimates.map(([name, one]) => fact(name, `${one.outcome ?? "–"}${one.error_m === undefined ? "" : `, ${figure(one.error_m)} m off`}`)),
+    estimates.map(([name, one]) => fact(name, `${one.outcome ?? "–"}${one.error_m === undefined ? "" : `, error ${figure(one.error_m)} m`}`)),
     fact("Shown", `${byId("frame").dataset.rate ?? "–"} frames/s`),
   );
 }
@@ -168,12 +168,14 @@ function begin(names, reference, terrain) {
   map?.remove();
   map = moonMap(byId("map"), { albedo: terrain?.real === true });
   byId("terrain").textContent = terrain ? `Terrain: ${terrain.name}.` : "Terrain: not stated by the payload.";
+  // White is seen on the picture of the Moon only.
+  const over = terrain?.real === true ? "#ffffff" : getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
   lines = {};
   paths = {};
   dots = {};
   show("map-legend");
   for (const [index, name] of ["reference", ...names].entries()) {
-    const css = name === "reference" ? "#ffffff" : solutionStyle(name, "estimate", index).colour;
+    const css = name === "reference" ? over : solutionStyle(name, "estimate", index).colour;
     const first = [[reference.latitude_deg], [((((reference.longitude_deg + 180) % 360) + 360) % 360) - 180]];
     paths[name] = [[first.flat()]];
     lines[name] = track(map, ...first, { color: css, weight: name === "reference" ? 2 + 3 * names.length : 2 + 3 * (names.length - index), lineCap: "butt" });

@@ -141,7 +141,7 @@ function showCompleteness(found) {
         ["APID", (row) => `0x${row.apid.toString(16)}`],
         ["Packets of", (row) => words(row.name)],
         ["", (row) => element("meter", { min: 0, max: 1, low: 0.99, optimum: 1, value: row.share, "aria-label": `share of ${row.name} that came` })],
-        ["Came", (row) => figure(row.packets), "num"],
+        ["Received", (row) => figure(row.packets), "num"],
         ["Lost", (row) => figure(row.lost), "num"],
         ["Lost at edges", (row) => figure(row.lost_at_edges), "num"],
         ["Repeated", (row) => figure(row.duplicates), "num"],
@@ -149,7 +149,7 @@ function showCompleteness(found) {
         ["Complete", (row) => `${(100 * row.share).toFixed(2)} %`, "num"],
       ],
       rows,
-      "No packet of this pass has come.",
+      "No packet of this pass was received.",
     ),
     receptionTable(found.receptions),
   );
@@ -162,12 +162,12 @@ function receptionTable(receptions) {
     "Link quality by reception",
     [
       ["Station", (row) => row.station || "not stated"],
-      ["First frame", (row) => row.first_received ?? "unknown"],
-      ["Last frame", (row) => row.last_received ?? "unknown"],
+      ["First frame", (row) => (row.first_received ? timeText(row.first_received) : "unknown")],
+      ["Last frame", (row) => (row.last_received ? timeText(row.last_received) : "unknown")],
       ["Frames", (row) => figure(row.frames), "num"],
       ["Good", (row) => figure(row.frames_good), "num"],
       ["Symbols corrected", (row) => figure(row.symbols_corrected), "num"],
-      ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : row.bit_error_rate.toExponential(1)), "num"],
+      ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : figure(row.bit_error_rate, 2)), "num"],
       ["Lock losses", (row) => figure(row.lock_losses), "num"],
       ["Octets", (row) => figure(row.octets), "num"],
       ["Outside frames", (row) => figure(row.octets_other), "num"],
@@ -199,7 +199,7 @@ async function showTerrain(pass) {
 }
 
 // Tracks lie on each other where the whole Moon is shown: wide ones below narrow ones, so that each is seen.
-const trackWeight = (index, count) => 2 + 4 * (count - 1 - index);
+const trackWeight = (index, count) => 3 + 5 * (count - 1 - index);
 
 async function showStates(pass, estimators) {
   const [map, ...answers] = await Promise.all([
@@ -215,7 +215,7 @@ async function showStates(pass, estimators) {
     if (line.getLatLngs().length) bounds.push(line.getBounds());
     byId("map-legend").append(layerItem(map, line, one.estimator, css));
   });
-  if (bounds.length) map.fitBounds(bounds.reduce((all, one) => all.extend(one)), { maxZoom: 4, padding: [20, 20] });
+  if (bounds.length) map.fitBounds(bounds.reduce((all, one) => all.extend(one)), { animate: false, maxZoom: 4, padding: [20, 20] });
   STATES.forEach((value, which) => {
     const unit = found[0]?.series[which].unit ?? "";
     const series = found.map((one) => ({

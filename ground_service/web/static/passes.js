@@ -66,10 +66,10 @@ const load = pager(async (limit, offset) => {
       [
         ["Compare", choice],
         ["Pass", (row) => element("a", { href: `/passes/${row.id}` }, row.name)],
+        ["Verdict", (row) => verdict(report[row.id])],
         ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
         ["Start", (row) => timeText(row.start)],
         ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"],
-        ["Verdict", (row) => verdict(report[row.id])],
         ["Median error, m", (row) => figure(report[row.id]?.median_error_m), "num"],
         ["Recall", (row) => figure(report[row.id]?.recall), "num"],
         ["Evidence", (row) => (report[row.id] ? `level ${report[row.id].evidence_level || "not stated"}` : "")],

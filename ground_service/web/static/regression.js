@@ -128,7 +128,7 @@ async function load() {
       [
         ["Build", buildName],
         ["Kind", (row) => row.kind],
-        ["What it is", (row) => row.description],
+        ["Description", (row) => row.description],
         ["Registered", (row) => `${timeText(row.registered)} by ${row.registered_by}`],
       ],
       builds,

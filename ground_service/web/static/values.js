@@ -47,7 +47,7 @@ function draw() {
         ["Parameter", (row) => element("span", { title: row.description }, parameterName(row.name, row.unit))],
         ["Value", (row) => `${row.text} ${unitText(row.unit)}`.trim(), "num"],
         ["Limits", (row) => (row.limit_state === "none" ? "" : [stateMark(row.limit_state), ` ${row.limits}`])],
-        ["Course", spark],
+        ["Trend", spark],
         ["Age", age],
         ["Spacecraft time", (row) => timeText(row.time)],
       ],

@@ -592,6 +592,8 @@ def test_an_activity_carries_the_octets_of_its_telecommand(
         "octets": DICTIONARY.pack_command("insert_activity", arguments, sequence_count=1),
     }  # fmt: skip
     assert {name: getattr(carrier, name) for name in expected} == expected
+    released = [get_command(ground, key).telecommand.release for key in (outer, outer - 1)]
+    assert released == ["1999-12-31T23:59:29.000000Z", None]  # 2000-01-01 TAI, and 1 s
     clock(NOW + 9)
     assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="bob")[1] == [outer]
     # What is inside is sent with its carrier.

@@ -245,10 +245,10 @@ def openmct(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Pictures:
-    """Pictures of the pages in 256 colours, in the folder that LINNA_PICTURES names, otherwise in that of a test."""
+    """Pictures of the pages in 256 colours; documented ones are kept in the folder that LINNA_PICTURES names."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = Path(os.environ.get("LINNA_PICTURES") or folder)
+    def __init__(self, folder: Path, *, documented: bool = True) -> None:
+        self.folder = Path((documented and os.environ.get("LINNA_PICTURES")) or folder)
 
     def take(self, page: Page, name: str, part: str = "body") -> None:
         """Take the upper 800 px of a part of the page."""

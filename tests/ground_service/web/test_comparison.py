@@ -161,6 +161,9 @@ def test_the_report_of_a_pass_has_the_word_of_the_list(view):
     settled(view, "/passes")
     line = view.locator("#passes tbody tr").filter(has=view.locator('a[href="/passes/1"]'))
     word = line.locator(".state").inner_text()
+    view.set_viewport_size({"width": 390, "height": 844})
+    box = line.locator(".state").bounding_box()
+    assert box["x"] + box["width"] < 390.0  # seen without scrolling the table
     with view.expect_popup() as opened:
         line.get_by_role("link", name="open").click()
     expect(opened.value.locator(".verdict .word")).to_have_text(f"Verdict: {word}")

@@ -93,6 +93,60 @@ def test_a_telephone_scrolls_wide_tables_rather_than_break_words(page):
     assert cell.locator("a").bounding_box()["height"] < 30.0  # one line
 
 
+def test_marks_of_a_legend_stay_with_their_text_on_a_telephone(page):
+    page.set_viewport_size({"width": 390, "height": 844})
+    for path in ("/commands", "/live"):
+        settled(page, path)
+        loose, heights = page.evaluate(
+            """() => {
+                const [legend] = document.querySelectorAll(".legend:has(.light, .key)");
+                const loose = [...legend.childNodes].filter((one) => one.nodeType === 3 && one.textContent.trim());
+                return [loose.length, [...legend.children].map((one) => one.getBoundingClientRect().height)];
+            }"""
+        )
+        assert loose == 0 and len(heights) == 3 and max(heights) < 30.0, path
+
+
+def pixels_of(page, colour):
+    """Number of pixels of the first chart that have a colour, "#rrggbb"."""
+    return page.evaluate(
+        """colour => {
+            const canvas = document.querySelector(".chart canvas");
+            const found = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+            const [red, green, blue] = [1, 3, 5].map((start) => parseInt(colour.slice(start, start + 2), 16));
+            let count = 0;
+            for (let at = 0; at < found.length; at += 4)
+                count += found[at] === red && found[at + 1] === green && found[at + 2] === blue;
+            return count;
+        }""",
+        colour,
+    )
+
+
+def test_the_grid_of_a_chart_follows_a_change_of_the_colours(page):
+    light, dark = "#e3e7ec", "#2c343e"  # --grid
+    settled(page, "/passes/1")
+    answered(page)
+    expect(page.locator(".chart canvas").first).to_be_visible()
+    wait_until(lambda: pixels_of(page, light) > 500, "the grid is not drawn")
+    assert pixels_of(page, dark) == 0
+    page.emulate_media(color_scheme="dark")
+    wait_until(lambda: pixels_of(page, dark) > 500, "the grid has the colour of the light scheme")
+    assert pixels_of(page, light) == 0
+    page.emulate_media(color_scheme="light")
+
+
+def test_small_figures_have_a_power_of_ten_and_zero_has_none(page):
+    page.goto("/licences")
+    found = page.evaluate(
+        """async () => {
+            const { figure } = await import("/static/page.js");
+            return [0, 4.51e-11, -2e-5, 0.00012, 0.5].map((value) => figure(value));
+        }"""
+    )
+    assert found == ["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5"]
+
+
 def test_passes_are_searched_and_show_their_verdict(page):
     job = page.request.post("/api/v1/passes/1/reports").json()["id"]
     deadline = time.monotonic() + 60
@@ -296,7 +350,7 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
     expect(page.locator("#state")).to_have_text("connected")
     for message in live_frames:
         console.say(message)
-    expect(page.locator("#numbers")).to_contain_text("fixed, 84 m off")
+    expect(page.locator("#numbers")).to_contain_text("fixed, error 84 m")
     expect(page.locator("#log")).to_contain_text("medium: image dark: mean grey level 1")
     expect(page.get_by_label("chart: distance from the reference, m")).to_be_visible()
     grey = page.evaluate(

@@ -107,7 +107,15 @@ def test_events_of_all_passes_are_filtered_in_the_address(page):
     expect(page.locator("#events")).to_contain_text("No event matches.")
 
 
-def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
+NOTE_ZOOMS = """
+window.zooms = 0;
+new MutationObserver(() => { window.zooms += document.querySelectorAll(".leaflet-zoom-anim").length; })
+    .observe(document, { subtree: true, attributeFilter: ["class"] });
+"""
+
+
+def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page, tmp_path):
+    page.add_init_script(NOTE_ZOOMS)
     settled(page, "/passes/1")
     expect(page.locator("#terrain")).to_contain_text("Terrain:")
     expect(page.locator("#terrain")).to_contain_text("craters of the catalogue of the pass")
@@ -116,6 +124,8 @@ def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
         re.compile("bare")
     )  # no picture of the Moon under other terrain
     expect(page.locator("#map img")).to_have_count(0)
+    Pictures(tmp_path).take(page, "pass-map", "section[aria-labelledby=map-title]")
+    assert page.evaluate("window.zooms") == 0  # drawn at its scale at once, not blurred by an animation
     page.locator("#map-legend").get_by_label("spherical").uncheck()
     expect(page.locator("#map-legend").get_by_label("spherical")).not_to_be_checked()
 

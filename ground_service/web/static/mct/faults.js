@@ -1,8 +1,9 @@
 // Alarms of the service as faults: acknowledge and shelve them.
 import { get, send } from "../api.js";
 import { parameterName, unitText } from "../units.js";
-import { listen } from "./feed.js";
+import { followNewest, listen, newest } from "./feed.js";
 
+const AGAIN_MS = 1000; // shortest time between two updates of the list because of new values
 const MINUTE_MS = 60_000;
 const HOUR_MS = 60 * MINUTE_MS;
 const DAY_MS = 24 * HOUR_MS;
@@ -18,16 +19,28 @@ const ANY_CHANGE = "alarms";
 
 const packets = (count) => `${count} packet${count === 1 ? "" : "s"}`;
 
-// Severity and side of a value outside its limits.
-function valueInfo(alarm) {
-  if (alarm.value === null) return { value: packets(alarm.count), rangeCondition: "", monitoringResult: "IN_LIMITS" };
+// Value with severity and side: a severity of a value within its limits is neither "warning" nor "alarm".
+function valueInfo(alarm, value, severity) {
+  const text = `${Number(value.toPrecision(6))} ${unitText(alarm.unit)}`.trim();
+  if (severity !== "alarm" && severity !== "warning") return { value: text, rangeCondition: "", monitoringResult: "IN_LIMITS" };
   const low = Number(alarm.limits.split(" to ")[0]);
-  const result = alarm.severity === "alarm" ? "CRITICAL" : "WARNING";
-  return { value: `${Number(alarm.value.toPrecision(6))} ${unitText(alarm.unit)}`.trim(), rangeCondition: alarm.value < low ? "LOW" : "HIGH", monitoringResult: result };
+  return { value: text, rangeCondition: value < low ? "LOW" : "HIGH", monitoringResult: severity === "alarm" ? "CRITICAL" : "WARNING" };
 }
 
-function faultOf(alarm) {
-  const trigger = valueInfo(alarm);
+const withoutLimits = (value) => ({ value, rangeCondition: "", monitoringResult: "IN_LIMITS" });
+
+// Value in the last packet with the condition, and value in the newest packet.
+function triggerOf(alarm) {
+  return alarm.value === null ? withoutLimits(packets(alarm.count)) : valueInfo(alarm, alarm.value, alarm.severity);
+}
+
+function currentOf(alarm, values) {
+  if (alarm.source === "event") return withoutLimits(alarm.active ? packets(alarm.count) : "ended");
+  const found = values.find((one) => one.packet === "housekeeping" && one.name === alarm.name);
+  return found ? valueInfo(alarm, found.value, found.limit_state) : withoutLimits("unknown");
+}
+
+function faultOf(alarm, values) {
   const limits = alarm.limits ? `, limits ${alarm.limits} ${unitText(alarm.unit)}` : "";
   return {
     type: ANY_CHANGE,
@@ -41,17 +54,44 @@ function faultOf(alarm) {
       shelved: alarm.state === "shelved",
       shortDescription: `${packets(alarm.count)}${limits}${alarm.active ? "" : ", condition ended"}`,
       triggerTime: `${alarm.last.slice(0, 10)} ${alarm.last.slice(11, 19)}Z`,
-      triggerValueInfo: trigger,
-      currentValueInfo: alarm.active ? trigger : { ...trigger, value: "ended", monitoringResult: "IN_LIMITS" },
+      triggerValueInfo: triggerOf(alarm),
+      currentValueInfo: currentOf(alarm, values),
     },
   };
 }
 
 export function installFaults(openmct, session) {
   const changed = new Set();
-  let asked = null; // the last request: the answer of an earlier one may come after its answer
+  let asked = null; // the last request of the alarms, null once they have changed: an earlier answer is out of date
   const notify = () => changed.forEach((callback) => callback(CHANGED));
-  listen("alarm", notify);
+  const alarmsChanged = () => {
+    asked = null;
+    notify();
+  };
+  listen("alarm", alarmsChanged);
+
+  // Newest values of the spacecraft with alarms: the list is shown again when they change.
+  const known = new Map();
+  const keyOf = (alarm) => `${alarm.spacecraft_id} ${alarm.instance}`;
+  let due = null;
+  const valuesChanged = () => {
+    due ??= setTimeout(() => {
+      due = null;
+      notify();
+    }, AGAIN_MS);
+  };
+  async function readValues(alarm) {
+    const key = keyOf(alarm);
+    if (known.has(key)) return;
+    known.set(key, []);
+    const warn = (error) => console.warn(`newest values: ${error.message}`);
+    const take = (values) => {
+      known.set(key, values);
+      valuesChanged();
+    };
+    await newest(alarm).then((values) => known.set(key, values), warn);
+    followNewest(alarm, take, warn);
+  }
 
   async function act(fault, path, json) {
     try {
@@ -59,22 +99,27 @@ export function installFaults(openmct, session) {
     } catch (error) {
       openmct.notifications.error(`Alarm ${fault.name}: ${error.message}`);
     }
-    notify();
+    alarmsChanged();
   }
   const provider = {
     supportsRequest: (object) => object.type === "faultManagement",
     supportsSubscribe: (object) => object.type === "faultManagement",
     async request() {
-      asked = get("alarms", { state: ["raised", "acknowledged", "shelved"], limit: 1000 });
       let found = null;
-      for (let answered = null; answered !== asked; ) {
-        answered = asked;
+      for (let answered = null; answered === null || answered !== asked; ) {
+        answered = asked ??= get("alarms", { state: ["raised", "acknowledged", "shelved"], limit: 1000 });
+        const ended = answered;
+        ended.catch(() => {
+          if (asked === ended) asked = null;
+        });
         found = await answered;
       }
-      return found.items.map(faultOf);
+      await Promise.all(found.items.filter((one) => one.source === "parameter").map(readValues));
+      return found.items.map((one) => faultOf(one, known.get(keyOf(one)) ?? []));
     },
     subscribe(_object, callback) {
       changed.add(callback);
+      asked = null;
       callback(CHANGED);
       return () => changed.delete(callback);
     },

@@ -3,6 +3,8 @@ import { addExtra, extraIdentifier, parameterIdentifier, parametersOf } from "./
 import { newest } from "./feed.js";
 
 const HIDDEN = { type: true, WARNING: true, CRITICAL: true }; // columns
+// Colours of lines, with a contrast of 3 on the backgrounds of both themes.
+const COLOURS = ["#1b83c4", "#cf5f1a", "#16905a"];
 const FAULTS = { namespace: "faults.taxonomy", key: "faultManagement.view" };
 
 // Identifiers of the parameters that a spacecraft has; names: a list, or a function of the spacecraft that gives one.
@@ -19,7 +21,7 @@ function addTable(kind, name, names) {
 function addPlot(kind, name, names) {
   const make = async (spacecraft) => {
     const composition = await values(spacecraft, names);
-    return { type: "telemetry.plot.stacked", name, composition, configuration: { series: composition.map((identifier) => ({ identifier })), yAxis: {}, xAxis: {} } };
+    return { type: "telemetry.plot.stacked", name, composition, configuration: { series: composition.map((identifier, index) => ({ identifier, series: { color: COLOURS[index % COLOURS.length] } })), yAxis: {}, xAxis: {} } };
   };
   addExtra(kind, make, false);
 }

@@ -59,6 +59,14 @@ function installIndicators(session) {
   openmct.indicators.add(home);
 }
 
+// Open MCT 4.2 multiplies the opacity of its colours twice, so that translucent marks of annotations are pale on a light
+// background. Opacity adds up with its own factor.
+function correctOpacity() {
+  WebGLRenderingContext.prototype.blendFunc = function (source, destination) {
+    this.blendFuncSeparate(source, destination, this.ONE, destination);
+  };
+}
+
 async function start() {
   const session = await get("session");
   const spacecraft = (await allSpacecraft())[0];
@@ -83,6 +91,7 @@ async function start() {
   installIndicators(session);
   // Without an object in the address: the layout of a shift.
   if (spacecraft && !location.hash) location.hash = `${addressOf(spacecraft, SHIFT)}?hideInspector=true`;
+  correctOpacity();
   openmct.on("start", () => performance.mark("linna-started"));
   openmct.start(document.body.firstElementChild);
 }
