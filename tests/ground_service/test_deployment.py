@@ -383,6 +383,25 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() ->
         assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
 
 
+def test_the_documented_reload_names_the_configuration_of_the_proxy() -> None:
+    """The default configuration of nginx names another file with the number of the process."""
+    program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
+    reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
+    assert reload in (ROOT / "docs/deployment.md").read_text()
+    assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]
+
+
+def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -> None:
+    text = (ROOT / "docs/deployment.md").read_text()
+    (volume, folder) = re.findall(r"--volume linna_(\w+):(/\w+):ro worker db restore /\w+/", text)[0]
+    assert COMPOSE["name"] == "linna" and volume in COMPOSE["volumes"]
+    assert f"{volume}:{folder}" in SERVICES["backup"]["volumes"]
+    assert "--no-deps --entrypoint linna migrate db upgrade\n" in text
+    # The worker writes the archive and has the role of the service, the migration that of the owner.
+    assert "archive:/var/lib/linna" in SERVICES["worker"]["volumes"]
+    assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
+
+
 def test_there_is_a_second_worker_and_a_second_scheduler() -> None:
     assert SERVICES["scheduler"]["scale"] == 2 and default_of(SERVICES["worker"]["scale"]) == "2"
     assert SERVICES["scheduler"]["command"] == ["scheduler"]
