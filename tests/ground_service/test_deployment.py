@@ -402,6 +402,19 @@ def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -
     assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
 
 
+def test_the_documented_base_backup_with_failover_signs_in_as_the_servers_permit() -> None:
+    text = (ROOT / "docs/deployment.md").read_text()
+    ((secret, hosts, user),) = re.findall(
+        r'PGPASSWORD="\$\(cat /run/secrets/(\w+)\)" \\\n +sh /linna/base-backup.sh --dbname "host=(\S+) user=(\w+) ',
+        text,
+    )
+    assert set(hosts.split(",")) == {name for name in ADDED if name.startswith("db")}
+    assert all(secret in ADDED[name]["secrets"] for name in hosts.split(","))
+    rules = yaml.safe_load((ROOT / "deploy/failover/patroni.yml").read_text())["postgresql"]["pg_hba"]
+    assert f"host replication {user} all scram-sha-256" in rules
+    assert not [rule for rule in rules if rule.startswith("local")]
+
+
 def test_there_is_a_second_worker_and_a_second_scheduler() -> None:
     assert SERVICES["scheduler"]["scale"] == 2 and default_of(SERVICES["worker"]["scale"]) == "2"
     assert SERVICES["scheduler"]["command"] == ["scheduler"]
