@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from linna import cli
-from studies.mission_run.comparison import OF_PROCESSES, compare_reports
+from studies.mission_run.comparison import OF_PROCESSES, compare_reports, largest_relative
 from studies.mission_run.processes import judged_memory
 
 REPORT: dict[str, Any] = {
@@ -42,7 +42,31 @@ def test_figures_of_processes_and_the_wall_clock_are_not_compared() -> None:
     )
     assert {"starts", "wall_s", "cpu_s", "memory_mib", "incidents", "kills"} <= OF_PROCESSES
     values, differences = compare_reports(REPORT, other)
-    assert differences == [] and values == 14
+    assert differences == [] and values == 12
+
+
+def test_a_window_is_the_same_whatever_number_a_database_gave_it() -> None:
+    rows = copy.deepcopy(REPORT["trend"])
+    rows[0]["window"] = 34
+    assert compare_reports(REPORT, changed(trend=rows))[1] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "largest"),
+    [
+        ({}, 0.0),
+        ({"detector": {"recall": 0.4}}, 0.2),
+        ({"detector": {"recall": 0.4}, "navigation": {"anchored": {"passes": 1.0, "median_m": 112.192621}}}, 0.5),
+        ({"detector": {"recall": 0.4}, "packets": 3092}, None),
+        ({"detector": {"recall": float("nan")}}, None),
+        ({"detector": {}}, None),
+    ],
+)
+def test_the_largest_relative_difference_is_that_of_numbers_only(
+    changes: dict[str, Any], largest: float | None
+) -> None:
+    found = largest_relative(compare_reports(REPORT, changed(**changes))[1])
+    assert found == pytest.approx(largest) if largest is not None else found is None
 
 
 @pytest.mark.parametrize(
@@ -89,8 +113,13 @@ def test_the_command_compares_folders_and_files_and_says_whether_they_are_identi
     file.write_text(json.dumps(changed(wall_s=672.3, starts=2, kills={"done": 14})))
     assert cli.run(["mission", "compare", str(folder), str(file)]) == 0
     text = capsys.readouterr().out
-    assert text.endswith("14 values compared, 0 differ\n")
+    assert text.endswith("12 values compared, 0 differ\n")
     assert "anchored median_m" in text and "672.3" in text and 'kills of the second run: {"done": 14}' in text
+    numbers = {"anchored": {"passes": 2.0, "median_m": 112.192733}}
+    file.write_text(json.dumps(changed(navigation=numbers)))
+    assert cli.run(["mission", "compare", str(folder), str(file)]) == 1
+    end = "12 values compared, 1 differ, all of them numbers, by at most 1.0e-06 of their value\n"
+    assert capsys.readouterr().out.endswith(end)
     file.write_text(json.dumps(changed(packets=1)))
     assert cli.run(["mission", "compare", str(folder), str(file), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)

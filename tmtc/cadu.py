@@ -9,7 +9,8 @@ the frames between are kept as well; their code or checksum decides whether they
 Markers are searched at every bit, upright and inverted (a receiver may lose bits and may lock with the wrong
 polarity). A station may insert octets between CADUs, as a fixed header or a varying gap. Therefore, the distance of the
 last two frames is tried as well as the period, and an isolated frame is accepted when its marker has at most one wrong
-bit or when its code or checksum is valid.
+bit or when its code or checksum is valid. Where several places are possible, the one with a valid code or checksum is
+taken.
 
 References
 ----------
@@ -232,47 +233,73 @@ class _Synchroniser:
     def _search(self, first: int, free: int, distances: tuple[int, ...]) -> int | None:
         """Return the first bit from `first` on at which a CADU probably begins; None if there is none.
 
+        A valid code or checksum decides. Markers occur by chance as well, at the end of the stream, where no other can
+        follow, and in the headers of records, which repeat from CADU to CADU. Within the length of a CADU, one with a
+        valid code or checksum is therefore preferred to one that another marker follows, and this to an isolated one.
+
         `free`: end of the previous frame; isolated markers are accepted from this bit on.
         """
-        total = 8 * self.octets.size
         length = 8 * self.period
+        total = 8 * self.octets.size
+        followed, cut_off = _Best(), _Best()
         lone: int | None = None
         for candidates in _candidates(self.octets, first, self.tolerance, 2 * length):
             wrong, inverted = _marker_errors(self.octets, candidates)
-            confirmed = np.zeros(candidates.size, dtype=np.bool_)
-            for distance in distances:
-                confirmed |= self._follower_stands(candidates, inverted, distance)
+            has_follower, is_cut_off = self._followers(candidates, inverted, distances)
             for k in range(candidates.size):
                 at = int(candidates[k])
-                if lone is not None and at >= lone + length:
-                    return lone
-                if confirmed[k]:
-                    return at
+                begun = lone if followed.first is None else followed.first
+                if begun is not None and at >= begun + length:
+                    return lone if followed.at is None else followed.at
                 if at + length > total:
                     continue
-                if self.verify is not None:
-                    one = CaduSync(
-                        candidates[k : k + 1],
-                        inverted[k : k + 1],
-                        wrong[k : k + 1],
-                        candidates[:0],
-                        self.period,
-                    )
-                    if self.verify(one)[0]:
-                        return at
-                if lone is None and wrong[k] <= LONE_TOLERANCE and at >= free:
+                if self._is_valid(candidates[k : k + 1], inverted[k : k + 1], wrong[k : k + 1]):
+                    return at
+                if has_follower[k]:
+                    followed.offer(at, int(wrong[k]))
+                elif lone is None and wrong[k] <= LONE_TOLERANCE and at >= free:
                     lone = at
-        return lone
+                if is_cut_off[k] and (self.verify is None or at >= free):
+                    cut_off.offer(at, int(wrong[k]))
+        if followed.at is not None:
+            return followed.at
+        return cut_off.at if lone is None else lone
 
-    def _follower_stands(self, candidates: IntArray, inverted: BoolArray, distance: int) -> BoolArray:
-        """Return whether another marker of the same polarity follows at `distance`, or the stream ends before it."""
-        follower = candidates + distance
-        inside = follower + MARKER_BITS <= 8 * self.octets.size
-        result = ~inside & (candidates + 8 * self.period <= 8 * self.octets.size)
-        if inside.any():
-            wrong, turned = _marker_errors(self.octets, follower[inside])
-            result[inside] = (wrong <= self.tolerance) & (turned == inverted[inside])
-        return result
+    def _is_valid(self, start_bit: IntArray, inverted: BoolArray, wrong: IntArray) -> bool:
+        """Return whether the CADU at a start bit (1,) has a valid code or checksum; False if it has neither."""
+        if self.verify is None:
+            return False
+        return bool(self.verify(CaduSync(start_bit, inverted, wrong, start_bit[:0], self.period))[0])
+
+    def _followers(
+        self, candidates: IntArray, inverted: BoolArray, distances: tuple[int, ...]
+    ) -> tuple[BoolArray, BoolArray]:
+        """Return where another marker of the same polarity follows at one of `distances`, and where the stream ends first."""
+        stands = np.zeros(candidates.size, dtype=np.bool_)
+        cut_off = np.zeros(candidates.size, dtype=np.bool_)
+        for distance in distances:
+            follower = candidates + distance
+            inside = follower + MARKER_BITS <= 8 * self.octets.size
+            cut_off |= ~inside
+            if inside.any():
+                wrong, turned = _marker_errors(self.octets, follower[inside])
+                stands[inside] |= (wrong <= self.tolerance) & (turned == inverted[inside])
+        return stands, cut_off
+
+
+@dataclass(slots=True)
+class _Best:
+    """The start bit with the fewest wrong bits among those offered, the first of equals; `first`: the first offered."""
+
+    first: int | None = None
+    at: int | None = None
+    wrong: int = MARKER_BITS
+
+    def offer(self, at: int, wrong: int) -> None:
+        if self.first is None:
+            self.first = at
+        if wrong < self.wrong:
+            self.at, self.wrong = at, wrong
 
 
 def _candidates(octets: OctetArray, first: int, tolerance: int, stretch: int) -> Iterator[IntArray]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,7 @@ def comparison(first: Path, second: Path) -> dict[str, Any]:
         "runs": [str(first), str(second)],
         "values": values,
         "differences": [asdict(one) for one in differences],
+        "largest_relative": largest_relative(differences),
         "figures": _side_by_side(reports, "compared"),
         "not_compared": _side_by_side(reports, "not compared"),
         "kills": [one.get("kills") for one in reports],
@@ -94,12 +96,34 @@ def described(found: Mapping[str, Any]) -> str:
         lines.append(f"{one['figure']}: {one['first']} in the first run, {one['second']} in the second")
     if len(differences) > SHOWN_LIMIT:
         lines.append(f"... and {len(differences) - SHOWN_LIMIT} more")
-    lines.append(f"{found['values']} values compared, {len(differences)} differ")
+    largest = found["largest_relative"]
+    by = f", all of them numbers, by at most {largest:.1e} of their value" if differences and largest is not None else ""
+    lines.append(f"{found['values']} values compared, {len(differences)} differ{by}")
     return "\n".join(lines)
 
 
 def _compared(report: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in report.items() if name not in OF_PROCESSES}
+    """Return what is compared; windows are told apart by their start, not by the number that a database gave them."""
+    kept = {name: value for name, value in report.items() if name not in OF_PROCESSES}
+    rows = kept.get("trend")
+    if isinstance(rows, list):
+        kept["trend"] = [
+            {key: value for key, value in row.items() if key != "window"} if isinstance(row, dict) else row
+            for row in rows
+        ]
+    return kept
+
+
+def largest_relative(differences: Sequence[Difference]) -> float | None:
+    """Return the largest difference of two numbers relative to the larger one; None if other values differ."""
+    largest = 0.0
+    for one in differences:
+        if type(one.first) is not float or type(one.second) is not float:
+            return None
+        if not (math.isfinite(one.first) and math.isfinite(one.second)):
+            return None
+        largest = max(largest, abs(one.first - one.second) / max(abs(one.first), abs(one.second)))
+    return largest
 
 
 def _values(name: str, value: Any) -> Iterator[tuple[str, Any]]:

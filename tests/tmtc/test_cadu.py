@@ -163,3 +163,57 @@ def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_p
 def test_the_period_is_told_from_the_whole_stream_however_long_the_noise_before_it():
     noise = np.random.default_rng(7).integers(0, 256, 5_000_000, dtype=np.uint8)
     assert find_period(np.concatenate((noise, stream_of(40)))) == PERIOD
+
+
+def header_with_a_likeness(wrong_bits: int, *, inverted: bool) -> np.ndarray:
+    """A record header of 8 octets with a marker of `wrong_bits` wrong bits that begins within an octet."""
+    bits = np.zeros(64, dtype=np.uint8)
+    likeness = np.unpackbits(np.frombuffer(ASM, dtype=np.uint8)) ^ np.uint8(inverted)
+    likeness[-wrong_bits:] ^= 1
+    bits[21:53] = likeness
+    return np.packbits(bits)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 12])
+@pytest.mark.parametrize("is_checked", [False, True])
+def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(count, inverted, is_checked):
+    header = header_with_a_likeness(3, inverted=inverted)
+    stream = np.hstack((np.tile(header, (count, 1)), stream_of(count).reshape(-1, PERIOD))).reshape(-1)
+    expected = [(PERIOD + 8) * k + 8 for k in range(count)]
+    verify = (lambda sync: np.isin(sync.start_bits, 8 * np.array(expected))) if is_checked else None
+    sync = synchronise(stream, PERIOD, verify=verify, record_octets=8)
+    assert sync.offsets.tolist() == expected
+    assert not sync.inverted.any()
+
+
+def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow():
+    header = np.concatenate((np.frombuffer(ASM, dtype=np.uint8), np.zeros(4, dtype=np.uint8)))
+    frames = stream_of(12).reshape(-1, PERIOD)
+    frames[:, 3] ^= 0b00000101
+    stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
+    expected = [(PERIOD + 8) * k + 8 for k in range(12)]
+    sync = synchronise(
+        stream, PERIOD, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=header.size
+    )
+    assert sync.offsets.tolist() == expected
+
+
+def test_a_likeness_in_the_last_frame_does_not_cost_the_frame():
+    stream = stream_of(3)
+    likeness = np.frombuffer(ASM, dtype=np.uint8).copy()
+    likeness[3] ^= 0b00000111
+    stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = likeness
+    # the stream goes on for most of a frame, whose marker and the rest are damaged
+    stream = np.concatenate((stream, np.zeros(PERIOD - 1, dtype=np.uint8)))
+    valid = [0, PERIOD, 2 * PERIOD]
+    sync = synchronise(stream, PERIOD, verify=lambda sync: np.isin(sync.offsets, valid))
+    assert sync.offsets.tolist() == valid
+    assert sync.truncated.size == 0
+
+
+def test_the_last_frame_with_a_damaged_marker_is_kept_with_or_without_a_check():
+    stream = np.concatenate((np.full(40, 0xAA, dtype=np.uint8), stream_of(1)))
+    stream[43] ^= 0b00000111
+    assert starts(stream) == [40]
+    assert starts(stream, verify=lambda sync: np.zeros(sync.offsets.size, dtype=np.bool_)) == [40]
