@@ -56,7 +56,13 @@ def test_a_window_is_the_same_whatever_number_a_database_gave_it() -> None:
     [
         ({}, 0.0),
         ({"detector": {"recall": 0.4}}, 0.2),
-        ({"detector": {"recall": 0.4}, "navigation": {"anchored": {"passes": 1.0, "median_m": 112.192621}}}, 0.5),
+        (
+            {
+                "detector": {"recall": 0.4},
+                "navigation": {"anchored": {"passes": 1.0, "median_m": 112.192621}},
+            },
+            0.5,
+        ),
         ({"detector": {"recall": 0.4}, "packets": 3092}, None),
         ({"detector": {"recall": float("nan")}}, None),
         ({"detector": {}}, None),

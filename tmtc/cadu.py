@@ -274,7 +274,7 @@ class _Synchroniser:
     def _followers(
         self, candidates: IntArray, inverted: BoolArray, distances: tuple[int, ...]
     ) -> tuple[BoolArray, BoolArray]:
-        """Return where another marker of the same polarity follows at one of `distances`, and where the stream ends first."""
+        """Return where a marker of the same polarity follows at one of `distances`, and where the stream ends first."""
         stands = np.zeros(candidates.size, dtype=np.bool_)
         cut_off = np.zeros(candidates.size, dtype=np.bool_)
         for distance in distances:

@@ -97,7 +97,9 @@ def described(found: Mapping[str, Any]) -> str:
     if len(differences) > SHOWN_LIMIT:
         lines.append(f"... and {len(differences) - SHOWN_LIMIT} more")
     largest = found["largest_relative"]
-    by = f", all of them numbers, by at most {largest:.1e} of their value" if differences and largest is not None else ""
+    by = ""
+    if differences and largest is not None:
+        by = f", all of them numbers, by at most {largest:.1e} of their value"
     lines.append(f"{found['values']} values compared, {len(differences)} differ{by}")
     return "\n".join(lines)
 
