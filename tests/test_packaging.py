@@ -1,5 +1,6 @@
 """Wheel and source distribution: complete, and usable from another folder without the checkout."""
 
+import importlib.metadata
 import os
 import re
 import shlex
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import urllib.request
 import venv
 import zipfile
@@ -15,6 +17,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 from tests.ground_service.conftest import free_port, wait_for
 
@@ -54,6 +58,28 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return folder
+
+
+def test_every_pinned_package_runs_on_the_oldest_python_that_the_project_states() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    oldest = project["requires-python"].removeprefix(">=") + ".0"
+    pins = {
+        Requirement(line).name
+        for path in (ROOT / "requirements").glob("*.txt")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if "==" in line and not line.startswith("#")
+    }
+    refused, judged = [], 0
+    for name in sorted(pins):
+        try:
+            found = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        judged += 1
+        needs = found.metadata.get("Requires-Python")
+        if needs and oldest not in SpecifierSet(needs):
+            refused.append(f"{name} {found.version}: {needs}")
+    assert judged > 50 and refused == []
 
 
 @pytest.mark.slow
