@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
 import json
 import os
 import selectors
@@ -158,6 +159,7 @@ class Service:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
         self.secrets = [str(folder / name) for name in texts]
+        self.secrets_sha256 = sorted({hashlib.sha256(text.encode()).hexdigest() for text in texts.values()})
         self.decoys = Decoys(folder)
         self.process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", f"import time; secret = {SECRET!r}; time.sleep(3600)"],
@@ -208,6 +210,7 @@ def write_build(folder: Path, kind: str, service: Service, leftover: str, writab
         "marker": SECRET,
         "leftover": leftover,
         "secrets": service.secrets,
+        "secrets_sha256": service.secrets_sha256,
         "writable": [*service.secrets, *map(str, writable)],
         "victims": [service.process.pid, os.getpid()],
         "ports": service.decoys.ports,

@@ -8,6 +8,7 @@ and the campaign checks its effect from outside.
 
 import contextlib
 import ctypes
+import hashlib
 import json
 import os
 import pathlib
@@ -113,9 +114,11 @@ def walk_for_targets():
     skipped = ("/proc", "/sys", "/usr", sys.prefix, sys.base_prefix)
     for where, folders, names in os.walk("/"):
         folders[:] = [name for name in folders if os.path.join(where, name) not in skipped]
-        found = wanted & set(names)
-        if found:
-            return f"{where}: {found}"
+        for name in sorted(wanted & set(names)):
+            # archives of the user of the machine have such names as well
+            with contextlib.suppress(OSError), open(os.path.join(where, name), "rb") as stream:
+                if hashlib.sha256(stream.read(1 << 16)).hexdigest() in TARGETS["secrets_sha256"]:
+                    return f"{where}: {name}"
     return ""
 
 
