@@ -17,6 +17,7 @@ import io
 import pickle
 import re
 from collections.abc import Callable, Mapping
+from enum import Enum
 from pathlib import Path
 from types import MappingProxyType, MethodType
 from typing import Any
@@ -141,6 +142,9 @@ class _Pickler(pickle.Pickler):
     def reducer_override(self, obj: object) -> Any:
         if isinstance(obj, MappingProxyType):
             return _proxy, (dict(obj),)
+        if isinstance(obj, Enum):
+            # The first releases of Python 3.11 name members by getattr, which a snapshot may not call.
+            return type(obj), (obj.value,)
         if isinstance(obj, MethodType) and isinstance(obj.__self__, Trajectory):
             return _state_of, (obj.__self__,)
         if not isinstance(obj, np.ndarray) or not isinstance(obj.base, np.ndarray):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 import warnings
@@ -40,7 +41,9 @@ def generated(service: TestClient, tmp_path_factory: pytest.TempPathFactory) -> 
         "--path", str(folder / "openapi.json"), "--output-path", str(folder / PACKAGE), "--meta", "none",
         "--fail-on-warning",
     ]  # fmt: skip
-    made = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    # The generator calls ruff, which lies beside it.
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    made = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stdout + made.stderr
     sys.path.insert(0, str(folder))
     yield folder / PACKAGE

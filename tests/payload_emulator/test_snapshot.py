@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import RecordError
+from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.snapshot import (
     _view,
     load_snapshot,
@@ -35,6 +36,19 @@ def test_views_stay_views_of_their_memory() -> None:
 def test_read_only_mappings_stay_read_only() -> None:
     found = unpack_snapshot(pack_snapshot("a", {"given": MappingProxyType({"one": 1})}, {}), "a", {})
     assert found["given"] == {"one": 1} and isinstance(found["given"], MappingProxyType)
+
+
+def test_members_of_enumerations_are_kept_by_value_whatever_the_release_of_python(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def by_name(self: PayloadMode, _protocol: int) -> tuple[object, ...]:
+        return getattr, (type(self), self.name)
+
+    # as Python 3.11.0 to 3.11.3 do
+    monkeypatch.setattr(PayloadMode, "__reduce_ex__", by_name)
+    mode = list(PayloadMode)[-1]
+    found = unpack_snapshot(pack_snapshot("a", {"mode": mode, "modes": [mode]}, {}), "a", {})
+    assert found == {"mode": mode, "modes": [mode]} and found["mode"] is mode
 
 
 def test_known_objects_are_those_of_the_reader() -> None:
