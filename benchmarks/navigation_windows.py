@@ -2,7 +2,7 @@
 
 Frames of several windows are rendered and searched once; then each variant of catalogue and filter runs on the same
 detections (level 3s on tuning terrain, level 3 on the strip and the block that no detector was trained on).
-Parameters of the filter were chosen on `tuning` only.
+Parameters of the filter were chosen on `tuning` only; the height of the craters also on `training`.
 
 - `list`: the crater list as published, filter as before.
 - `constant`: the list 59 m farther north, which was the constant of former versions.
@@ -14,7 +14,8 @@ The filter as before has a pixel bias of 0.25 px (1 sigma) and a catalogue offse
 variants have the craters at the mean height of their rims, too.
 
 A second table compares the shipped filter with the smoother of the ground (`--smoother`), a third shows the filter with
-attitudes that are noisier than declared (`--attitude-noise-deg`).
+attitudes that are noisier than declared (`--attitude-noise-deg`). `--crater-height` fits the height at which the
+network sees the centres of craters, from which the height of the craters on board follows.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ import numpy as np
 
 from linna.data import data_folder
 from lunar.datafolder import default_orientation
+from payload_emulator.flight.models import DEFAULT_NETWORK
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.session.loading import SEEN_BELOW_RIM_M
 from payload_emulator.session.scenario import Scenario, load_scenario
+from studies.crater_heights import fit_height, sightings
 from studies.navigation_windows import (
     Recording,
     SmootherRow,
@@ -53,6 +56,7 @@ from tmtc.tables import CatalogueTable, unpack_catalogue_table
 # Name, west, east, south, north (degrees), windows, direction, seed.
 PLACES = {
     "tuning": (("tuning", 315.0, 330.0, -60.0, 60.0, 5, "ascending", 3040),),
+    "training": (("training", 300.0, 315.0, -60.0, 60.0, 3, "descending", 3043),),
     "test": (
         ("strip-up", 285.0, 300.0, -60.0, 60.0, 6, "ascending", 2041),
         ("strip-down", 285.0, 300.0, -60.0, 60.0, 5, "descending", 2042),
@@ -69,6 +73,12 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument(
         "--recordings", type=Path, required=True, help="folder of recordings, made where missing"
     )
+    parser.add_argument(
+        "--network",
+        default=DEFAULT_NETWORK,
+        metavar="NAME|FILE",
+        help="network of new recordings: a shipped one or an ONNX file (default: craters)",
+    )
     parser.add_argument("--smoother", action="store_true", help="only the table of the smoother")
     parser.add_argument(
         "--attitude-noise-deg",
@@ -78,13 +88,22 @@ def main(words: Sequence[str]) -> int:
         help="only the table of attitudes with this noise in addition to the declared 0.01 degrees",
     )
     parser.add_argument(
+        "--crater-height",
+        action="store_true",
+        help="only the height of the craters, fitted to true positions",
+    )
+    parser.add_argument(
         "--no-monitor", action="store_true", help="attitudes without the monitor of the attitude"
     )
     arguments = parser.parse_args(words)
     arguments.recordings.mkdir(parents=True, exist_ok=True)
-    recordings = [_recording(arguments.recordings, place) for place in PLACES[arguments.set]]
+    recordings = [
+        _recording(arguments.recordings, place, arguments.network) for place in PLACES[arguments.set]
+    ]
     if arguments.smoother:
         _print_smoother(recordings)
+    elif arguments.crater_height:
+        _print_crater_height(recordings)
     elif arguments.attitude_noise_deg:
         _print_attitudes(recordings, arguments.attitude_noise_deg, not arguments.no_monitor)
     else:
@@ -138,6 +157,23 @@ def _print_smoother(recordings: Sequence[Recording]) -> None:
             f"\n{name}: {len(pairs)} windows, root mean square {filtered:.0f} m and {smoothed:.0f} m, ratio "
             f"{filtered / smoothed:.2f}; median ratio {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
         )
+
+
+def _print_crater_height(recordings: Sequence[Recording]) -> None:
+    """Print the fitted height of seen centres against the rims, for all craters and by their depth over diameter."""
+    seen = sightings(recordings)
+    low, high = (int(f(seen.altitude_m) / 1e3) for f in (np.min, np.max))
+    print(
+        f"detections at {low} to {high} km\n\n| depth/diameter | craters | detections | height against the rim m |"
+    )
+    print("|" + "---|" * 4)
+    for name, rows in (
+        ("all", np.ones(seen.crater.size, dtype=bool)),
+        ("below 0.06", seen.depth_ratio < 0.06),
+        ("0.06 and more", seen.depth_ratio >= 0.06),
+    ):
+        fit = fit_height(seen.chosen(rows))
+        print(f"| {name} | {fit.craters:,} | {fit.detections:,} | {fit.height_m:.0f} ± {fit.sigma_m:.0f} |")
 
 
 def _print_attitudes(recordings: Sequence[Recording], noises_deg: Sequence[float], monitored: bool) -> None:
@@ -227,14 +263,14 @@ def _signed(bias_rtn_m: tuple[float, float, float]) -> str:
     return ", ".join(f"{value:.0f}" for value in bias_rtn_m)
 
 
-def _recording(folder: Path, place: tuple[Any, ...]) -> Recording:
+def _recording(folder: Path, place: tuple[Any, ...], network: str) -> Recording:
     path = folder / f"{place[0]}.npz"
     if not path.is_file():
-        save_recording(path, record(_scenario(place), data_folder(), _told))
+        save_recording(path, record(_scenario(place, network), data_folder(), _told))
     return load_recording(path)
 
 
-def _scenario(place: tuple[Any, ...]) -> Scenario:
+def _scenario(place: tuple[Any, ...], network: str) -> Scenario:
     name, west, east, south, north, passes, direction, seed = place
     scenario = load_scenario("unseen-strip")
     window = replace(
@@ -246,7 +282,8 @@ def _scenario(place: tuple[Any, ...]) -> Scenario:
         latitude_min_deg=south,
         latitude_max_deg=north,
     )
-    return replace(scenario, name=name, seed=seed, window=window)
+    detector = replace(scenario.detector, network=network)
+    return replace(scenario, name=name, seed=seed, window=window, detector=detector)
 
 
 def _told(frames: Iterable[Any], total: int) -> Iterable[Any]:

@@ -97,7 +97,7 @@ class BodyLimit:
 
         try:
             await self._app(scope, counted, watched)
-        except Exception:
+        except Exception:  # what the application makes of a body that was cut off is not its fault
             if refusal is None:
                 raise
         finally:

@@ -81,6 +81,20 @@ def _add_train(verbs: Any) -> None:
         help="choose and weigh labels by their visibility in the frame instead of their depth/diameter",
     )
     train.add_argument(
+        "--least-emphasis",
+        type=float,
+        default=0.5,
+        metavar="W",
+        help="least factor of a label's weight by diameter; 1 weighs all craters below 28 px the same (default: 0.5)",
+    )
+    train.add_argument(
+        "--rims",
+        type=Path,
+        default=None,
+        metavar="TABLE",
+        help="train on rims from `linna catalogue curate` where the table has a crater, not on the catalogue's circle",
+    )
+    train.add_argument(
         "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
     )
     add_json_flag(train)
@@ -237,6 +251,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.vision.preprocess import Preparation
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.data.feeder import TrainParameters
+    from payload_emulator.training.data.refits import load_refitted
     from payload_emulator.training.evaluate.landmarks import load_landmarks
     from payload_emulator.training.model.train import train
 
@@ -252,16 +267,19 @@ def _train(arguments: argparse.Namespace) -> int:
         replicas=arguments.replicas,
         enlarge=arguments.enlarge,
         visible_labels=arguments.visible_labels,
+        least_emphasis=arguments.least_emphasis,
         preparation=Preparation.normalise_first if arguments.normalise_first else Preparation.gray_first,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]
     landmarks = None if arguments.landmarks is None else load_landmarks(arguments.landmarks)
+    rims = None if arguments.rims is None else load_refitted(arguments.rims)
     figures = train(
         datasets,
         arguments.out,
         parameters,
         start_from=arguments.start_from,
         landmarks=landmarks,
+        rims=rims,
         report=log,
     )
     emit(arguments, figures)

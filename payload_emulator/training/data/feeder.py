@@ -21,7 +21,7 @@ LEAST_CROP_DIAMETER_PX = 8.0
 """A labelled crater that a crop shows smaller than this is ignored there."""
 
 EVEN_DIAMETER_PX = 28.0
-EMPHASIS_LIMITS = (0.5, 4.0)
+MOST_EMPHASIS = 4.0
 STAMPED_EMPHASIS = 0.6
 """Small craters outnumber large ones twenty to one; without a counterweight the network hardly learns the large."""
 
@@ -35,6 +35,8 @@ class TrainParameters:
     preparation : how RGB frames become gray; the paper's order needs a data set in colour.
     soft_labels : the weight of a label grows with its depth/diameter; else all weigh the same.
     visible_labels : labels are chosen and weighed by their visibility in the frame instead of their depth/diameter.
+    least_emphasis : least factor by which a label counts for its diameter; the factor is 1 at 28 px and grows with the
+        diameter. 1.0: all craters below 28 px count the same.
     backbone, stride_px, enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are
         shorter in the image by the enlargement.
     """
@@ -63,6 +65,7 @@ class TrainParameters:
     enlarge: int = 1
     soft_labels: bool = True
     visible_labels: bool = False
+    least_emphasis: float = 0.5
     preparation: Preparation = Preparation.gray_first
     augment: AugmentParameters = field(default_factory=AugmentParameters)
 
@@ -127,7 +130,7 @@ class Feeder:
         tier = np.where(
             inside & (crop.diameter_px >= LEAST_CROP_DIAMETER_PX / p.enlarge), tiers, Tier.IGNORE
         ).astype(np.int8)[near]
-        emphasis = np.clip(p.enlarge * crop.diameter_px / EVEN_DIAMETER_PX, *EMPHASIS_LIMITS)
+        emphasis = np.clip(p.enlarge * crop.diameter_px / EVEN_DIAMETER_PX, p.least_emphasis, MOST_EMPHASIS)
         if not p.soft_labels:
             weights = np.ones_like(weights)
         weights = weights * np.where(craters["id"] < 0, STAMPED_EMPHASIS, 1.0) * emphasis

@@ -38,8 +38,8 @@ class RefittedRims:
 def load_refitted(path: Path, east_m: float = 0.0, north_m: float = 0.0) -> RefittedRims:
     """The rims of a table that `linna catalogue curate` wrote, moved by so much.
 
-    The table is in the frame of the crater list. The terrain in the pictures may be offset from it by tens of metres:
-    by what the curation took out plus what the terrain is shifted by when it is drawn.
+    Table and pictures are both in the frame of the terrain. Data sets that were drawn before the terrain was registered
+    need a shift of tens of metres.
 
     Raises
     ------

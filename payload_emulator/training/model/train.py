@@ -29,6 +29,7 @@ from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
+from payload_emulator.training.data.refits import RefittedRims, refitted_frame
 from payload_emulator.training.evaluate.landmarks import Landmarks, with_landmarks
 from payload_emulator.training.model.curves import append_curve, draw_curves
 
@@ -57,13 +58,15 @@ def train(
     *,
     start_from: Path | None = None,
     landmarks: Landmarks | None = None,
+    rims: RefittedRims | None = None,
     train_frames: Sequence[tuple[Dataset, Frame]] | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Train (or resume) a run; the best validation figures come back.
 
-    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists, `train_frames` the frames
-    to learn from where it is not the split "train" as it stands.
+    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists, `rims` circles measured on
+    the terrain that replace those of the catalogue, `train_frames` the frames to learn from where it is not the split
+    "train" as it stands.
 
     Raises
     ------
@@ -76,7 +79,7 @@ def train(
     from payload_emulator.training.model.model import CraterNet
     from payload_emulator.training.model.restore import count_statistics
 
-    frames = _training_frames(datasets, train_frames, landmarks)
+    frames = _training_frames(datasets, train_frames, landmarks, rims)
     validation = [(d, f) for d in datasets for f in d.frames("val")]
     _check_datasets(datasets, frames, parameters)
     run.mkdir(parents=True, exist_ok=True)
@@ -102,7 +105,7 @@ def train(
         origin = _start_from(start_from, network, average)
         report(f"started from {start_from.name}")
     images = _load_images(frames, report, parameters.preparation is Preparation.normalise_first)
-    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
+    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin, rims)
     feeder = Feeder(frames, images, parameters)
     if origin is not None and start_from is not None and start_from.suffix == ".onnx":
         count_statistics(network, feeder, average)
@@ -127,9 +130,12 @@ def _training_frames(
     datasets: Sequence[Dataset],
     chosen: Sequence[tuple[Dataset, Frame]] | None,
     landmarks: Landmarks | None,
+    rims: RefittedRims | None,
 ) -> list[tuple[Dataset, Frame]]:
-    """Return the frames to learn from: the chosen ones or the split "train", with landmarks as further labels."""
+    """Return the frames to learn from: the chosen ones or the split "train", on measured rims, with landmarks."""
     frames = [(d, f) for d in datasets for f in d.frames("train")] if chosen is None else list(chosen)
+    if rims is not None:
+        frames = [(d, refitted_frame(d, f, rims)[0]) for d, f in frames]
     return frames if landmarks is None else [(d, with_landmarks(d, f, landmarks)) for d, f in frames]
 
 
@@ -486,6 +492,7 @@ def _write_run(
     replicas: int,
     device: str,
     origin: dict[str, Any] | None,
+    rims: RefittedRims | None,
 ) -> None:
     path = run / "run.json"
     if origin is None and path.is_file():
@@ -499,5 +506,6 @@ def _write_run(
         "replicas": replicas,
         "device": device,
         "started_from": origin,
+        "rims": 0 if rims is None else len(rims),
     }
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")

@@ -13,7 +13,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from payload_emulator.errors import DatasetError, ModelError  # noqa: E402
-from payload_emulator.training.data.feeder import TrainParameters  # noqa: E402
+from payload_emulator.training.data.feeder import Feeder, TrainParameters  # noqa: E402
+from payload_emulator.training.data.refits import RefittedRims  # noqa: E402
 from payload_emulator.training.evaluate.landmarks import Landmarks  # noqa: E402
 from payload_emulator.training.model import train as training  # noqa: E402
 from payload_emulator.training.model.export import load_network  # noqa: E402
@@ -142,6 +143,46 @@ def test_landmarks_are_labels_of_the_second_round(blob_dataset, tmp_path, monkey
     train([blob_dataset], tmp_path / "a", replace(SHORT, steps=1))
     train([blob_dataset], tmp_path / "b", replace(SHORT, steps=1), landmarks=landmarks)
     assert seen[1] - seen[0] == len(blob_dataset.frames("train"))
+
+
+def test_labels_are_the_rims_of_a_table(blob_dataset, tmp_path, monkeypatch):
+    """Training sees what `refitted_frame` makes of each frame, and the run says how many rims there were."""
+    moved = []
+
+    def shifted(dataset, frame, rims):
+        assert len(rims) == 1
+        craters = {**frame.craters, "u_px": frame.craters["u_px"] + 3.0}
+        moved.append(replace(frame, craters=craters))
+        return moved[-1], np.ones(craters["u_px"].size, bool)
+
+    monkeypatch.setattr(training, "refitted_frame", shifted)
+    seen = []
+    original = training.Feeder.__init__
+
+    def watched(self, frames, *rest):
+        seen.extend(frame for _, frame in frames)
+        original(self, frames, *rest)
+
+    monkeypatch.setattr(training.Feeder, "__init__", watched)
+    one = [np.array([value]) for value in (0.0, 0.0, 8_000.0, 0.0)]
+    train([blob_dataset], tmp_path, replace(SHORT, steps=1), rims=RefittedRims(np.array([3]), *one))
+    assert seen and all(frame is other for frame, other in zip(seen, moved, strict=True))
+    assert json.loads((tmp_path / "run.json").read_text())["rims"] == 1
+
+
+def test_the_weight_of_small_craters_is_bounded_below(blob_dataset):
+    """Weights grow with the diameter from the stated share on; with 1.0 small craters count as those of 28 px."""
+    frames = [(blob_dataset, frame) for frame in blob_dataset.frames("train")]
+    images = [blob_dataset.gray(frame) for _, frame in frames]
+
+    def least(share):
+        parameters = replace(SHORT, soft_labels=False, least_emphasis=share)
+        weight = Feeder(frames, images, parameters).batch(0, 24)["weight"]
+        return weight[weight > 0.0].min()
+
+    assert least(0.05) < least(0.9) < 1.0
+    assert least(0.9) == pytest.approx(0.9)
+    assert least(1.0) == pytest.approx(1.0)
 
 
 def test_a_data_set_without_training_frames_is_refused(make_blob_dataset, tmp_path):
