@@ -82,12 +82,12 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
 
 def _verdict(found: Performance) -> tuple[str, str]:
     """Return verdict and level; "met" only if every pass is judged on every requirement with a limit."""
-    bad = sum(one.not_met > 0 for one in found.requirements)
+    failed = sum(one.not_met > 0 for one in found.requirements)
     judged = [one for one in found.requirements if one.met + one.not_met]
     unknown = [one for one in found.requirements if one.limit is not None and one.unknown]
     missing = found.passes_in_span - len(found.passes)
-    if bad:
-        verdict, level = f"requirements not met in every pass: {bad} of {len(judged)} judged", "not met"
+    if failed:
+        verdict, level = f"requirements not met in every pass: {failed} of {len(judged)} judged", "not met"
     elif judged and not unknown and not missing:
         verdict, level = f"requirements met in every pass: {len(judged)} of {len(judged)} judged", "met"
     else:

@@ -32,6 +32,10 @@ _LARGEST_TANGENT, _LARGEST_ARC = 4.0, 0.2
 # number of places in the first column.
 SCORE, ROW, COLUMN, DISTANCE = range(4)
 
+# Columns of the turn from the ground that a detection sees to the camera: sine of the arc to the east, arc to the north
+# in the meridian's plane, and the length of the projection into that plane, as its inverse less one and itself.
+EAST, TURN, LONGER, LENGTH = range(4)
+
 
 class Directions(NamedTuple):
     """Directions of detections (k,): off nadir, azimuth from north over east, logarithm of diameter over depth."""
@@ -42,20 +46,28 @@ class Directions(NamedTuple):
 
 
 class SortedCraters(NamedTuple):
-    """Craters sorted by bins of rim height and by diameter inside them.
+    """Craters sorted by tiles of the map, by bins of rim height inside a tile, and by diameter inside a bin.
+
+    Votes of neighbouring craters go to neighbouring blocks. Tile by tile they stay within the cache of the processor.
 
     Attributes
     ----------
+    tile_start
+        First bin of each tile and the end of the last, (t + 1,).
     bin_start, bin_height
-        First crater of each bin (b + 1,) and its height (b,).
+        First crater of each bin and the end of the last (b + 1,), and the number of its height (b,).
+    height
+        Heights of the bins, each once (h,).
     tangent
         Of the latitude.
     longitude
         West of the map to west + 2 pi.
     """
 
+    tile_start: IntArray
     bin_start: IntArray
-    bin_height: FloatArray
+    bin_height: IntArray
+    height: FloatArray
     log_diameter: FloatArray
     latitude: FloatArray
     tangent: FloatArray
@@ -90,7 +102,8 @@ def vote(
 
     A crater seen under a known angle from a known altitude puts the camera on one place of the sphere. Each pair of
     a detection and a crater whose size fits adds the detection's weight to the four overlapping blocks about that
-    place, once per detection. The weight is the logarithm of how much rarer a chance vote is than a true one.
+    place, once per detection (and tile). The weight is the logarithm of how much rarer a chance vote is than a true
+    one.
 
     Parameters
     ----------
@@ -110,19 +123,19 @@ def vote(
     count, threshold = 0, _LOWEST_THRESHOLD
     if int(listed[0, SCORE]) == kept:
         threshold = max(threshold, int(listed[kept, SCORE]) + 1)
-    for i in range(seen.off_nadir.size):
-        weight = _weight(distance_m, radius_m, seen, i, gate, craters, blocks, weight_limit)
-        if weight < 1:
-            continue
-        for b in range(craters.bin_height.size):
-            gamma, wanted = _below_ground(distance_m, radius_m + craters.bin_height[b], seen, i)
-            if gamma < 0.0:
+    turned, pieces, votes = _pieces(distance_m, radius_m, seen, gate, craters)
+    for t in range(craters.tile_start.size - 1):
+        for i in range(votes.size):
+            weight = _weight(votes[i], blocks, weight_limit)
+            if weight < 1:
                 continue
-            first, stop = _fitting(craters, b, wanted, gate)
-            count, threshold = _cast(
-                board, at, count, threshold, weight, i, gamma, seen.azimuth[i], first, stop, craters, blocks,
-                columns_per_rad,
-            )  # fmt: skip
+            for b in range(craters.tile_start[t], craters.tile_start[t + 1]):
+                first, stop = pieces[i, b]
+                if first < stop:
+                    count, threshold = _cast(
+                        board, at, count, threshold, weight, i, turned[i, craters.bin_height[b]], first, stop,
+                        craters, blocks, columns_per_rad,
+                    )  # fmt: skip
     total = int(listed[0, SCORE])
     for k in range(count):
         value = float(int(board[at[k, 0], at[k, 1]]) >> 8)
@@ -147,31 +160,41 @@ def _below_ground(distance_m: float, radius_m: float, seen: Directions, i: int) 
 
 
 @njit
-def _fitting(craters: SortedCraters, b: int, wanted: float, gate: float) -> tuple[int, int]:
-    """Return the range of craters of a bin whose logarithm of diameter is within the gate of the wanted one."""
-    start = craters.bin_start[b]
-    piece = craters.log_diameter[start : craters.bin_start[b + 1]]
-    return start + np.searchsorted(piece, wanted - gate), start + np.searchsorted(piece, wanted + gate)
+def _pieces(
+    distance_m: float, radius_m: float, seen: Directions, gate: float, craters: SortedCraters
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return how detections turn to the camera, the craters that fit each in size, and how many these are (k,).
+
+    Turns have a row for each height and the columns `EAST` to `LENGTH`, (k, h, 4). Of each bin the first crater that
+    fits and the end are given, (k, b, 2), equal where none fits.
+    """
+    detections, heights, bins = seen.off_nadir.size, craters.height.size, craters.bin_height.size
+    turned, wanted = np.zeros((detections, heights, 4)), np.empty((detections, heights))
+    pieces, votes = np.zeros((detections, bins, 2), dtype=np.int64), np.zeros(detections, dtype=np.int64)
+    for i in range(detections):
+        for h in range(heights):
+            gamma, size = _below_ground(distance_m, radius_m + craters.height[h], seen, i)
+            wanted[i, h] = size if gamma >= 0.0 else math.nan
+            north = math.sin(gamma) * math.cos(seen.azimuth[i])
+            turned[i, h, EAST] = math.sin(gamma) * math.sin(seen.azimuth[i])
+            turned[i, h, TURN] = math.atan2(north, math.cos(gamma))
+            turned[i, h, LENGTH] = math.sqrt(math.cos(gamma) ** 2 + north * north)
+            turned[i, h, LONGER] = 1.0 / turned[i, h, LENGTH] - 1.0
+        for b in range(bins):
+            size = wanted[i, craters.bin_height[b]]
+            if math.isnan(size):
+                continue
+            start = craters.bin_start[b]
+            piece = craters.log_diameter[start : craters.bin_start[b + 1]]
+            pieces[i, b, 0] = start + np.searchsorted(piece, size - gate)
+            pieces[i, b, 1] = start + np.searchsorted(piece, size + gate)
+            votes[i] += pieces[i, b, 1] - pieces[i, b, 0]
+    return turned, pieces, votes
 
 
 @njit
-def _weight(
-    distance_m: float,
-    radius_m: float,
-    seen: Directions,
-    i: int,
-    gate: float,
-    craters: SortedCraters,
-    blocks: Blocks,
-    weight_limit: float,
-) -> int:
+def _weight(votes: int, blocks: Blocks, weight_limit: float) -> int:
     """Return the weight of each vote of a detection, from how many votes it casts; 0 where it casts none."""
-    votes = 0
-    for b in range(craters.bin_height.size):
-        gamma, wanted = _below_ground(distance_m, radius_m + craters.bin_height[b], seen, i)
-        if gamma >= 0.0:
-            first, stop = _fitting(craters, b, wanted, gate)
-            votes += stop - first
     expected = votes * 4.0 * blocks.cell * blocks.cell / blocks.area
     weight = round(2.0 * min(math.log(0.5 / max(expected, 1e-9)), weight_limit))
     return weight if votes else 0
@@ -185,8 +208,7 @@ def _cast(
     threshold: int,
     weight: int,
     i: int,
-    gamma: float,
-    azimuth: float,
+    turned: FloatArray,
     first: int,
     stop: int,
     craters: SortedCraters,
@@ -194,11 +216,7 @@ def _cast(
     columns_per_rad: FloatArray,
 ) -> tuple[int, int]:
     """Cast the votes of a detection for some craters; return the number of listed blocks and the threshold."""
-    north = math.sin(gamma) * math.cos(azimuth)
-    east = math.sin(gamma) * math.sin(azimuth)
-    length = math.sqrt(math.cos(gamma) ** 2 + north * north)
-    turn = math.atan2(north, math.cos(gamma))
-    longer = 1.0 / length - 1.0
+    east, turn, longer, length = turned
     for j in range(first, stop):
         tangent = craters.tangent[j]
         t = east * math.sqrt(1.0 + tangent * tangent)

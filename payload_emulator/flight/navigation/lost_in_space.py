@@ -36,6 +36,9 @@ _CANDIDATES_COMBINED = 12
 
 # Bins of rim height: half a bin moves a place by 350 m at the edge of the image.
 _HEIGHT_BIN_M = 400.0
+# Edge of a tile of the map: the blocks that its craters vote for fit into the second cache of a processor core.
+_TILE_RAD = math.radians(15.0)
+_TILE_FACTOR = 1_000
 # The vote leaves out places this far from any crater.
 _MARGIN_RAD = math.radians(3.0)
 # Largest natural logarithm of how much rarer a chance vote is than a true one: one detection decides nothing.
@@ -106,7 +109,7 @@ class LostParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceIndex:
-    """Craters sorted for the vote: by bins of rim height, by diameter inside them.
+    """Craters sorted for the vote: by tiles of the map, by bins of rim height in them, by diameter inside these.
 
     Attributes
     ----------
@@ -117,8 +120,10 @@ class PlaceIndex:
     """
 
     landmarks: LandmarkMap
+    tile_start: IntArray
     bin_start: IntArray
-    bin_height_m: FloatArray
+    bin_height: IntArray
+    height_m: FloatArray
     log_diameter: FloatArray
     latitude_rad: FloatArray
     tangent: FloatArray
@@ -128,9 +133,9 @@ class PlaceIndex:
     @property
     def octets(self) -> int:
         """Return the size of what is kept in addition to the map."""
-        bins = self.bin_start.nbytes + self.bin_height_m.nbytes
-        arrays = (self.log_diameter, self.latitude_rad, self.tangent, self.longitude_rad)
-        return int(bins + sum(array.nbytes for array in arrays))
+        bins = (self.tile_start, self.bin_start, self.bin_height, self.height_m)
+        craters = (self.log_diameter, self.latitude_rad, self.tangent, self.longitude_rad)
+        return int(sum(array.nbytes for array in (*bins, *craters)))
 
     def __len__(self) -> int:
         return int(self.log_diameter.size)
@@ -182,10 +187,17 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
     position = landmarks.position_mcmf_m
     radius = np.linalg.norm(position, axis=1)
     longitude = np.arctan2(position[:, 1], position[:, 0])
-    bins = np.floor((radius - MOON_RADIUS_M) / _HEIGHT_BIN_M).astype(np.int64)
     log_diameter = np.log(landmarks.diameter_m)
-    order = np.lexsort((log_diameter, bins))
-    values, first = np.unique(bins[order], return_index=True)
+    heights, height = np.unique(
+        np.floor((radius - MOON_RADIUS_M) / _HEIGHT_BIN_M).astype(np.int64), return_inverse=True
+    )
+    row, column = (
+        np.floor(part / _TILE_RAD).astype(np.int64) for part in (landmarks.latitude_rad, longitude)
+    )
+    tile = row * _TILE_FACTOR + column
+    order = np.lexsort((log_diameter, height, tile))
+    bins, first = np.unique(np.stack([tile[order], height[order]]), axis=1, return_index=True)
+    _, tiles = np.unique(bins[0], return_index=True)
     latitude = landmarks.latitude_rad
     west, width = _span(longitude)
     south = max(float(latitude.min(initial=0.0)) - _MARGIN_RAD, -0.5 * math.pi)
@@ -195,8 +207,10 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
     area = width * (math.sin(north) - math.sin(south))
     return PlaceIndex(
         landmarks,
+        np.append(tiles, bins.shape[1]).astype(np.int64),
         np.append(first, order.size).astype(np.int64),
-        (values + 0.5) * _HEIGHT_BIN_M,
+        bins[1].astype(np.int64),
+        (heights + 0.5) * _HEIGHT_BIN_M,
         log_diameter[order],
         latitude[order],
         np.tan(latitude[order]),
@@ -352,8 +366,10 @@ def _voted(
     widest = math.cos(max(south, -north, 0.0))
     smallest = math.sqrt((north - south) * width * widest / parameters.cells)
     craters = SortedCraters(
+        index.tile_start,
         index.bin_start,
-        index.bin_height_m,
+        index.bin_height,
+        index.height_m,
         index.log_diameter,
         index.latitude_rad,
         index.tangent,
