@@ -35,7 +35,7 @@ def heights(source: str) -> np.ndarray:
 def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them() -> None:
     rims = measured("LU1319381").rim_height_m
     np.testing.assert_allclose(heights("LU1319381") - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
-    # Of the order of the measured 16 and 21 m: another sign would double the error of the altitude.
+    # Of the order of the measured 16 to 23 m: another sign would double the error of the altitude.
     assert 14.0 <= SEEN_BELOW_RIM_M <= 24.0
 
 
