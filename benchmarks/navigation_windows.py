@@ -1,7 +1,7 @@
 """Navigation over windows of real terrain, with and without registration: python -m benchmarks.navigation_windows.
 
 Frames of several windows are rendered and searched once; then each variant of catalogue and filter runs on the same
-detections (level 3s on tuning terrain, level 3 on the strip and the block that no detector was trained on).
+detections (level 3s on tuning and training terrain, level 3 on the strip and the block that no detector has learned).
 Parameters of the filter were chosen on `tuning` only; the height of the craters also on `training`.
 
 - `list`: the crater list as published, filter as before.
@@ -21,6 +21,7 @@ network sees the centres of craters, from which the height of the craters on boa
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import sys
 from collections.abc import Iterable, Sequence
@@ -32,9 +33,10 @@ import numpy as np
 
 from linna.data import data_folder
 from lunar.datafolder import default_orientation
+from payload_emulator.errors import ModelError, RecordError
 from payload_emulator.flight.models import DEFAULT_NETWORK
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.session.loading import SEEN_BELOW_RIM_M
+from payload_emulator.session.loading import SEEN_BELOW_RIM_M, network_octets
 from payload_emulator.session.scenario import Scenario, load_scenario
 from studies.crater_heights import fit_height, sightings
 from studies.navigation_windows import (
@@ -77,17 +79,18 @@ def main(words: Sequence[str]) -> int:
         "--network",
         default=DEFAULT_NETWORK,
         metavar="NAME|FILE",
-        help="network of new recordings: a shipped one or an ONNX file (default: craters)",
+        help="network that searches the frames: a shipped one or an ONNX file (default: craters)",
     )
-    parser.add_argument("--smoother", action="store_true", help="only the table of the smoother")
-    parser.add_argument(
+    table = parser.add_mutually_exclusive_group()
+    table.add_argument("--smoother", action="store_true", help="only the table of the smoother")
+    table.add_argument(
         "--attitude-noise-deg",
         type=float,
         nargs="+",
         metavar="A",
         help="only the table of attitudes with this noise in addition to the declared 0.01 degrees",
     )
-    parser.add_argument(
+    table.add_argument(
         "--crater-height",
         action="store_true",
         help="only the height of the craters, fitted to true positions",
@@ -97,9 +100,13 @@ def main(words: Sequence[str]) -> int:
     )
     arguments = parser.parse_args(words)
     arguments.recordings.mkdir(parents=True, exist_ok=True)
-    recordings = [
-        _recording(arguments.recordings, place, arguments.network) for place in PLACES[arguments.set]
-    ]
+    try:
+        recordings = [
+            _recording(arguments.recordings, place, arguments.network) for place in PLACES[arguments.set]
+        ]
+    except (ModelError, RecordError) as error:
+        print(f"navigation_windows: {error}", file=sys.stderr)
+        return 2
     if arguments.smoother:
         _print_smoother(recordings)
     elif arguments.crater_height:
@@ -162,9 +169,9 @@ def _print_smoother(recordings: Sequence[Recording]) -> None:
 def _print_crater_height(recordings: Sequence[Recording]) -> None:
     """Print the fitted height of seen centres against the rims, for all craters and by their depth over diameter."""
     seen = sightings(recordings)
-    low, high = (int(f(seen.altitude_m) / 1e3) for f in (np.min, np.max))
+    low, high = (round(float(f(seen.altitude_m)) / 1e3) for f in (np.min, np.max))
     print(
-        f"detections at {low} to {high} km\n\n| depth/diameter | craters | detections | height against the rim m |"
+        f"detections at {low} to {high} km\n\n| depth/diameter | craters | detections | height relative to the rim m |"
     )
     print("|" + "---|" * 4)
     for name, rows in (
@@ -173,7 +180,8 @@ def _print_crater_height(recordings: Sequence[Recording]) -> None:
         ("0.06 and more", seen.depth_ratio >= 0.06),
     ):
         fit = fit_height(seen.chosen(rows))
-        print(f"| {name} | {fit.craters:,} | {fit.detections:,} | {fit.height_m:.0f} ± {fit.sigma_m:.0f} |")
+        height = f"{fit.height_m:.0f} ± {fit.sigma_m:.0f}" if math.isfinite(fit.height_m) else "unknown"
+        print(f"| {name} | {fit.craters:,} | {fit.detections:,} | {height} |")
 
 
 def _print_attitudes(recordings: Sequence[Recording], noises_deg: Sequence[float], monitored: bool) -> None:
@@ -264,10 +272,25 @@ def _signed(bias_rtn_m: tuple[float, float, float]) -> str:
 
 
 def _recording(folder: Path, place: tuple[Any, ...], network: str) -> Recording:
-    path = folder / f"{place[0]}.npz"
+    """Return the recording of a place with a network, made where it is missing.
+
+    Raises
+    ------
+    ModelError
+        There is no such network.
+    RecordError
+        The file is no recording, or one of another network.
+    """
+    path, sha256 = folder / f"{place[0]}.npz", hashlib.sha256(network_octets(network)).hexdigest()
     if not path.is_file():
         save_recording(path, record(_scenario(place, network), data_folder(), _told))
-    return load_recording(path)
+    recording = load_recording(path)
+    if recording.network_sha256 != sha256:
+        raise RecordError(
+            f"{path}: expected a recording with the network {sha256[:12]} ({network}), found one with "
+            f"{recording.network_sha256[:12]}; remove it or name another folder"
+        )
+    return recording
 
 
 def _scenario(place: tuple[Any, ...], network: str) -> Scenario:

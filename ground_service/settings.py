@@ -352,7 +352,7 @@ def _with_password(name: str, url: str, password: str) -> str:
     if ":" in user or scheme.startswith("sqlite"):
         return url
     if not user:
-        raise SettingsError(name, "a URL with the user whose password is in the file", repr(url))
+        raise SettingsError(name, "a URL with a user, whose password is in a file", repr(url))
     return f"{scheme}{mark}{user}:{quote(password, safe='')}@{place}"
 
 

@@ -2,7 +2,7 @@
 
 A crater whose seen centre lies below the mean height of its rim appears nearer to the image centre, which a navigator
 takes for a larger altitude. All detections of known craters are compared with the projections of their craters, and
-one height is fitted by weighted least squares, together with a shift of each window to the east and to the north (what
+one height is fitted by weighted least squares together with a shift of each window to the east and to the north (what
 the registration of list and terrain leaves).
 """
 
@@ -24,6 +24,7 @@ from payload_emulator.flight.vision.detections import Detections
 from studies.navigation_windows import CAMERA_FOV_RAD, CAMERA_PX, Recording, arcs
 
 LEAST_DIAMETER_M, MOST_DIAMETER_M = 3_000.0, 30_000.0
+# Detections below are left out: recordings of all networks are compared at the on-board threshold of the shipped one.
 LEAST_SCORE = 0.44
 _STEP_M = 50.0
 _LARGEST_DIAMETER_RATIO = 1.35
@@ -70,7 +71,10 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class HeightFit:
-    """Height (m) of the seen centres above the mean rim, its standard deviation by crater, and what it rests on."""
+    """Height (m) of the seen centres above the mean rim, its standard deviation, and what they rest on.
+
+    The standard deviation takes all errors of one crater as one. Both are NaN where the detections do not tell them.
+    """
 
     height_m: float
     sigma_m: float
@@ -98,6 +102,8 @@ def fit_height(seen: Sightings) -> HeightFit:
     rows = np.ones(seen.crater.size, dtype=bool)
     for _ in range(_ROUNDS):
         part = seen.chosen(rows)
+        if not _is_determined(part):
+            return HeightFit(math.nan, math.nan, int(np.unique(part.crater).size), int(part.crater.size))
         solution, covariance = _solve(part)
         left = seen.residual_px - _predicted(seen, solution, np.unique(part.window))
         size = np.sqrt(seen.weight) * np.linalg.norm(left, axis=1)
@@ -158,7 +164,7 @@ def _of_frame(recording: Recording, number: int, window: int) -> Sightings | Non
 
 def _pairs(found: Detections, projected: FloatArray, diameter_px: FloatArray) -> IntArray:
     """Return pairs of detection and crater, (n, 2), that are nearest to each other and of similar size."""
-    usable = found.score >= LEAST_SCORE
+    usable = (found.score >= LEAST_SCORE) & np.isfinite(found.sigma_px)
     offset = np.stack([found.u_px, found.v_px], axis=1)[:, None] - projected[None]
     away = np.linalg.norm(offset, axis=2)
     larger = np.abs(np.log(found.diameter_px[:, None] / diameter_px[None]))
@@ -202,6 +208,14 @@ def _design(seen: Sightings, windows: IntArray) -> FloatArray:
 
 def _predicted(seen: Sightings, solution: FloatArray, windows: IntArray) -> FloatArray:
     return np.asarray(_design(seen, windows) @ solution)
+
+
+def _is_determined(seen: Sightings) -> bool:
+    """Return whether the detections tell the height and the shifts of their windows apart."""
+    windows = np.unique(seen.window)
+    unknowns = 1 + 2 * windows.size
+    design = _design(seen, windows).reshape(2 * seen.crater.size, unknowns)
+    return seen.crater.size > unknowns and int(np.linalg.matrix_rank(design)) == unknowns
 
 
 def _solve(seen: Sightings) -> tuple[FloatArray, FloatArray]:

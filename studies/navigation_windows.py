@@ -6,6 +6,7 @@ detections, attitudes, tables and truth of every frame: variants of catalogue an
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
@@ -41,6 +42,7 @@ from payload_emulator.flight.onboard.loads import FlightTables
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.emulator import load_scenario_payload
+from payload_emulator.session.loading import network_octets
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.scoring import halves, normalised_squares, rtn_errors, turned, turns
 from payload_emulator.session.world import build_world, exposures
@@ -94,6 +96,8 @@ class Recording:
         As uploaded.
     shift_m
         Registration that the craters of the uploaded catalogue contain, east and north, (c, 2); zero where unknown.
+    network_sha256
+        Network that searched the frames.
     """
 
     name: str
@@ -110,6 +114,7 @@ class Recording:
     catalogue: CraterCatalogue
     tables: FlightTables
     shift_m: FloatArray
+    network_sha256: str
 
     def found(self, number: int) -> Detections | None:
         """Return the detections of a frame; None where the image was not usable."""
@@ -159,6 +164,7 @@ def record(scenario: Scenario, data: DataFolder, progress: Progress | None = Non
         catalogue,
         loaded.tables,
         shift_m,
+        hashlib.sha256(network_octets(scenario.detector.network)).hexdigest(),
     )
 
 
@@ -174,6 +180,7 @@ def save_recording(path: Path, recording: Recording) -> None:
         f"table_{name}": np.frombuffer(getattr(recording.tables, name), dtype=np.uint8) for name in _TABLES
     }
     named = {"name": np.array(recording.name), "source": np.array(recording.catalogue.source)}
+    named["network_sha256"] = np.array(recording.network_sha256)
     np.savez_compressed(path, allow_pickle=False, **arrays, **named, seed=np.array(recording.seed))
 
 
@@ -205,6 +212,7 @@ def load_recording(path: Path) -> Recording:
             CraterCatalogue(**columns, source=str(values["source"])),
             FlightTables(**tables),
             values["shift_m"],
+            str(values["network_sha256"]),
         )
     except (OSError, KeyError, ValueError) as error:
         raise RecordError(f"{path}: expected a recording of navigation windows, found {error}") from None

@@ -97,7 +97,7 @@ class BodyLimit:
 
         try:
             await self._app(scope, counted, watched)
-        except Exception:  # what the application makes of a body that was cut off is not its fault
+        except Exception:  # an application that got half of a body may fail in any way
             if refusal is None:
                 raise
         finally:

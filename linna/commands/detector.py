@@ -92,7 +92,7 @@ def _add_train(verbs: Any) -> None:
         type=Path,
         default=None,
         metavar="TABLE",
-        help="train on rims from `linna catalogue curate` where the table has a crater, not on the catalogue's circle",
+        help="labels on rims (binary table of `linna catalogue curate`) instead of the catalogue's circles",
     )
     train.add_argument(
         "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"

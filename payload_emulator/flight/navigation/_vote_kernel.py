@@ -33,7 +33,7 @@ _LARGEST_TANGENT, _LARGEST_ARC = 4.0, 0.2
 SCORE, ROW, COLUMN, DISTANCE = range(4)
 
 # Columns of the turn from the ground that a detection sees to the camera: sine of the arc to the east, arc to the north
-# in the meridian's plane, and the length of the projection into that plane, as its inverse less one and itself.
+# in the plane of the meridian, 1 / length - 1 and length of the projection into that plane.
 EAST, TURN, LONGER, LENGTH = range(4)
 
 
@@ -102,8 +102,8 @@ def vote(
 
     A crater seen under a known angle from a known altitude puts the camera on one place of the sphere. Each pair of
     a detection and a crater whose size fits adds the detection's weight to the four overlapping blocks about that
-    place, once per detection (and tile). The weight is the logarithm of how much rarer a chance vote is than a true
-    one.
+    place, once per detection and tile: beside the edge of a tile one detection may count twice. The weight is the
+    logarithm of how much rarer a chance vote is than a true one.
 
     Parameters
     ----------

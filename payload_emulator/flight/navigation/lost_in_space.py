@@ -36,8 +36,9 @@ _CANDIDATES_COMBINED = 12
 
 # Bins of rim height: half a bin moves a place by 350 m at the edge of the image.
 _HEIGHT_BIN_M = 400.0
-# Edge of a tile of the map: the blocks that its craters vote for fit into the second cache of a processor core.
+# Edge of a tile of the map: over the whole Moon the blocks that its craters vote for fit into the L2 cache.
 _TILE_RAD = math.radians(15.0)
+# Number of a tile: row times this plus column.
 _TILE_FACTOR = 1_000
 # The vote leaves out places this far from any crater.
 _MARGIN_RAD = math.radians(3.0)

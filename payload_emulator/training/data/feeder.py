@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray, OctetArray
 from lunar.catalogue import size_class
+from payload_emulator.errors import DatasetError
 from payload_emulator.flight.vision.preprocess import Preparation, gray_levels
 from payload_emulator.training.data.augment import AugmentParameters, make_crop
 from payload_emulator.training.data.dataset import LABEL_MINIMUM_DIAMETER_PX, Dataset, Frame, choose_tiers
@@ -22,8 +23,10 @@ LEAST_CROP_DIAMETER_PX = 8.0
 
 EVEN_DIAMETER_PX = 28.0
 MOST_EMPHASIS = 4.0
-STAMPED_EMPHASIS = 0.6
 """Small craters outnumber large ones twenty to one; without a counterweight the network hardly learns the large."""
+
+STAMPED_EMPHASIS = 0.6
+"""Small craters that are stamped on real terrain outnumber those of the list."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,12 @@ class TrainParameters:
     least_emphasis: float = 0.5
     preparation: Preparation = Preparation.gray_first
     augment: AugmentParameters = field(default_factory=AugmentParameters)
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.least_emphasis <= MOST_EMPHASIS:
+            raise DatasetError(
+                f"training, least emphasis: expected 0 to {MOST_EMPHASIS:g}, found {self.least_emphasis:g}"
+            )
 
 
 class Feeder:

@@ -36,7 +36,7 @@ class RefittedRims:
 
 
 def load_refitted(path: Path, east_m: float = 0.0, north_m: float = 0.0) -> RefittedRims:
-    """The rims of a table that `linna catalogue curate` wrote, moved by so much.
+    """The rims of a table that `linna catalogue curate` wrote, shifted by `east_m` and `north_m`.
 
     Table and pictures are both in the frame of the terrain. Data sets that were drawn before the terrain was registered
     need a shift of tens of metres.

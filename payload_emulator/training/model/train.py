@@ -79,7 +79,7 @@ def train(
     from payload_emulator.training.model.model import CraterNet
     from payload_emulator.training.model.restore import count_statistics
 
-    frames = _training_frames(datasets, train_frames, landmarks, rims)
+    frames, moved = _training_frames(datasets, train_frames, landmarks, rims)
     validation = [(d, f) for d in datasets for f in d.frames("val")]
     _check_datasets(datasets, frames, parameters)
     run.mkdir(parents=True, exist_ok=True)
@@ -105,7 +105,7 @@ def train(
         origin = _start_from(start_from, network, average)
         report(f"started from {start_from.name}")
     images = _load_images(frames, report, parameters.preparation is Preparation.normalise_first)
-    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin, rims)
+    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin, moved)
     feeder = Feeder(frames, images, parameters)
     if origin is not None and start_from is not None and start_from.suffix == ".onnx":
         count_statistics(network, feeder, average)
@@ -131,12 +131,25 @@ def _training_frames(
     chosen: Sequence[tuple[Dataset, Frame]] | None,
     landmarks: Landmarks | None,
     rims: RefittedRims | None,
-) -> list[tuple[Dataset, Frame]]:
-    """Return the frames to learn from: the chosen ones or the split "train", on measured rims, with landmarks."""
+) -> tuple[list[tuple[Dataset, Frame]], int]:
+    """Return the frames to learn from, with landmarks and on measured rims, and how many craters were moved to rims.
+
+    Raises
+    ------
+    DatasetError
+        Rims are given, but none is of a crater of these frames.
+    """
     frames = [(d, f) for d in datasets for f in d.frames("train")] if chosen is None else list(chosen)
+    moved = 0
     if rims is not None:
-        frames = [(d, refitted_frame(d, f, rims)[0]) for d, f in frames]
-    return frames if landmarks is None else [(d, with_landmarks(d, f, landmarks)) for d, f in frames]
+        placed = [(d, *refitted_frame(d, f, rims)) for d, f in frames]
+        moved = sum(int(np.count_nonzero(known)) for _, _, known in placed)
+        frames = [(d, f) for d, f, _ in placed]
+        if frames and not moved:
+            raise DatasetError(
+                f"training, rims: expected rims of craters in the training frames, found none among {len(rims)}"
+            )
+    return frames if landmarks is None else [(d, with_landmarks(d, f, landmarks)) for d, f in frames], moved
 
 
 def _check_datasets(
@@ -492,11 +505,17 @@ def _write_run(
     replicas: int,
     device: str,
     origin: dict[str, Any] | None,
-    rims: RefittedRims | None,
+    moved: int,
 ) -> None:
     path = run / "run.json"
-    if origin is None and path.is_file():
-        origin = json.loads(path.read_text(encoding="utf-8")).get("started_from")
+    if path.is_file():
+        before = json.loads(path.read_text(encoding="utf-8"))
+        origin = before.get("started_from") if origin is None else origin
+        if before.get("labels_on_rims", 0) != moved:
+            raise DatasetError(
+                f"{path}: expected the rims that the run began with ({before.get('labels_on_rims', 0)} labels on "
+                f"rims), found {moved} labels on rims"
+            )
     document = {
         "parameters": asdict(parameters),
         "model": config,
@@ -506,6 +525,6 @@ def _write_run(
         "replicas": replicas,
         "device": device,
         "started_from": origin,
-        "rims": 0 if rims is None else len(rims),
+        "labels_on_rims": moved,
     }
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")

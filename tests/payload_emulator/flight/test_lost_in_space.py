@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -183,6 +185,49 @@ def test_fewer_inliers_suffice_on_a_smaller_map() -> None:
     best = [candidate_places(found, found.sigma_px, place_index(m), CAMERA, RULES)[0] for m in (whole, part)]
     assert len(best[0]) == len(best[1])
     assert best[1].log_false < best[0].log_false
+
+
+@pytest.mark.parametrize("west_deg", [350.0, 172.0])
+def test_craters_are_sorted_by_tile_height_and_diameter(west_deg: float) -> None:
+    landmarks = craters(west_deg)
+    index = place_index(landmarks)
+    assert index.bin_start[0] == 0 and index.bin_start[-1] == len(index) == len(landmarks.diameter_m)
+    assert index.tile_start[0] == 0 and index.tile_start[-1] == index.bin_height.size
+    tiles = []
+    for first, stop in pairwise(index.tile_start):
+        low, high = index.bin_start[first], index.bin_start[stop]
+        longitude = np.degrees(index.longitude_rad[low:high]) % 360.0
+        places = np.stack([np.degrees(index.latitude_rad[low:high]) // 15.0, longitude // 15.0])
+        assert np.all(places == places[:, :1])
+        tiles.append(tuple(places[:, 0]))
+        assert np.all(np.diff(index.bin_height[first:stop]) > 0)
+    assert len(set(tiles)) == len(tiles) > 4
+    for first, stop in pairwise(index.bin_start):
+        assert stop > first and np.all(np.diff(index.log_diameter[first:stop]) >= 0.0)
+    np.testing.assert_array_equal(np.sort(index.log_diameter), np.sort(np.log(landmarks.diameter_m)))
+
+
+def test_a_map_without_craters_has_an_index_and_gives_no_fix() -> None:
+    empty = np.empty(0)
+    landmarks = landmark_map(
+        CatalogueTable(np.empty(0, np.int64), empty, empty, empty, empty, np.empty((0, 3)))
+    )
+    index = place_index(landmarks)
+    assert len(index) == 0 and index.tile_start.tolist() == [0]
+    assert find_place(no_detections(), empty, index, CAMERA, RULES) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tiles_do_not_change_the_place_found(seed: int, index: PlaceIndex) -> None:
+    """One tile for the whole map, in which no detection counts twice, leads to the same place and the same pairs."""
+    whole = replace(index, tile_start=np.array([0, index.bin_height.size]))
+    assert index.tile_start.size > 4
+    _, found = frame(index.landmarks, -8.0 + 5.0 * seed, 355.0 + 2.0 * seed, 28_000.0, seed)
+    sigma = np.full(len(found), SIGMA_PX)
+    tiled, single = (find_place(found, sigma, one, CAMERA, RULES) for one in (index, whole))
+    assert tiled is not None and single is not None
+    np.testing.assert_allclose(tiled.position_mcmf_m, single.position_mcmf_m, atol=1.0)
+    np.testing.assert_array_equal(tiled.detection, single.detection)
 
 
 def test_the_tail_of_the_poisson_distribution_is_that_of_the_sum() -> None:

@@ -145,15 +145,18 @@ def test_landmarks_are_labels_of_the_second_round(blob_dataset, tmp_path, monkey
     assert seen[1] - seen[0] == len(blob_dataset.frames("train"))
 
 
+def one_rim(number):
+    return RefittedRims(np.array([number]), *(np.array([value]) for value in (0.0, 0.0, 8_000.0, 0.0)))
+
+
 def test_labels_are_the_rims_of_a_table(blob_dataset, tmp_path, monkeypatch):
-    """Training sees what `refitted_frame` makes of each frame, and the run says how many rims there were."""
+    """Training sees what `refitted_frame` makes of each frame; the run states the labels and resumes with them only."""
     moved = []
 
     def shifted(dataset, frame, rims):
-        assert len(rims) == 1
         craters = {**frame.craters, "u_px": frame.craters["u_px"] + 3.0}
         moved.append(replace(frame, craters=craters))
-        return moved[-1], np.ones(craters["u_px"].size, bool)
+        return moved[-1], np.arange(craters["u_px"].size) == 0
 
     monkeypatch.setattr(training, "refitted_frame", shifted)
     seen = []
@@ -164,10 +167,20 @@ def test_labels_are_the_rims_of_a_table(blob_dataset, tmp_path, monkeypatch):
         original(self, frames, *rest)
 
     monkeypatch.setattr(training.Feeder, "__init__", watched)
-    one = [np.array([value]) for value in (0.0, 0.0, 8_000.0, 0.0)]
-    train([blob_dataset], tmp_path, replace(SHORT, steps=1), rims=RefittedRims(np.array([3]), *one))
+    train([blob_dataset], tmp_path, replace(SHORT, steps=1), rims=one_rim(3))
     assert seen and all(frame is other for frame, other in zip(seen, moved, strict=True))
-    assert json.loads((tmp_path / "run.json").read_text())["rims"] == 1
+    assert json.loads((tmp_path / "run.json").read_text())["labels_on_rims"] == len(seen)
+    with pytest.raises(
+        DatasetError, match=r"expected the rims that the run began with \(24 labels on rims\)"
+    ):
+        train([blob_dataset], tmp_path, replace(SHORT, steps=2))
+
+
+def test_rims_of_other_craters_are_refused(blob_dataset, tmp_path):
+    with pytest.raises(
+        DatasetError, match="expected rims of craters in the training frames, found none among 1"
+    ):
+        train([blob_dataset], tmp_path, replace(SHORT, steps=1), rims=one_rim(99_999_999))
 
 
 def test_the_weight_of_small_craters_is_bounded_below(blob_dataset):
@@ -183,6 +196,12 @@ def test_the_weight_of_small_craters_is_bounded_below(blob_dataset):
     assert least(0.05) < least(0.9) < 1.0
     assert least(0.9) == pytest.approx(0.9)
     assert least(1.0) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("share", [-0.1, 4.1, float("nan")])
+def test_a_least_emphasis_without_meaning_is_refused(share):
+    with pytest.raises(DatasetError, match="least emphasis: expected 0 to 4, found"):
+        replace(SHORT, least_emphasis=share)
 
 
 def test_a_data_set_without_training_frames_is_refused(make_blob_dataset, tmp_path):
