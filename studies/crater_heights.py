@@ -144,10 +144,10 @@ def _of_frame(recording: Recording, number: int, window: int) -> Sightings | Non
     if not len(pairs):
         return None
     of_found, of_crater = pairs.T
-    moves = _moves(craters, of_crater)
-    shift = [
-        (camera.project((moved - position) @ rotation.T) - projected[of_crater]) / _STEP_M for moved in moves
-    ]
+    east, north, up = (
+        (camera.project((moved - position) @ rotation.T) - projected[of_crater]) / _STEP_M
+        for moved in _moves(craters, of_crater)
+    )
     count = len(pairs)
     with np.errstate(invalid="ignore"):
         ratio = craters.depth_m[of_crater] / craters.diameter_m[of_crater]
@@ -155,7 +155,9 @@ def _of_frame(recording: Recording, number: int, window: int) -> Sightings | Non
         np.asarray(craters.ids[of_crater], dtype=np.int64),
         np.full(count, window, dtype=np.int64),
         np.stack([found.u_px, found.v_px], axis=1)[of_found] - projected[of_crater],
-        *shift,
+        east,
+        north,
+        up,
         1.0 / np.maximum(found.sigma_px[of_found], 0.3) ** 2,
         np.asarray(ratio, dtype=np.float64),
         np.full(count, np.linalg.norm(position) - MOON_RADIUS_M),
