@@ -71,7 +71,7 @@ def train(
     Raises
     ------
     DatasetError
-        No training frames, or data sets of different cameras.
+        No training frames, data sets of different cameras, rims of other craters, or a run begun with other rims.
     """
     import cv2
     import torch
