@@ -22,6 +22,7 @@ from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run.checkpoints import Checkpoints
+from studies.mission_run.comparison import compare_reports, largest_relative
 from studies.mission_run.figures import _missing, contacts_until, trend
 from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.regions import Box, in_boxes, observed_boxes
@@ -257,13 +258,10 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     again = run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, terms, lines.append)
     assert any("continues from 2029-08-07T" in line for line in lines)
     assert again["starts"] == 2 and again["interventions"] == 0
-    differ = {
-        "starts", "wall_s", "cpu_s", "memory_mib", "memory_series_mib", "memory_lives", "interventions_list",
-        "incidents",
-    }  # fmt: skip
-    assert {key: value for key, value in again.items() if key not in differ} == {
-        key: value for key, value in whole.items() if key not in differ
-    }
+    # A report uses the time correlation of that moment, which further time reports of the contact change a little.
+    values, differences = compare_reports(whole, again)
+    largest = largest_relative(differences)
+    assert largest is not None and largest < 1e-5 and values > 50
     assert of_mission_time(again["incidents"]) == of_mission_time(whole["incidents"])
 
 

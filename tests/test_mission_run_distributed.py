@@ -19,7 +19,7 @@ from ground_service.links import service as links
 from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
-from studies.mission_run.comparison import compare_reports
+from studies.mission_run.comparison import compare_reports, largest_relative
 from studies.mission_run.kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
 from studies.mission_run.parts import Part, PidFile, PostgresServer, runs
 from studies.mission_run.processes import Usage, family_cpu_s, family_memory, family_mib
@@ -93,8 +93,10 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
     killed = run_mission(scenario, data, folder, killing, print)
     assert killed["kills"]["by_part"] == {part: 1 for _, part, _ in sorted(KILLED, key=lambda one: one[1])}
     assert killed["kills"]["done"] == killed["kills"]["planned"] == len(KILLED)
+    # A report uses the time correlation of that moment, which further time reports of the contact change a little.
     values, differences = compare_reports(whole, killed)
-    assert differences == [] and values > 50
+    largest = largest_relative(differences)
+    assert largest is not None and largest < 1e-5 and values > 50
     assert killed["windows"]["processed"] == killed["windows"]["flown"] > 0 and killed["interventions"] == 0
     assert killed["packets_received"] == killed["packets"] > 0 and killed["packets_lost"] == 0
     kills = [one for one in killed["incidents"] if one["kind"] == "kill"]

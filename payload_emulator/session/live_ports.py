@@ -3,6 +3,7 @@
 A client can connect and disconnect at any time, reset its connection, disappear without closing it, or never read.
 This must not stop or delay the simulation: nothing here blocks, and `Server.drop` is the only place where a client's
 socket is closed. It takes the socket out of the selector first, so that a new connection can have the same descriptor.
+A client that no longer takes data is read to its end first: what it sent before it left has arrived and counts.
 """
 
 from __future__ import annotations
@@ -36,11 +37,14 @@ class Client:
         Consecutive number of the connection; unlike a descriptor, it is never reused.
     unsent
         Octets that are not sent yet.
+    takes_data
+        Whether the client can still be sent to.
     """
 
     number: int
     connection: socket.socket
     unsent: bytearray = field(default_factory=bytearray)
+    takes_data: bool = True
     events: int = selectors.EVENT_READ
 
 
@@ -170,21 +174,37 @@ class Server:
             self.drop(client)
 
     def _flush(self, client: Client) -> None:
+        if not client.takes_data:
+            client.unsent.clear()
+            return
         try:
             while client.unsent:
                 del client.unsent[: client.connection.send(client.unsent[:_CHUNK_OCTETS])]
         except BlockingIOError:
             pass
         except OSError:
-            self.drop(client)
+            self._stop_sending(client)
             return
         if len(client.unsent) > UNSENT_LIMIT_OCTETS:
-            self.drop(client)
+            self._stop_sending(client)
             return
         if self.document is not None and not client.unsent:
             self.drop(client)
             return
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)
+        self._select(client, selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0))
+
+    def _stop_sending(self, client: Client) -> None:
+        """Give up sending to a client; it is dropped when what it has sent so far is read."""
+        client.takes_data = False
+        client.unsent.clear()
+        with contextlib.suppress(OSError):  # the client may have closed the connection
+            client.connection.shutdown(socket.SHUT_RDWR)
+        if self._selector is None or self.document is not None:
+            self.drop(client)
+        else:
+            self._select(client, selectors.EVENT_READ)
+
+    def _select(self, client: Client, wanted: int) -> None:
         if wanted != client.events and self._selector is not None:
             client.events = wanted
             self._selector.modify(client.connection, wanted, (self, client))

@@ -9,7 +9,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -379,6 +379,30 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody() -> None
     server.close()
     slow.close()
     quick.close()
+    selector.close()
+
+
+@pytest.mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
+def test_words_of_a_client_that_left_without_reading_are_received(
+    leave: Callable[[socket.socket], None],
+) -> None:
+    received: list[bytes] = []
+    server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))
+    selector = served(server)
+    client = socket.create_connection(("127.0.0.1", server.port), timeout=20.0)
+    while not server.clients:
+        turn(selector)
+    server.send(b"snapshot that nobody reads\n")
+    assert client.recv(1, socket.MSG_PEEK) == b"s"
+    client.sendall(b"x" * 30_000 + b"\nquit\n")
+    leave(client)
+    # The snapshots meet a connection that is gone, before its words are read.
+    for _ in range(3):
+        server.send(b"another one\n")
+    while server.clients:
+        turn(selector)
+    assert b"".join(received) == b"x" * 30_000 + b"\nquit\n"
+    server.close()
     selector.close()
 
 
