@@ -102,6 +102,22 @@ class LostRow:
 
 
 @dataclass(frozen=True, slots=True)
+class HostileSearches:
+    """Searches of changed detections, none of which has a place: how many ended with a fix, each of them wrong.
+
+    Attributes
+    ----------
+    least_log10_false
+        Decimal logarithm of the smallest probability that chance was said to have of making up the best place.
+    """
+
+    kind: str
+    searches: int
+    fixes: int
+    least_log10_false: float
+
+
+@dataclass(frozen=True, slots=True)
 class Share:
     """Searches of one kind: how many, how many right and how many wrong."""
 
@@ -296,6 +312,46 @@ def search_frames(
             )
         )
     return single, sets
+
+
+def hostile_detections(
+    found: Detections, camera: PinholeCamera, rng: np.random.Generator
+) -> dict[str, Detections]:
+    """Return detections mirrored, turned by a quarter and by half, and scattered over the image, by kind."""
+    right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
+    u, v = found.u_px, found.v_px
+    scattered = rng.uniform(0.0, right, u.size), rng.uniform(0.0, bottom, v.size)
+    kinds = {
+        "mirrored": (right - u, v),
+        "turned by a quarter": (v * right / bottom, bottom - u * bottom / right),
+        "turned by half": (right - u, bottom - v),
+        "scattered": scattered,
+    }
+    return {kind: replace(found, u_px=place[0], v_px=place[1]) for kind, place in kinds.items()}
+
+
+def search_hostile(
+    seen: SeenFrames,
+    board: LandmarkMap,
+    camera: PinholeCamera,
+    parameters: LostParameters,
+    seed: int,
+    progress: Progress | None = None,
+) -> list[HostileSearches]:
+    """Return the searches of every frame with its detections changed in each way."""
+    index, rng = place_index(board), np.random.default_rng(seed)
+    fixes: dict[str, list[bool]] = {}
+    log_false: dict[str, list[float]] = {}
+    rows = range(seen.number.size)
+    for row in progress(rows, len(rows)) if progress else rows:
+        for kind, found in hostile_detections(seen.of(row), camera, rng).items():
+            places = candidate_places(found, _sigma_px(found), index, camera, parameters)
+            fixes.setdefault(kind, []).append(believed_place(places, parameters) is not None)
+            log_false.setdefault(kind, []).append(places[0].log_false if places else math.inf)
+    return [
+        HostileSearches(kind, len(found), sum(found), min(log_false[kind]) / math.log(10.0))
+        for kind, found in fixes.items()
+    ]
 
 
 def share(rows: Sequence[LostRow], least_catalogued: int = 0) -> Share:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -10,14 +11,12 @@ from typing import TYPE_CHECKING, Any
 from linna.output import emit, log, progress
 
 if TYPE_CHECKING:
-    from studies.lost_in_space import LostRow, Share
+    from studies.lost_in_space import HostileSearches, LostRow, Share
 
 LEAST_CATALOGUED = 6
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import math
-
     from linna.data import data_folder
     from linna.errors import UsageError
     from payload_emulator.flight.models import load_shipped_model
@@ -55,6 +54,12 @@ def run(arguments: argparse.Namespace) -> int:
     single, sets = study.search_frames(
         world, seen, true, board, parameters, lambda rows, total: progress(rows, total, "searches", "frame")
     )
+    hostile = []
+    if arguments.hostile:
+        hostile = study.search_hostile(
+            seen, board, world.camera, parameters, scenario.seed,
+            lambda rows, total: progress(rows, total, "hostile searches", "frame"),
+        )  # fmt: skip
     rows = {
         "all frames": study.share(single),
         f"frames, {LEAST_CATALOGUED} known": study.share(single, LEAST_CATALOGUED),
@@ -67,8 +72,11 @@ def run(arguments: argparse.Namespace) -> int:
     figures: dict[str, Any] = {
         "single_correct_share": rows[f"frames, {LEAST_CATALOGUED} known"].correct_share,
         "four_frames_correct_share": rows[f"sets, {LEAST_CATALOGUED} known in each"].correct_share,
-        "wrong": rows["all frames"].wrong + rows["all sets of four"].wrong,
-        "searches": len(single) + len(sets),
+        "wrong": rows["all frames"].wrong
+        + rows["all sets of four"].wrong
+        + sum(one.fixes for one in hostile),
+        "searches": len(single) + len(sets) + sum(one.searches for one in hostile),
+        "hostile": [_hostile_as_json(one) for one in hostile],
         "scores": {name: _as_json(row) for name, row in rows.items()},
         "by_altitude": [
             {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}
@@ -87,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         "data": list(world.data_names),
     }
     table = _table(rows, study.by_altitude(single, LEAST_CATALOGUED))
+    table += [f"{one.kind:<24}{one.searches:>9}{0:>9}{'':>8}{one.fixes:>7}" for one in hostile]
     last = (
         f"{figures['catalogued_per_frame']:.1f} of {figures['detections_per_frame']:.1f} detections a frame are of "
         f"the {len(board)} craters of the map; {figures['median_cpu_s']:.2f} s "
@@ -135,6 +144,11 @@ def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Sha
 
 def _as_json(row: Share) -> dict[str, Any]:
     return asdict(row) | {"correct_share": row.correct_share if row.searches else None}
+
+
+def _hostile_as_json(one: HostileSearches) -> dict[str, Any]:
+    least = one.least_log10_false
+    return asdict(one) | {"least_log10_false": least if math.isfinite(least) else None}
 
 
 def _key(scenario: str, numbers: bytes, model_sha256: str) -> str:

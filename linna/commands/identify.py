@@ -57,6 +57,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     rendered.add_argument(
         "--detections", type=Path, metavar="F.npz", help="keep the detections here, or take those kept here"
     )
+    rendered.add_argument(
+        "--hostile",
+        action="store_true",
+        help="search each frame also with its detections mirrored, turned and scattered: each fix is wrong",
+    )
     lost.set_defaults(handler=run_lost)
     tracking.set_defaults(handler=run_tracking)
 
@@ -64,6 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_lost(arguments: argparse.Namespace) -> int:
     import math
 
+    from linna.errors import UsageError
     from payload_emulator.flight.navigation.lost_in_space import place_index
     from studies.identification import KINDS, study_lost, study_lost_in_frames
 
@@ -71,6 +77,8 @@ def run_lost(arguments: argparse.Namespace) -> int:
         from linna.commands._identify_rendered import run as run_rendered
 
         return run_rendered(arguments)
+    if arguments.hostile:
+        raise UsageError("--hostile: expected --scenario, found none")
     model = _model(arguments)
     world = _world(arguments)
     attitude_rad = math.radians(arguments.attitude_deg)

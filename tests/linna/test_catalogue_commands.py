@@ -131,6 +131,7 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
         (["catalogue", "minimum", "--hours", "0"], "--hours"),
         (["identify", "tracking", "--recall", "2"], "--recall"),
         (["identify", "lost", "--frames", "0"], "--frames"),
+        (["identify", "lost", "--hostile"], "--hostile: expected --scenario"),
     ],
 )
 def test_bad_input_is_one_line_that_names_it(

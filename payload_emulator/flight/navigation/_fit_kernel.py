@@ -22,6 +22,12 @@ _WIDE_ROUNDS, _SHRINK = 6, 0.6
 _MARGIN_PX = 12.0
 """Craters this far outside the image may still be detected at its edge."""
 
+_RECALLS = (0.15, 0.4, 0.8)
+"""Shares of the craters in the image that a detector may find; which is not known, so that their mean counts."""
+
+_LARGEST_SHARE = 0.9
+"""Largest share of the detections of a size that are taken to be craters of the map."""
+
 
 class Image(NamedTuple):
     """Focal length, centre (2,) and half width and height (2,) of the image."""
@@ -32,10 +38,10 @@ class Image(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Detections: centres (k, 2), diameters (k,) and variances of the centres per axis (k,)."""
+    """Detections: centres (k, 2), logarithms of diameters (k,) and variances of the centres per axis (k,)."""
 
     uv_px: FloatArray
-    diameter_px: FloatArray
+    log_diameter: FloatArray
     variance_px2: FloatArray
 
 
@@ -59,18 +65,24 @@ class Gates(NamedTuple):
         Of two degrees of freedom, within which a crater explains a detection.
     log_diameter
         Largest difference of the logarithms of diameters.
+    log_diameter_sigma
+        Standard deviation of the difference of a true pair.
     """
 
     tolerance_px: float
     chi_square: float
     log_diameter: float
+    log_diameter_sigma: float
 
 
 class Seen(NamedTuple):
-    """Predicted craters: centres (m, 2), diameters (m,), -1 outside the image, offsets (m, 3), variances (m,)."""
+    """Predicted craters: centres (m, 2), logarithms of diameters (m,), offsets (m, 3), variances (m,).
+
+    The logarithm is minus infinity outside the image, where nothing resembles a crater.
+    """
 
     uv: FloatArray
-    diameter: FloatArray
+    log_diameter: FloatArray
     enu: FloatArray
     variance: FloatArray
 
@@ -85,8 +97,8 @@ def fit_place(
     attitude_sigma: float,
     gates: Gates,
     radius_m: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
-    """Return place, attitude, their normal matrix, the crater of each detection (-1: none) and what chance would give.
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, float]:
+    """Return place, attitude, their normal matrix, the crater of each detection (-1: none) and the evidence.
 
     Least squares on the pairs of detections and craters that are each other's nearest, over place (east, north, up)
     and a small rotation of the camera whose size is known; pairs are chosen again in every round, ever closer.
@@ -100,13 +112,12 @@ def fit_place(
 
     Returns
     -------
-    chance
-        Expected number of detections that craters would explain if detections lay anywhere; per detection, (k,).
+    evidence
+        See `log_evidence`.
     """
     count = found.uv_px.shape[0]
     place, theta = start.copy(), np.zeros(3)
-    nearest, chance = np.full(count, -1), np.zeros(count)
-    normal = np.zeros((6, 6))
+    nearest, normal, evidence = np.full(count, -1), np.zeros((6, 6)), 0.0
     around = _in_reach(place, image, craters, radius_m)
     members = around.size
     seen = Seen(np.empty((members, 2)), np.empty(members), np.empty((members, 3)), np.empty(members))
@@ -115,9 +126,11 @@ def fit_place(
         rotation = _turned(camera_from_enu, theta)
         _project(seen, place, enu, rotation, image, craters, around)
         tolerance2 = (gates.tolerance_px * _SHRINK**step) ** 2 if step < _WIDE_ROUNDS else 0.0
-        final = step == _ROUNDS - 1
-        pairs = _choose(nearest, chance, seen, found, image, gates, tolerance2, final)
-        if final or pairs < 3:
+        pairs = _choose(nearest, seen, found, gates, tolerance2)
+        if pairs < 3:
+            break
+        if step == _ROUNDS - 1:
+            evidence = log_evidence(nearest, seen, found, image, gates.log_diameter_sigma)
             break
         right = _normal_equations(
             normal, place, theta, rotation, seen, found, nearest, attitude_sigma, image.focal_px
@@ -129,12 +142,64 @@ def fit_place(
         if not math.isfinite(place[0] + place[1] + place[2]) or math.hypot(place[0], place[1]) < 1.0:
             for i in range(count):
                 nearest[i] = -1
-            return start, np.zeros(3), np.zeros((6, 6)), nearest, chance
+            return start, np.zeros(3), np.zeros((6, 6)), nearest, 0.0
     pair = np.full(count, -1)
     for i in range(count):
         if nearest[i] >= 0:
             pair[i] = around[nearest[i]]
-    return place, theta, normal, pair, chance
+    return place, theta, normal, pair, evidence
+
+
+@njit
+def log_evidence(
+    nearest: IntArray, seen: Seen, found: Found, image: Image, log_diameter_sigma: float
+) -> float:
+    """Return how much likelier the detections are with the camera at a place than scattered, as a logarithm.
+
+    Given the sizes of all detections, each lies anywhere in the image if it is scattered. At the right place it is,
+    with a probability that follows from the numbers of craters and of detections of about its size, one of the
+    craters, each of which is as likely as its size agrees. A detection without a pair counts as scattered although
+    craters may be near, and the positions of pairs have a normal distribution. So the mean ratio of scattered
+    detections is at most one, and chance exceeds a ratio r with a probability of at most 1 / r (Markov's inequality).
+
+    Parameters
+    ----------
+    nearest
+        Predicted crater of each detection, -1 for none, shape (k,); none twice.
+    """
+    count, members = nearest.size, seen.log_diameter.size
+    area_px2 = 4.0 * image.half_px[0] * image.half_px[1]
+    ratio, share = np.zeros(count), np.zeros(count)
+    for i in range(count):
+        of_craters, of_detections = 0.0, 0.0
+        for m in range(members):
+            of_craters += _density(found.log_diameter[i] - seen.log_diameter[m], log_diameter_sigma)
+        for k in range(count):
+            of_detections += _density(found.log_diameter[i] - found.log_diameter[k], log_diameter_sigma)
+        share[i] = of_craters / of_detections
+        m = nearest[i]
+        if m < 0 or of_craters <= 0.0:
+            continue
+        variance = found.variance_px2[i] + seen.variance[m]
+        away = (found.uv_px[i, 0] - seen.uv[m, 0]) ** 2 + (found.uv_px[i, 1] - seen.uv[m, 1]) ** 2
+        alike = _density(found.log_diameter[i] - seen.log_diameter[m], log_diameter_sigma) / of_craters
+        ratio[i] = area_px2 * alike * math.exp(-0.5 * away / variance) / (2.0 * math.pi * variance)
+    best = -math.inf
+    totals = np.zeros(len(_RECALLS))
+    for r in range(len(_RECALLS)):
+        for i in range(count):
+            totals[r] += math.log1p(min(_RECALLS[r] * share[i], _LARGEST_SHARE) * (ratio[i] - 1.0))
+        best = max(best, totals[r])
+    mean = 0.0
+    for r in range(len(_RECALLS)):
+        mean += math.exp(totals[r] - best) / len(_RECALLS)
+    return best + math.log(mean)
+
+
+@njit
+def _density(difference: float, sigma: float) -> float:
+    """Return the normal density."""
+    return math.exp(-0.5 * (difference / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
 
 
 @njit
@@ -199,11 +264,11 @@ def _project(
     craters: Craters,
     around: IntArray,
 ) -> None:
-    """Fill `seen` with the craters around; a diameter of -1 marks those outside the image."""
+    """Fill `seen` with the craters around."""
     position, focal_px = craters.position, image.focal_px
     for m in range(around.size):
         j = around[m]
-        seen.diameter[m] = -1.0
+        seen.log_diameter[m] = -math.inf
         dx, dy, dz = position[j, 0] - place[0], position[j, 1] - place[1], position[j, 2] - place[2]
         for a in range(3):
             seen.enu[m, a] = enu[a, 0] * dx + enu[a, 1] * dy + enu[a, 2] * dz
@@ -216,36 +281,22 @@ def _project(
         if abs(x) > image.half_px[0] + _MARGIN_PX or abs(y) > image.half_px[1] + _MARGIN_PX:
             continue
         seen.uv[m, 0], seen.uv[m, 1] = image.centre_px[0] + x, image.centre_px[1] + y
-        seen.diameter[m] = craters.diameter[j] * focal_px / depth
+        seen.log_diameter[m] = math.log(craters.diameter[j] * focal_px / depth)
         seen.variance[m] = (craters.sigma_m[j] * focal_px / depth) ** 2
 
 
 @njit
-def _choose(
-    nearest: IntArray,
-    chance: FloatArray,
-    seen: Seen,
-    found: Found,
-    image: Image,
-    gates: Gates,
-    tolerance2: float,
-    final: bool,
-) -> int:
-    """Fill the crater of each detection with mutual nearest ones and return their number; in the end, chance, too."""
-    count, members = nearest.size, seen.diameter.size
+def _choose(nearest: IntArray, seen: Seen, found: Found, gates: Gates, tolerance2: float) -> int:
+    """Fill the crater of each detection with mutual nearest ones and return their number."""
+    count, members = nearest.size, seen.log_diameter.size
     distance = np.full(count, np.inf)
     taken_by = np.full(members, -1)
     for i in range(count):
-        nearest[i], chance[i] = -1, 0.0
+        nearest[i] = -1
         for m in range(members):
-            if (
-                seen.diameter[m] <= 0.0
-                or abs(math.log(found.diameter_px[i] / seen.diameter[m])) > gates.log_diameter
-            ):
+            if abs(found.log_diameter[i] - seen.log_diameter[m]) > gates.log_diameter:
                 continue
             limit = max(gates.chi_square * (found.variance_px2[i] + seen.variance[m]), tolerance2)
-            if final:
-                chance[i] += math.pi * limit / (4.0 * image.half_px[0] * image.half_px[1])
             away = (found.uv_px[i, 0] - seen.uv[m, 0]) ** 2 + (found.uv_px[i, 1] - seen.uv[m, 1]) ** 2
             if away < limit and away < distance[i]:
                 nearest[i], distance[i] = m, away

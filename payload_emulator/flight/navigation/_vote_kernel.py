@@ -22,6 +22,9 @@ _RAISE = 3
 _FULL_SCORE = 255
 """Largest score of a place, and the detection that no place has had a vote of: both are eight bits."""
 
+CHANCE_LIMIT = 0.38
+"""Largest number of chance votes of a detection on a block: of more, the detection does not vote."""
+
 _LARGEST_SINE = 0.98
 """Craters under a larger sine are too close to the limb for their depth to be known."""
 
@@ -196,8 +199,9 @@ def _pieces(
 def _weight(votes: int, blocks: Blocks, weight_limit: float) -> int:
     """Return the weight of each vote of a detection, from how many votes it casts; 0 where it casts none."""
     expected = votes * 4.0 * blocks.cell * blocks.cell / blocks.area
-    weight = round(2.0 * min(math.log(0.5 / max(expected, 1e-9)), weight_limit))
-    return weight if votes else 0
+    if votes == 0 or expected > CHANCE_LIMIT:
+        return 0
+    return round(2.0 * min(math.log(0.5 / max(expected, 1e-9)), weight_limit))
 
 
 @njit

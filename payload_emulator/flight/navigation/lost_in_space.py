@@ -6,9 +6,10 @@ each altitude: votes are counted over the whole map, the best places are fitted 
 one is believed if chance would make up such a place less often than a limit anywhere in the search, and no other
 place does nearly as well. Otherwise the answer is that there is no fix.
 
-Chance is counted so: detections thrown at random into the image fall within the tolerance of a crater of their size
-with a known probability; the number that does is Poisson distributed, and there are as many trials as the search has
-distinguishable poses (an a-contrario test; Desolneux, Moisan, Morel 2000).
+Chance is counted by the Bayes factor of a place: how much likelier the detections are with the camera there than
+scattered over the image, on the average over all poses that are possible before. Its expected value for scattered
+detections is one, so that chance exceeds 1 / p anywhere in the search with a probability of at most p (Markov's
+inequality). Near a place, the average over poses follows from the fit and its normal matrix (Laplace's method).
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ NADIR_NORTH_UP: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 
 
 FRAMES_COMBINED = 4
 
-# Candidates of each frame that take part in a search over several.
-_CANDIDATES_COMBINED = 12
+# Candidates that a search of a frame returns, and those that take part in a search over several frames.
+_CANDIDATES, _CANDIDATES_COMBINED = 48, 12
 
 # Bins of rim height: half a bin moves a place by 350 m at the edge of the image.
 _HEIGHT_BIN_M = 400.0
@@ -42,6 +43,10 @@ _TILE_RAD = math.radians(15.0)
 _TILE_FACTOR = 1_000
 # The vote leaves out places this far from any crater.
 _MARGIN_RAD = math.radians(3.0)
+# Largest number of detections that vote, which the vote keeps in eight bits, and the number that always votes.
+_VOTERS, _LEAST_VOTERS = 250, 6
+# Quantiles of the sizes of all craters, to tell how many are like a detection.
+_QUANTILES = 257
 # Largest natural logarithm of how much rarer a chance vote is than a true one: one detection decides nothing.
 _WEIGHT_LIMIT = 6.0
 # The gate of a fit for logarithms of diameters over that of the vote, which is narrow to cast few chance votes.
@@ -77,6 +82,8 @@ class LostParameters:
         Ratio of neighbouring altitudes less one.
     log_diameter_gate
         Largest difference of the logarithms of measured and catalogued diameter.
+    log_diameter_sigma
+        Standard deviation of that difference.
     detections
         Number of detections used, strongest first: all that a detector gives. Those smaller than any crater of the map
         cost no evidence, since no crater is like them, and the strongest alone are not those that the map holds.
@@ -85,12 +92,12 @@ class LostParameters:
     gate
         Chi-square within which a crater explains a detection after the fit; 99.5 % of true pairs.
     false_fix_limit
-        Expected number of false fixes per search.
+        Largest probability that a search of scattered detections ends with a fix.
     rival_ratio
         A fix must be this many times less likely made up by chance than the best other place.
     cells, votes
-        Bounds of work space and work: cells of the vote (2 octets each), and detections times craters that vote; over
-        a large map only the largest of the detections do.
+        Bounds of work space and work: cells of the vote (2 octets each), and pairs of a detection and a crater of its
+        size that vote at all altitudes together. The largest detections vote, which the fewest craters resemble.
     """
 
     minimum_altitude_m: float = 12_000.0
@@ -99,13 +106,14 @@ class LostParameters:
     block_px: float = 14.0
     altitude_step: float = 0.045
     log_diameter_gate: float = 0.2
+    log_diameter_sigma: float = 0.1
     detections: int = 120
-    places: int = 48
+    places: int = 500
     gate: float = 10.6
     false_fix_limit: float = 1e-4
     rival_ratio: float = 1e3
     cells: int = 12_000_000
-    votes: int = 400_000
+    votes: int = 8_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +126,8 @@ class PlaceIndex:
         The map itself, for the fit.
     extent
         South, north, west, width in longitude (rad) and area (sr) of what the map covers.
+    size_quantiles
+        Logarithms of diameters at equal steps of rank, ascending, of the map as a whole.
     """
 
     landmarks: LandmarkMap
@@ -130,12 +140,19 @@ class PlaceIndex:
     tangent: FloatArray
     longitude_rad: FloatArray
     extent: FloatArray
+    size_quantiles: FloatArray
 
     @property
     def octets(self) -> int:
         """Return the size of what is kept in addition to the map."""
         bins = (self.tile_start, self.bin_start, self.bin_height, self.height_m)
-        craters = (self.log_diameter, self.latitude_rad, self.tangent, self.longitude_rad)
+        craters = (
+            self.log_diameter,
+            self.latitude_rad,
+            self.tangent,
+            self.longitude_rad,
+            self.size_quantiles,
+        )
         return int(sum(array.nbytes for array in (*bins, *craters)))
 
     def __len__(self) -> int:
@@ -156,10 +173,8 @@ class Place:
         Standard deviations east, north, up.
     detection, index
         Pairs: indices into the detections and into the map.
-    chance
-        Expected number of pairs by chance.
     log_false
-        Natural logarithm of the expected number of places as good as this that chance makes up per search.
+        Natural logarithm of the largest probability that chance makes up a place as good as this in a search.
     """
 
     position_mcmf_m: FloatArray
@@ -167,7 +182,6 @@ class Place:
     sigma_m: FloatArray
     detection: IntArray
     index: IntArray
-    chance: float
     log_false: float
 
     def __len__(self) -> int:
@@ -217,6 +231,7 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
         np.tan(latitude[order]),
         west + np.mod(longitude[order] - west, 2.0 * math.pi),
         np.array([south, north, west, width, area]),
+        np.quantile(log_diameter, np.linspace(0.0, 1.0, _QUANTILES)) if log_diameter.size else np.zeros(0),
     )
 
 
@@ -228,7 +243,7 @@ def candidate_places(
     parameters: LostParameters = LostParameters(),
     camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> list[Place]:
-    """Return places that explain at least three detections, the least likely by chance first.
+    """Return the best places that explain at least three detections, the least likely by chance first.
 
     Parameters
     ----------
@@ -248,14 +263,12 @@ def candidate_places(
     chosen, sigma = found.select(usable), np.maximum(sigma_px[usable], _SMALLEST_SIGMA_PX)
     uv = np.stack([chosen.u_px, chosen.v_px], axis=1)
     places = _voted(uv, chosen.diameter_px, index, camera, parameters, camera_from_enu)
-    fits = []
-    for start in places:
-        place = _fitted(start, uv, chosen.diameter_px, sigma, index, camera, parameters, camera_from_enu)
-        if place is not None:
-            fits.append(place)
+    fits = _fitted(places, uv, chosen.diameter_px, sigma, index, camera, parameters, camera_from_enu)
     fits.sort(key=lambda place: place.log_false)
     apart: list[Place] = []
     for place in fits:
+        if len(apart) == _CANDIDATES:
+            break
         if all(_distance_m(place, other) > _same_place_m(place, camera, parameters) for other in apart):
             apart.append(place)
     return [_renumbered(place, usable) for place in apart]
@@ -356,13 +369,10 @@ def _voted(
     log_size = np.log(
         diameter_px / camera.focal_px * rays[:, 2] / np.cos(np.minimum(off_nadir, _LARGEST_OFF_NADIR_RAD))
     )
-    voters = max(8, parameters.votes // len(index))
-    order = np.argsort(-diameter_px, kind="stable")[: min(voters, 250)]
     south, north, west, width, area = index.extent
     low, high = parameters.minimum_altitude_m, parameters.maximum_altitude_m
     steps = math.ceil(math.log(high / low) / math.log1p(parameters.altitude_step)) + 1
     listed = np.zeros((parameters.places + 1, 4))
-    result: list[tuple[float, FloatArray]] = []
     # The widest parallel of the map: the equator where it holds it.
     widest = math.cos(max(south, -north, 0.0))
     smallest = math.sqrt((north - south) * width * widest / parameters.cells)
@@ -376,14 +386,16 @@ def _voted(
         index.tangent,
         index.longitude_rad,
     )
+    altitudes_m = np.geomspace(low, high, steps)
+    cells = np.maximum(0.5 * parameters.block_px * altitudes_m / camera.focal_px / MOON_RADIUS_M, smallest)
+    order = np.argsort(-diameter_px, kind="stable")[:_VOTERS]
+    order = order[: _affordable(log_size[order], altitudes_m, cells, index, parameters)]
     work = np.empty(0, dtype=np.uint16)
-    for altitude_m in np.geomspace(low, high, steps):
-        cell = max(0.5 * parameters.block_px * altitude_m / camera.focal_px / MOON_RADIUS_M, smallest)
+    for altitude_m, cell in zip(altitudes_m, cells, strict=True):
         rows = math.ceil((north - south) / cell) + 1
         columns = math.ceil(width * widest / cell) + 2
         if not work.size:
             work = np.empty(rows * columns, dtype=np.uint16)
-        before = {tuple(row) for row in listed[1 : int(listed[0, 0]) + 1]}
         vote(
             MOON_RADIUS_M + float(altitude_m),
             MOON_RADIUS_M,
@@ -396,18 +408,49 @@ def _voted(
             listed,
             parameters.places,
         )
-        for row in listed[1 : int(listed[0, 0]) + 1]:
-            if tuple(row) in before:
-                continue
-            latitude = south + (row[1] + 1.0) * cell
-            longitude = west + (row[2] + 1.0) * cell / math.cos(latitude)
-            result.append((float(row[0]), _mcmf(latitude, longitude, float(row[3]))))
-    result.sort(key=lambda item: -item[0])
-    return np.array([place for _, place in result[: parameters.places]]).reshape(-1, 3)
+    _, row, column, distance_m = listed[1 : int(listed[0, 0]) + 1].T
+    edge = cells[np.searchsorted(altitudes_m, distance_m - MOON_RADIUS_M - 1.0)]
+    latitude = south + (row + 1.0) * edge
+    longitude = west + (column + 1.0) * edge / np.cos(latitude)
+    flat = distance_m * np.cos(latitude)
+    return np.stack(
+        [flat * np.cos(longitude), flat * np.sin(longitude), distance_m * np.sin(latitude)], axis=1
+    )
+
+
+def _affordable(
+    log_size: FloatArray,
+    altitudes_m: FloatArray,
+    cells_rad: FloatArray,
+    index: PlaceIndex,
+    parameters: LostParameters,
+) -> int:
+    """Return how many detections, from the first on, may vote within the bound of work.
+
+    The same ones vote at all altitudes, so that the votes of places can be compared.
+
+    Parameters
+    ----------
+    log_size
+        Logarithms of diameter over depth, largest diameter first, shape (k,).
+    altitudes_m, cells_rad
+        Altitudes and the edges of a quarter block there, shape (h,).
+    """
+    from payload_emulator.flight.navigation._vote_kernel import CHANCE_LIMIT
+
+    size = log_size[:, None] + np.log(altitudes_m)
+    level = np.linspace(0.0, len(index), index.size_quantiles.size)
+    below, above = (
+        np.interp(size + sign * parameters.log_diameter_gate, index.size_quantiles, level)
+        for sign in (-1.0, 1.0)
+    )
+    votes = above - below
+    votes[votes * 4.0 * cells_rad**2 > CHANCE_LIMIT * index.extent[4]] = 0.0
+    return max(_LEAST_VOTERS, int(np.searchsorted(np.cumsum(votes.sum(axis=1)), parameters.votes)))
 
 
 def _fitted(
-    start: FloatArray,
+    places: FloatArray,
     uv: FloatArray,
     diameter_px: FloatArray,
     sigma_px: FloatArray,
@@ -415,100 +458,81 @@ def _fitted(
     camera: PinholeCamera,
     parameters: LostParameters,
     camera_from_enu: FloatArray,
-) -> Place | None:
-    """Return a place fitted to the detections it explains, None where they are fewer than three."""
+) -> list[Place]:
+    """Return places (MCMF), shape (n, 3), fitted to the detections they explain; those without three are left out."""
     from payload_emulator.flight.navigation._fit_kernel import Craters, Found, Gates, Image, fit_place
 
     landmarks = index.landmarks
-    position, attitude, normal, pair, chance = fit_place(
-        start,
-        camera_from_enu,
-        Image(
-            camera.focal_px,
-            np.array(camera.centre_px),
-            0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64),
-        ),
-        Found(uv, diameter_px, sigma_px**2),
-        Craters(
-            landmarks.latitude_rad,
-            landmarks.position_mcmf_m,
-            landmarks.diameter_m,
-            np.hypot(landmarks.sigma_m[:, 0], landmarks.sigma_m[:, 1]) / math.sqrt(2.0),
-        ),
-        parameters.attitude_sigma_rad,
-        Gates(parameters.block_px, parameters.gate, _LOG_GATE_FACTOR * parameters.log_diameter_gate),
-        MOON_RADIUS_M,
+    half_px = 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    image = Image(camera.focal_px, np.array(camera.centre_px), half_px)
+    found = Found(uv, np.log(diameter_px), sigma_px**2)
+    craters = Craters(
+        landmarks.latitude_rad,
+        landmarks.position_mcmf_m,
+        landmarks.diameter_m,
+        np.hypot(landmarks.sigma_m[:, 0], landmarks.sigma_m[:, 1]) / math.sqrt(2.0),
     )
-    detection = np.flatnonzero(pair >= 0)
-    altitude_m = float(np.linalg.norm(position)) - MOON_RADIUS_M
+    gates = Gates(
+        parameters.block_px,
+        parameters.gate,
+        _LOG_GATE_FACTOR * parameters.log_diameter_gate,
+        parameters.log_diameter_sigma,
+    )
     lowest_m = parameters.minimum_altitude_m / _ALTITUDE_SLACK
-    inside = lowest_m < altitude_m < _ALTITUDE_SLACK * parameters.maximum_altitude_m
-    if detection.size < 3 or not inside:
-        return None
-    try:
-        covariance = np.linalg.inv(normal)
-    except np.linalg.LinAlgError:
-        return None
-    expected = float(np.minimum(chance, 1.0).sum())
-    trials = _log_trials(index, altitude_m, float(np.median(sigma_px)), camera, parameters)
-    return Place(
-        position,
-        attitude,
-        np.sqrt(np.maximum(np.diag(covariance)[:3], 0.0)),
-        detection,
-        pair[detection],
-        expected,
-        trials + log_poisson_tail(detection.size, expected),
-    )
+    highest_m = _ALTITUDE_SLACK * parameters.maximum_altitude_m
+    fits: list[Place] = []
+    for start in places:
+        position, attitude, normal, pair, evidence = fit_place(
+            start, camera_from_enu, image, found, craters, parameters.attitude_sigma_rad, gates, MOON_RADIUS_M
+        )
+        detection = np.flatnonzero(pair >= 0)
+        altitude_m = float(np.linalg.norm(position)) - MOON_RADIUS_M
+        if detection.size < 3 or not lowest_m < altitude_m < highest_m:
+            continue
+        try:
+            covariance = np.linalg.inv(normal)
+        except np.linalg.LinAlgError:
+            continue
+        fits.append(
+            Place(
+                position,
+                attitude,
+                np.sqrt(np.maximum(np.diag(covariance)[:3], 0.0)),
+                detection,
+                pair[detection],
+                -evidence - _log_share(altitude_m, attitude, normal, index, parameters),
+            )
+        )
+    return fits
 
 
-def log_poisson_tail(count: int, mean: float) -> float:
-    """Return the logarithm of the probability of at least a number of events of a Poisson distribution."""
-    if count <= 0 or mean <= 0.0:
-        return 0.0 if count <= 0 else -math.inf
-    if count <= mean:
-        # Not the tail any more: no evidence.
-        return 0.0
-    first = count * math.log(mean) - mean - math.lgamma(count + 1)
-    total, term = 1.0, 1.0
-    for k in range(count + 1, count + 200):
-        term *= mean / k
-        total += term
-        if term < 1e-12 * total:
-            break
-    return min(first + math.log(total), 0.0)
-
-
-def _log_trials(
-    index: PlaceIndex,
+def _log_share(
     altitude_m: float,
-    sigma_px: float,
-    camera: PinholeCamera,
+    attitude_rad: FloatArray,
+    normal: FloatArray,
+    index: PlaceIndex,
     parameters: LostParameters,
 ) -> float:
-    """Return the logarithm of the number of poses that the search tells apart.
+    """Return the logarithm of the share of all possible poses that agrees with the detections as well as a fit.
 
-    Two poses are told apart if they move craters by more than the radius within which pairs are accepted: cells of
-    place, steps of altitude at the edge of the image, and steps of attitude within two sigma.
+    All places of the map are alike, so are logarithms of the altitude; the attitude has the normal distribution of its
+    sigma, per axis. The normal matrix (6, 6) tells how far place and attitude may move.
     """
-    radius_px = sigma_px * math.sqrt(parameters.gate)
-    cell_m = radius_px * altitude_m / camera.focal_px
-    places = index.extent[4] * MOON_RADIUS_M**2 / (math.pi * cell_m**2)
-    edge_px = 0.5 * camera.width_px
+    sigma = parameters.attitude_sigma_rad
     span = math.log(parameters.maximum_altitude_m / parameters.minimum_altitude_m)
-    altitudes = 1.0 + span * edge_px / (2.0 * radius_px)
-    # Beyond the shift that a change of place makes up for, a tilt distorts: focal length times tangent squared.
-    swing = 4.0 * parameters.attitude_sigma_rad / (2.0 * radius_px)
-    tilts = (1.0 + swing * edge_px**2 / camera.focal_px) ** 2
-    turns = 1.0 + swing * edge_px
-    return math.log(places * altitudes * tilts * turns)
+    of_place = -math.log(float(index.extent[4]) * MOON_RADIUS_M**2 * altitude_m * span)
+    of_attitude = (
+        -1.5 * math.log(2.0 * math.pi * sigma**2) - 0.5 * float(attitude_rad @ attitude_rad) / sigma**2
+    )
+    volume = 3.0 * math.log(2.0 * math.pi) - 0.5 * float(np.linalg.slogdet(normal)[1])
+    return of_place + of_attitude + volume
 
 
 def _log_false_of_chain(chain: tuple[tuple[int, Place], ...], parameters: LostParameters) -> float:
-    """Return the logarithm of the number of chains as good as this that chance makes up.
+    """Return the logarithm of the largest probability that chance makes up a chain as good as this.
 
     The first place may be anywhere; the next lies on a ring about it, a further one near a point. What a ring and a
-    point leave of the trials of a whole search is at most one in two thousand and one in two million.
+    point leave of the poses of a whole search is at most one in two thousand and one in two million.
     """
     total = 0.0
     for number, (_, place) in enumerate(chain):
@@ -563,7 +587,6 @@ def _renumbered(place: Place, usable: IntArray) -> Place:
         place.sigma_m,
         usable[place.detection].astype(np.int64),
         place.index,
-        place.chance,
         place.log_false,
     )
 
@@ -577,8 +600,3 @@ def _span(longitude: FloatArray) -> tuple[float, float]:
     widest = int(np.argmax(gaps))
     west = float(ordered[(widest + 1) % ordered.size])
     return west, 2.0 * math.pi - float(gaps[widest])
-
-
-def _mcmf(latitude: float, longitude: float, radius_m: float) -> FloatArray:
-    flat = radius_m * math.cos(latitude)
-    return np.array([flat * math.cos(longitude), flat * math.sin(longitude), radius_m * math.sin(latitude)])

@@ -381,7 +381,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
     there = 1.01 * turn.apply(prior.mean[:3])
     place = Place(
         orbit.rotations[0] @ there, np.zeros(3), np.array([30.0, 80.0, 50.0]), np.array([2, 5, 7]), np.array([4, 1, 9]),
-        0.1, -20.0,
+        -20.0,
     )  # fmt: skip
     search = recorded(monkeypatch, recovery, "find_place", place)
     updated = recorded(monkeypatch, recovery, "correct", "the fix")

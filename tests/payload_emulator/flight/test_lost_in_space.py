@@ -9,17 +9,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
+from payload_emulator.flight.navigation._fit_kernel import Found, Image, Seen, log_evidence
 from payload_emulator.flight.navigation.lost_in_space import (
     NADIR_NORTH_UP,
     LostFrame,
     LostParameters,
     PlaceIndex,
+    _affordable,
     candidate_places,
     find_place,
     find_place_in_frames,
-    log_poisson_tail,
     place_index,
 )
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
@@ -230,17 +232,65 @@ def test_tiles_do_not_change_the_place_found(seed: int, index: PlaceIndex) -> No
     np.testing.assert_array_equal(tiled.detection, single.detection)
 
 
-def test_the_tail_of_the_poisson_distribution_is_that_of_the_sum() -> None:
-    for mean, count in ((0.1, 3), (2.0, 7), (5.0, 20)):
-        exact = 1.0 - sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(count))
-        assert log_poisson_tail(count, mean) == pytest.approx(math.log(exact), abs=1e-3)
-    assert log_poisson_tail(3, 5.0) == 0.0
-    assert log_poisson_tail(0, 0.5) == 0.0
+IMAGE = Image(100.0, np.array([50.0, 50.0]), np.array([50.0, 50.0]))
+PREDICTED_PX = np.array([[20.0, 20.0], [80.0, 30.0], [40.0, 70.0], [75.0, 80.0]])
+
+
+def evidence_of(uv_px: FloatArray, diameter_px: FloatArray, pairs: list[int]) -> float:
+    """Return the evidence of detections for four craters of 8 to 64 px predicted in an image of 100 by 100."""
+    seen = Seen(PREDICTED_PX, np.log([8.0, 16.0, 32.0, 64.0]), np.zeros((4, 3)), np.zeros(4))
+    found = Found(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2))
+    return log_evidence(np.array(pairs), seen, found, IMAGE, 0.1)
+
+
+def test_scattered_detections_have_no_evidence_on_average() -> None:
+    """The mean likelihood ratio is one for pairs at any distance, and less where only near ones count."""
+    rng = np.random.default_rng(2)
+    pairs, diameter = [0, 1, 3], np.array([8.5, 17.0, 60.0])
+    every, near = np.empty((2, 20_000))
+    for k in range(every.size):
+        uv = rng.uniform(0.0, 100.0, (3, 2))
+        every[k] = math.exp(evidence_of(uv, diameter, pairs))
+        away = np.linalg.norm(uv - PREDICTED_PX[pairs], axis=1)
+        near[k] = math.exp(evidence_of(uv, diameter, np.where(away < 6.0, pairs, -1).tolist()))
+    doubt = every.std() / math.sqrt(every.size)
+    assert doubt < 0.1 and abs(every.mean() - 1.0) < 3.0 * doubt
+    assert near.mean() < every.mean()
+
+
+def test_evidence_grows_with_agreement_of_place_and_size() -> None:
+    pairs, diameter = [0, 1, 3], np.array([8.0, 16.0, 64.0])
+    exact = PREDICTED_PX[pairs]
+    best = evidence_of(exact, diameter, pairs)
+    assert best > evidence_of(exact + np.array([3.0, 0.0]), diameter, pairs) > 0.0
+    assert best > evidence_of(exact, diameter * 1.15, pairs) > evidence_of(exact, diameter, [0, 1, -1])
+    # A detection that resembles no crater of the map says nothing; one that does and lies elsewhere speaks against it.
+    more = np.array([*exact, [50.0, 50.0]])
+    assert evidence_of(more, np.append(diameter, 200.0), [*pairs, -1]) == pytest.approx(best, abs=1e-6)
+    assert evidence_of(more, np.append(diameter, 32.0), [*pairs, -1]) < best - 0.1
+
+
+def test_the_same_detections_vote_at_all_altitudes_within_the_bound_of_work(index: PlaceIndex) -> None:
+    log_size = np.log(np.linspace(0.9, 0.1, 40))
+    altitudes, cells = np.geomspace(12e3, 55e3, 20), np.full(20, 2e-4)
+    size = np.sort(np.log(index.landmarks.diameter_m))
+    wanted = log_size[:, None] + np.log(altitudes)
+    gate = RULES.log_diameter_gate
+    pairs = (np.searchsorted(size, wanted + gate) - np.searchsorted(size, wanted - gate)).sum(axis=1)
+    for share in (0.3, 0.7):
+        votes = int(share * pairs.sum())
+        voters = _affordable(log_size, altitudes, cells, index, replace(RULES, votes=votes))
+        assert 6 < voters < 40
+        assert pairs[: voters - 1].sum() < 1.05 * votes and pairs[: voters + 1].sum() > 0.95 * votes
+    assert _affordable(log_size, altitudes, cells, index, replace(RULES, votes=0)) == 6
+    assert _affordable(log_size, altitudes, cells, index, replace(RULES, votes=10**9)) == 40
+    # Detections whose votes would be spread over every block do not vote and cost nothing.
+    assert _affordable(log_size, altitudes, np.full(20, 1.0), index, replace(RULES, votes=1)) == 40
 
 
 def test_the_index_is_small_beside_the_table(index: PlaceIndex) -> None:
-    # Four float64 per crater and a few bins; 22 octets per crater in the table itself.
-    assert index.octets < 33 * len(index) + 2_000
+    # Four float64 per crater, a few bins and the quantiles of sizes; 22 octets per crater in the table itself.
+    assert index.octets < 33 * len(index) + 5_000
 
 
 def test_the_nominal_attitude_looks_down_with_north_up() -> None:
