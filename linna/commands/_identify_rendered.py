@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 from linna.output import emit, log, progress
 
 if TYPE_CHECKING:
-    from studies.lost_in_space import HostileSearches, LostRow, Share
+    from lunar.arrays import IntArray
+    from payload_emulator.flight.vision.detector import OnnxDetector
+    from payload_emulator.session.world import World
+    from studies.lost_in_space import HostileSearches, LostRow, SeenFrames, Share
 
 LEAST_CATALOGUED = 6
 
@@ -19,11 +22,9 @@ LEAST_CATALOGUED = 6
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.flight.models import load_shipped_model
     from payload_emulator.flight.navigation.lost_in_space import FRAMES_COMBINED, LostParameters
-    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.session.mission import level_of, level_text, unseen_share
-    from payload_emulator.session.scenario import format_scenario, load_scenario
+    from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world import build_world
     from studies import lost_in_space as study
 
@@ -35,19 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--scenario {arguments.scenario}: expected {FRAMES_COMBINED} frames in a row, found none"
         )
-    camera = world.camera
-    detector = OnnxDetector(
-        load_shipped_model(), DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
-    )
-    key = _key(format_scenario(scenario), numbers.tobytes(), detector.sha256)
-    if arguments.detections is not None and arguments.detections.exists():
-        seen = study.load_seen_frames(arguments.detections, key)
-    else:
-        seen = study.see_frames(
-            world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
-        )
-        if arguments.detections is not None:
-            study.save_seen_frames(arguments.detections, seen, key)
+    detector, seen = _seen(arguments, world, numbers)
     log("map of the search")
     true, board = study.search_map(world, numbers, 1e3 * arguments.min_diameter_km)
     parameters = LostParameters(attitude_sigma_rad=math.radians(arguments.attitude_deg))
@@ -103,6 +92,29 @@ def run(arguments: argparse.Namespace) -> int:
     )
     emit(arguments, figures, text="\n".join([*table, last, level]))
     return 0
+
+
+def _seen(arguments: argparse.Namespace, world: World, numbers: IntArray) -> tuple[OnnxDetector, SeenFrames]:
+    """Return the detector that flies and what it finds in frames, kept or found now."""
+    from payload_emulator.flight.models import load_shipped_model
+    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
+    from payload_emulator.session.scenario import format_scenario
+    from studies import lost_in_space as study
+
+    camera = world.camera
+    detector = OnnxDetector(
+        load_shipped_model(), DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
+    )
+    key = _key(format_scenario(world.scenario), numbers.tobytes(), detector.sha256)
+    if arguments.detections is not None and arguments.detections.exists():
+        seen = study.load_seen_frames(arguments.detections, key)
+    else:
+        seen = study.see_frames(
+            world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
+        )
+        if arguments.detections is not None:
+            study.save_seen_frames(arguments.detections, seen, key)
+    return detector, seen
 
 
 def _statistics(single: Sequence[LostRow], wrong_m: float) -> dict[str, float | None]:
