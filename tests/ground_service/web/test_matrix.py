@@ -43,6 +43,13 @@ FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
 
 AXE_WIDTHS = (1280, 390)
+LONG_LOG = """() => {
+  const feed = document.getElementById("feed");
+  for (let k = 0; feed && k < 60; k++)
+    feed.append(Object.assign(document.createElement("li"), {textContent: `line ${k}`}));
+}"""
+"""A log that is longer than its box, as after a long pass."""
+
 COLUMNS = ("wider than the window", "axe", "console errors", "not reached by Tab", "without a focus mark")
 SIGN_IN = "sign-in"
 API_PAGE = "/docs"
@@ -200,6 +207,7 @@ class Faults:
 
     def find(self, page: Page, name: str) -> None:
         """Look at an opened page in all forms."""
+        page.evaluate(LONG_LOG)
         for scheme in SCHEMES:
             page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]  # one of its words
             for font, family in FONTS.items():
