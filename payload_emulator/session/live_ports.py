@@ -37,14 +37,11 @@ class Client:
         Consecutive number of the connection; unlike a descriptor, it is never reused.
     unsent
         Octets that are not sent yet.
-    takes_data
-        Whether the client can still be sent to.
     """
 
     number: int
     connection: socket.socket
     unsent: bytearray = field(default_factory=bytearray)
-    takes_data: bool = True
     events: int = selectors.EVENT_READ
 
 
@@ -174,9 +171,6 @@ class Server:
             self.drop(client)
 
     def _flush(self, client: Client) -> None:
-        if not client.takes_data:
-            client.unsent.clear()
-            return
         try:
             while client.unsent:
                 del client.unsent[: client.connection.send(client.unsent[:_CHUNK_OCTETS])]
@@ -195,11 +189,10 @@ class Server:
 
     def _stop_sending(self, client: Client) -> None:
         """Give up sending to a client; it is dropped when what it has sent so far is read."""
-        client.takes_data = False
         client.unsent.clear()
         with contextlib.suppress(OSError):  # the client may have closed the connection
             client.connection.shutdown(socket.SHUT_RDWR)
-        if self._selector is None or self.document is not None:
+        if self._selector is None:
             self.drop(client)
         else:
             self._select(client, selectors.EVENT_READ)
