@@ -8,7 +8,7 @@ from __future__ import annotations
 import ipaddress
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlsplit
 
 from pydantic import BeforeValidator, Field, SecretStr, ValidationError, field_validator
@@ -292,7 +292,7 @@ def load_settings(**given: object) -> Settings:
     SettingsError
         If a value is invalid; the message names the setting.
     """
-    values = {name: value for name, value in given.items() if value is not None}
+    values: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     for name in (*URLS, *SECRETS):
         path = os.environ.get(f"LINNA_{name.upper()}_FILE")
         if path and name not in values:
@@ -305,7 +305,7 @@ def load_settings(**given: object) -> Settings:
                 f"LINNA_{name.upper()}", str(url), _secret(f"{name.removesuffix('_url')}_password", password)
             )
     try:
-        return Settings(**values)  # type: ignore[arg-type]
+        return Settings(**values)
     except ValidationError as error:
         first = error.errors()[0]
         name = "LINNA_" + "_".join(str(part) for part in first["loc"]).upper()

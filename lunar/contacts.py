@@ -84,10 +84,10 @@ def visibility_spans(
     def spans(condition: Callable[[IntArray], BoolArray]) -> tuple[Span, ...]:
         return tuple(find_windows(condition, start, stop, step_s))
 
-    found = {
-        station.name: spans(lambda utc_ns, station=station: link(ephemeris, utc_ns, station).visible)  # type: ignore[misc]
-        for station in stations
-    }
+    def seen_from(station: GroundStation) -> Callable[[IntArray], BoolArray]:
+        return lambda utc_ns: link(ephemeris, utc_ns, station).visible
+
+    found = {station.name: spans(seen_from(station)) for station in stations}
     whole = link(
         ephemeris, np.linspace(start, stop, 1 + int((stop - start) // (600 * NS)) + 1).astype(np.int64)
     )

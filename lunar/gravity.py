@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -145,12 +145,17 @@ def builtin_gravity() -> GravityField:
     return GravityField(table.NAME, table.GM_M3_S2, table.RADIUS_M, c_bar, s_bar)
 
 
-def _kept(gravity: GravityField, purpose: str, degree: int, pack: object) -> FloatArray:
+def _kept(
+    gravity: GravityField,
+    purpose: str,
+    degree: int,
+    pack: Callable[[FloatArray, FloatArray, float, float], FloatArray],
+) -> FloatArray:
     kept = _PACKED.setdefault(gravity, {})
     key = (purpose, degree)
     if key not in kept:
         cut = gravity.truncated(degree)
-        kept[key] = pack(cut.c_bar, cut.s_bar, cut.gm_m3_s2, cut.radius_m)  # type: ignore[operator]
+        kept[key] = pack(cut.c_bar, cut.s_bar, cut.gm_m3_s2, cut.radius_m)
     return kept[key]
 
 

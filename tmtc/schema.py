@@ -502,7 +502,9 @@ class _Compiled:
             self.tm_dtype = np.dtype([("header", _TM_HEADER_DTYPE), *_dtype_fields(definition.fields)])
         if group:
             count = definition.field(group.count)
-            self.count_offset = definition.data_start + int(self.base_dtype.fields[group.count][1])  # type: ignore[index]
+            places = self.base_dtype.fields
+            assert places is not None
+            self.count_offset = definition.data_start + int(places[group.count][1])
             self.count_dtype = count.dtype
 
     def packet(self, header: bytes, values: Mapping[str, object], sequence_count: int) -> bytes:

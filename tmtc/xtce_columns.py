@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import Any, Union, cast
 
 import numpy as np
 
@@ -112,20 +112,21 @@ def concatenated(columns: list[Column]) -> Column:
     if len(columns) == 1:
         return first
     if isinstance(first, ValueColumn):
-        raw = np.concatenate([c.raw for c in columns])  # type: ignore[union-attr]
-        if all(c.values is c.raw for c in columns):  # type: ignore[union-attr]
+        numbers = cast(list[ValueColumn], columns)
+        raw = np.concatenate([c.raw for c in numbers])
+        if all(c.values is c.raw for c in numbers):
             return ValueColumn(raw, raw)
-        return ValueColumn(raw, np.concatenate([c.values for c in columns]))  # type: ignore[union-attr]
+        return ValueColumn(raw, np.concatenate([c.values for c in numbers]))
     if isinstance(first, ArrayColumn):
-        return ArrayColumn(
-            np.concatenate([c.counts for c in columns]),  # type: ignore[union-attr]
-            concatenated([c.elements for c in columns]),  # type: ignore[union-attr]
-        )
+        arrays = cast(list[ArrayColumn], columns)
+        counts = np.concatenate([c.counts for c in arrays])
+        return ArrayColumn(counts, concatenated([c.elements for c in arrays]))
     if isinstance(first, RecordColumn):
+        records = cast(list[RecordColumn], columns)
         return RecordColumn(
-            {name: concatenated([c.members[name] for c in columns]) for name in first.members}  # type: ignore[union-attr]
+            {name: concatenated([c.members[name] for c in records]) for name in first.members}
         )
+    optional = cast(list[OptionalColumn], columns)
     return OptionalColumn(
-        np.concatenate([c.present for c in columns]),  # type: ignore[union-attr]
-        concatenated([c.column for c in columns]),  # type: ignore[union-attr]
+        np.concatenate([c.present for c in optional]), concatenated([c.column for c in optional])
     )

@@ -256,8 +256,13 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
 
     for entry in entries:
         item = entry.item
-        bits = item.type.bits if isinstance(item, Parameter) and isinstance(item.type, ScalarType) else None
-        numeric = bits is not None and isinstance(item.type.encoding, (IntegerEncoding, FloatEncoding))  # type: ignore[union-attr]
+        kind = item.type if isinstance(item, Parameter) and isinstance(item.type, ScalarType) else None
+        bits = None if kind is None else kind.bits
+        numeric = (
+            bits is not None
+            and kind is not None
+            and isinstance(kind.encoding, (IntegerEncoding, FloatEncoding))
+        )
         if numeric and not entry.from_start and entry.condition is None and cursor + entry.offset >= 0:
             assert isinstance(item, Parameter) and isinstance(item.type, ScalarType) and bits is not None
             if fields and _refers_to_open(item.type, fields):
@@ -547,8 +552,8 @@ def _read_aggregate(run: _Run, data_type: AggregateType, rows: _Rows) -> _Found:
 def _fixed_fields(data_type: DataType, offset: int = 0) -> list[tuple[ScalarType, int]] | None:
     """The numbers of a type of fixed width and their places, None where its width depends on the packet."""
     if isinstance(data_type, ScalarType):
-        numeric = isinstance(data_type.encoding, (IntegerEncoding, FloatEncoding))
-        if not numeric or data_type.encoding.calibration.contexts:  # type: ignore[union-attr]
+        encoding = data_type.encoding
+        if not isinstance(encoding, (IntegerEncoding, FloatEncoding)) or encoding.calibration.contexts:
             return None
         return [(data_type, offset)]
     if isinstance(data_type, ArrayType):

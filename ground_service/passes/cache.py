@@ -193,7 +193,8 @@ class Cache:
                     found = _Answer(value, state, self._number, self._vehicle, start_ticks, stop_ticks)
                     if not isinstance(value, bytes) or len(value) <= LONGEST_OCTETS:
                         self._answers.keep(key, found)
-        return found.value  # type: ignore[no-any-return]
+        answer: T = found.value
+        return answer
 
 
 def _change_of(event: LoggedEvent) -> _Change | None:

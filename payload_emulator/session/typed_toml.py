@@ -205,7 +205,7 @@ def _fault(kind: type, error: ValidationError, path: str) -> TableFault:
     found = str(context.get("found", repr(first["input"])[:SHOWN]))
     if first["type"] == "extra_forbidden":
         name = str(first["loc"][-1])
-        known = [item.name for item in dataclasses.fields(here)]  # type: ignore[arg-type]  # a class
+        known = [item.name for item in dataclasses.fields(here)]
         return TableFault(
             f"{place}.{name}" if place else name, f"one of {', '.join(known)}", "an unknown key", known
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def errors(view: PassView) -> list[Block]:
                 f"orbit. {text}",
                 f"Radial, along-track and cross-track error of {one.name}.",
                 3.6,
-                lambda c, one=one: navigation.draw_rtn(c, one, view.styles, view.time, arcs),  # type: ignore[misc]
+                partial(navigation.draw_rtn, one=one, styles=view.styles, time=view.time, arcs=arcs),
             )
         )
     return blocks
@@ -169,8 +170,13 @@ def drift(view: PassView) -> list[Block]:
                     f"{count_text(resets)} {noun} shown.",
                     f"Latitude and longitude error of the odometry over time, {resets} resets.",
                     3.7,
-                    lambda c, time=time: navigation.draw_ground_error(  # type: ignore[misc]
-                        c, odometry, track, view.styles, time, report.imaging_arcs
+                    partial(
+                        navigation.draw_ground_error,
+                        series=odometry,
+                        track=track,
+                        styles=view.styles,
+                        time=time,
+                        arcs=report.imaging_arcs,
                     ),
                 )
             )
@@ -254,8 +260,13 @@ def altitude(view: PassView) -> list[Block]:
                 f"{what}{extra} {runs_from}",
                 f"Altitude over time. {runs_from}",
                 3.9 if series else 2.4,
-                lambda c, time=time: navigation.draw_altitude(  # type: ignore[misc]
-                    c, series, track, view.styles, time, report.imaging_arcs
+                partial(
+                    navigation.draw_altitude,
+                    series=series,
+                    track=track,
+                    styles=view.styles,
+                    time=time,
+                    arcs=report.imaging_arcs,
                 ),
             )
         )
@@ -300,9 +311,13 @@ def consistency_section(view: PassView) -> list[Block]:
                 "lie. NIS alone cannot see an error common to all craters of a frame.",
                 f"{squared[0] if squared else 'NEES'} and NIS of {one.name} over time.",
                 3.4 if both else 2.1,
-                lambda c, one=one: consistency.draw_consistency(
-                    c, one, view.styles, view.time, view.report.imaging_arcs
-                ),  # type: ignore[misc]
+                partial(
+                    consistency.draw_consistency,
+                    one=one,
+                    styles=view.styles,
+                    time=view.time,
+                    arcs=view.report.imaging_arcs,
+                ),
             )
         )
     rows: list[tuple[Cell | str, ...]] = []

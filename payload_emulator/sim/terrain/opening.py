@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from payload_emulator.errors import TerrainError
 
@@ -25,7 +25,7 @@ def open_terrain(
     registration_north_east_m: tuple[float, ...] = (),
     photographs: tuple[str, ...] = (),
     heights: tuple[str, ...] = (),
-    **options: object,
+    **options: Any,
 ) -> TiledTerrain:
     """The terrain of a kind.
 
@@ -60,19 +60,19 @@ def open_terrain(
         from lunar.catalogue import load_catalogue
         from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
-        return ProceduralTerrain(seed, catalogue=load_catalogue(catalogue_path), **options)  # type: ignore[arg-type]
+        return ProceduralTerrain(seed, catalogue=load_catalogue(catalogue_path), **options)
     if kind == "photograph":
         return _open_photograph(data, catalogue_path, photographs, heights, registration_north_east_m)
     if kind == "procedural" or not (tiles and catalogue_path):
         from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
-        return ProceduralTerrain(seed, **options)  # type: ignore[arg-type]
+        return ProceduralTerrain(seed, **options)
     from lunar.catalogue import load_catalogue
     from payload_emulator.sim.terrain.raster import RasterTerrain
     from payload_emulator.sim.terrain.registering import find_registration
 
     assert catalogue_path is not None
-    chosen: dict[str, object] = {"name": "LROC WAC GLD100"}
+    chosen: dict[str, Any] = {"name": "LROC WAC GLD100"}
     if data.dem_sldem:
         # The smoothing is GLD100's; nothing is known against SLDEM2015 as it stands.
         chosen = {
@@ -91,7 +91,7 @@ def open_terrain(
         albedo_paths=albedo,
         data_names=_names(data),
         seed=seed,
-        **(chosen | options),  # type: ignore[arg-type]
+        **(chosen | options),
     )
     registration = find_registration(data, catalogue_path, tiles)
     if registration is not None:
