@@ -219,7 +219,7 @@ def write_build(folder: Path, kind: str, service: Service, leftover: str, writab
         **LIMITS,
     }
     (folder / "targets.json").write_text(json.dumps(targets))
-    limits = {**LIMITS, "wall_s": SHORT_S} if kind in ("outlive",) else LIMITS
+    limits = {**LIMITS, "wall_s": SHORT_S} if kind in ("outlive", "stop others") else LIMITS
     (folder / "build.toml").write_text(
         f'schema_version = 1\nname = "{kind}"\nfiles = ["attack.py", "targets.json"]\n'
         f'command = ["{{python}}", "-I", "-S", "{{build}}/attack.py", "{kind}", "{{archive}}", "{{out}}"]\n[limits]\n'

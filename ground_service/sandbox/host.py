@@ -117,6 +117,9 @@ def execute(run: Run) -> dict[str, Any]:
             try:
                 job = json.dumps({**asdict(run), "environment": dict(run.environment)}).encode()
                 _, failure = launcher.communicate(job, timeout=run.limits["wall_s"] + GRACE_S)
+            except subprocess.TimeoutExpired as error:
+                launcher.kill()
+                raise SandboxRefused(f"the launcher did not end within {error.timeout:.0f} s") from None
             except BaseException:
                 launcher.kill()
                 raise

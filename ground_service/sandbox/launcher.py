@@ -15,6 +15,7 @@ In both modes, D has no capabilities, cannot gain any, and runs with a system ca
 """
 
 import contextlib
+import functools
 import json
 import os
 import resource
@@ -24,7 +25,7 @@ import stat
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, BinaryIO
 
 from ground_service.sandbox import kernel
@@ -40,6 +41,9 @@ INODES = 65_536
 BASE = "/tmp"
 FIRST_BUILD_UID = 1_900_000_000
 """Lowest user id of builds, above the ranges of systemd and of user namespaces."""
+
+HELPER_OFFSET = 1 << 22
+"""From the user of a build to the user of the launcher's helpers for it; process ids are below this number."""
 
 WORLD_WRITABLE = ("/tmp", "/dev/shm", "/var/tmp", "/run")
 DEVICES = ("null", "zero", "full", "random", "urandom")
@@ -81,7 +85,15 @@ def run_in_namespaces(run: Json) -> Json:
         finally:
             os._exit(1)
     close(entered[1], mapped[0], control[0], reports[1], printed[1])
-    watch = Watch(run, b, reports[0], printed[0], lambda: os.write(control[1], b"x"), own=1)
+    watch = Watch(
+        run,
+        b,
+        reports[0],
+        printed[0],
+        lambda: os.write(control[1], b"x"),
+        memory=lambda processes: sum(map(proportional_memory, processes)),
+        own=1,
+    )
     try:
         failure = read_some(entered[0], SETUP_S)
         if failure == b"":
@@ -292,7 +304,15 @@ def run_as_user(run: Json) -> Json:
         close(reports[0], reports[1], printed[0])
         become_build(json.loads(json.dumps(run).replace("{private}", home)), uid, uid, printed[1], True)
     close(printed[1])
-    watch = Watch(run, os.getpid(), reports[0], printed[0], lambda: kill_user(uid), shared_disk=True)
+    watch = Watch(
+        run,
+        os.getpid(),
+        reports[0],
+        printed[0],
+        lambda: kill_user(uid),
+        memory=functools.partial(memory_of_user, uid),
+        shared_disk=True,
+    )
     try:
         send(reports[1], {"started": True, "isolation": f"runner, user {uid}, system call filter"})
         status = None
@@ -308,7 +328,7 @@ def run_as_user(run: Json) -> Json:
         collector = os.fork()
         if collector == 0:
             try:
-                put_on_user(uid)
+                act_as_user(uid)
                 send_outputs(reports[1], {**run, "collect": folder})
             finally:
                 os._exit(1)
@@ -334,23 +354,41 @@ def kill_user(uid: int) -> None:
 
 
 def as_user(uid: int, action: Callable[[], object]) -> None:
-    """Call a function in a child process with this user id, and wait for it."""
+    """Call a function in a child process that acts as this user, and wait for it."""
     child = os.fork()
     if child == 0:
         try:
-            put_on_user(uid)
+            act_as_user(uid)
             with contextlib.suppress(ProcessLookupError):
                 action()
         finally:
             os._exit(0)
-    # The function may kill all processes of the user, on some systems including itself.
     os.waitpid(child, 0)
 
 
-def put_on_user(uid: int) -> None:
+def act_as_user(uid: int) -> None:
+    """Take the rights of a user, out of reach of the signals of its processes.
+
+    The effective user decides about access to files and processes. Signals are accepted from the real and the saved
+    user, which are another user of this run: otherwise a build could stop or end the process that is to end it.
+    """
     os.setgroups([])
     os.setresgid(uid, uid, uid)
-    os.setresuid(uid, uid, uid)
+    os.setresuid(uid + HELPER_OFFSET, uid, uid + HELPER_OFFSET)
+
+
+def memory_of_user(uid: int, processes: Sequence[int]) -> int:
+    """Return the sum of the proportional set sizes of processes of a user in octets.
+
+    This process has no capability to read them. Without an answer the resident set sizes apply, which count shared
+    pages for every process.
+    """
+    reading, writing = os.pipe()
+    as_user(uid, lambda: os.write(writing, struct.pack(">Q", sum(map(proportional_memory, processes)))))
+    close(writing)
+    answer = os.read(reading, 8)
+    close(reading)
+    return struct.unpack(">Q", answer)[0] if len(answer) == 8 else sum(map(resident_memory, processes))
 
 
 def remove_owned(uid: int) -> None:
@@ -436,11 +474,13 @@ class Watch:
         printed: int,
         stop: Callable[[], object],
         *,
+        memory: Callable[[Sequence[int]], int],
         own: int = 0,
         shared_disk: bool = False,
     ) -> None:
         # `own`: number of first descendants that belong to the sandbox; their memory is not counted.
         self.run, self.root, self.stop, self.own, self.shared_disk = run, root, stop, own, shared_disk
+        self.memory = memory
         self.occupied_before = occupied()
         self.reports, self.printed = reports, printed
         self.tail, self.octets_printed = b"", 0
@@ -530,7 +570,7 @@ class Watch:
         limit = limits["memory_mib"] << 20
         if rss > limit:
             # Shared pages were counted for each process above; the proportional size is exact but slower.
-            rss = sum(map(proportional_memory, counted))
+            rss = self.memory(counted)
         self.cpu_s = max(self.cpu_s, cpu)
         self.most_mib = max(self.most_mib, rss / (1 << 20))
         if rss > limit:
@@ -696,6 +736,11 @@ def proportional_memory(process: int) -> int:
         for line in stream:
             if line.startswith("Pss:"):
                 return int(line.split()[1]) << 10
+    return resident_memory(process)
+
+
+def resident_memory(process: int) -> int:
+    """Return the resident set size of a process in octets; 0 if it has ended."""
     with contextlib.suppress(OSError, IndexError, ValueError), open(f"/proc/{process}/statm") as stream:
         return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0

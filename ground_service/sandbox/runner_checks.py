@@ -49,14 +49,14 @@ def build_remains() -> Iterator[str]:
 
     Processes in other PID namespaces end with these and are not those of a runner's builds.
     """
-    own = os.readlink("/proc/self/ns/pid")
     for status in Path("/proc").glob("[0-9]*/status"):
         try:
-            user = next(line for line in status.read_text().splitlines() if line.startswith("Uid:"))
-            namespace = os.readlink(status.parent / "ns" / "pid")
-        except (OSError, StopIteration):
+            words = dict(line.split(":\t", 1) for line in status.read_text().splitlines() if ":\t" in line)
+            user, numbers = int(words["Uid"].split()[0]), words["NSpid"].split()
+        except (OSError, KeyError):
             continue
-        if int(user.split()[1]) >= launcher.FIRST_BUILD_UID and namespace == own:
+        # A process has a number in each namespace, from that of /proc to its own.
+        if user >= launcher.FIRST_BUILD_UID and len(numbers) == 1:
             yield f"process {status.parent.name}"
     for place in launcher.WORLD_WRITABLE:
         for folder, names, files in os.walk(place):

@@ -283,6 +283,7 @@ def explore_limits():
 
 
 def many_forks():
+    """Fork as often as allowed, and keep the children for some samples of memory: their pages are shared."""
     reading, writing = os.pipe()
     children = []
     with contextlib.suppress(OSError):
@@ -293,6 +294,7 @@ def many_forks():
                 os.read(reading, 1)
                 os._exit(0)
             children.append(child)
+    time.sleep(0.5)
     os.close(writing)
     os.close(reading)
     for child in children:
@@ -438,6 +440,20 @@ def daemon():
         outlive()
 
 
+def stop_others():
+    """Stop every process that can be stopped, continuously, among them those which supervise or end the build."""
+    import signal
+
+    finish()
+    for _ in range(4):
+        if os.fork() == 0:
+            os.setsid()
+            break
+    while True:
+        with contextlib.suppress(OSError):
+            os.kill(-1, signal.SIGSTOP)
+
+
 def link_out():
     os.symlink(TARGETS["secrets"][0], OUT / "downlink.packets")
 
@@ -495,6 +511,7 @@ KINDS = {
     "disk fill": disk_fill,
     "outlive": outlive,
     "daemon": daemon,
+    "stop others": stop_others,
     "link out": link_out,
     "hard link out": hard_link_out,
     "pipe out": pipe_out,

@@ -8,6 +8,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     "disk fill": ("ok", "disk"),
     "outlive": ("timeout",),
     "daemon": ("ok",),
+    "stop others": ("timeout",),
     "link out": ("nothing",),
     "hard link out": ("crashed",),
     "pipe out": ("nothing",),

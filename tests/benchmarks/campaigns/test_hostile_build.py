@@ -39,6 +39,6 @@ def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces() -> Non
 
 @root_only
 def test_a_hostile_build_achieves_nothing_in_the_runner() -> None:
-    kinds = ("explore", "leave files", "disk fill", "daemon", "link out", "flood")
+    kinds = ("explore", "leave files", "disk fill", "daemon", "stop others", "link out", "flood")
     result = campaign("no unshare, runner", kinds)
     assert held(result) and result.isolation.startswith("runner, user 19")

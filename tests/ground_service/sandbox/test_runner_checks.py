@@ -1,17 +1,21 @@
 """Removal of processes and files of builds between two runs of a runner."""
 
 import contextlib
+import json
 import os
+import signal
 import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ground_service.regression import runner
-from ground_service.sandbox import launcher
+from ground_service.sandbox import kernel, launcher
 from ground_service.sandbox.host import SandboxRefused
 from ground_service.sandbox.runner_checks import build_remains
 
@@ -51,6 +55,108 @@ def test_a_process_of_a_build_is_found_until_it_is_killed(shared: Path) -> None:
         assert f"process {process.pid}" in build_remains()
         launcher.kill_user(UID)
     assert f"process {process.pid}" not in build_remains()
+
+
+AS_RUNNER = (
+    *("setpriv", "--bounding-set=-all,+setuid,+setgid,+kill", "--inh-caps=-all"),
+    *(sys.executable, "-c"),
+)
+
+
+def said_by_runner(program: str, *words: int) -> Any:
+    """Return what a program prints as JSON with the capabilities of a runner, which cannot inspect other users."""
+    command = [*AS_RUNNER, program, *map(str, words)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=True, timeout=60)
+    return json.loads(done.stdout)
+
+
+def test_a_process_of_a_build_is_found_with_the_capabilities_of_a_runner() -> None:
+    program = """
+import json
+from ground_service.sandbox.runner_checks import build_remains
+print(json.dumps(list(build_remains())))
+"""
+    with process_of_build(lambda: time.sleep(60)) as process:
+        assert f"process {process}" in said_by_runner(program)
+
+
+@contextlib.contextmanager
+def process_of_build(program: Callable[[], None]) -> Iterator[int]:
+    """Run a function in a process of the user of a build; yield its number."""
+    process = os.fork()
+    if process == 0:
+        try:
+            os.setresgid(UID, UID, UID)
+            os.setresuid(UID, UID, UID)
+            kernel.hide_memory(False)  # as after execution of a program
+            program()
+        finally:
+            os._exit(1)
+    try:
+        yield process
+    finally:
+        launcher.kill_user(UID)
+        os.waitpid(process, 0)
+        deadline = time.monotonic() + 20.0
+        while processes_of(UID) and time.monotonic() < deadline:  # until process 1 has reaped the orphans
+            time.sleep(0.01)
+
+
+def share_memory() -> None:
+    """Write 32 MiB, which eight processes then share."""
+    held = b"x" * (32 << 20)
+    for _ in range(3):
+        os.fork()
+    time.sleep(60)
+    del held
+
+
+def test_pages_that_processes_of_a_build_share_are_counted_once_by_a_runner() -> None:
+    program = """
+import json, sys
+from ground_service.sandbox import launcher
+processes = list(map(int, sys.argv[2:]))
+print(json.dumps([launcher.memory_of_user(int(sys.argv[1]), processes),
+                  sum(map(launcher.resident_memory, processes))]))
+"""
+    with process_of_build(share_memory) as first:
+        processes = [first]
+        while len(processes) < 8:
+            time.sleep(0.01)
+            processes = [first, *launcher.descendants(first)]
+        memory, resident = said_by_runner(program, UID, *processes)
+    assert resident > 8 * (32 << 20)
+    assert 32 << 20 < memory < resident / 3
+
+
+def test_a_build_cannot_stop_the_process_that_ends_it() -> None:
+    helper = os.fork()
+    if helper == 0:
+        try:
+            launcher.act_as_user(UID)
+            time.sleep(60)
+        finally:
+            os._exit(1)
+
+    def stop() -> None:
+        try:
+            os.kill(helper, signal.SIGSTOP)
+        except PermissionError:
+            os._exit(7)
+
+    try:
+        while f"Uid:\t{UID + launcher.HELPER_OFFSET}\t{UID}\t" not in status_of(helper):
+            time.sleep(0.01)
+        with process_of_build(stop) as attacker:
+            ended = os.waitid(os.P_PID, attacker, os.WEXITED | os.WNOWAIT)
+        assert ended is not None and ended.si_status == 7
+    finally:
+        os.kill(helper, signal.SIGKILL)
+        os.waitpid(helper, 0)
+
+
+def status_of(process: int) -> str:
+    return Path(f"/proc/{process}/status").read_text()
 
 
 def processes_of(uid: int) -> list[str]:
