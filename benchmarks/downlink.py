@@ -60,7 +60,7 @@ class Stream:
 
 
 @functools.cache
-def telemetry(frames: int, seed: int = 0, settings: LinkSettings = LinkSettings()) -> tuple[bytes, ...]:  # noqa: B008 (frozen)
+def telemetry(frames: int, seed: int = 0, settings: LinkSettings = LinkSettings()) -> tuple[bytes, ...]:
     """Return packets of the dictionary that fill about this number of frames."""
     rng = np.random.default_rng(seed)
     sequencer = PacketSequencer()
@@ -90,7 +90,7 @@ def telemetry(frames: int, seed: int = 0, settings: LinkSettings = LinkSettings(
 def cadus(
     frames: int = SHORT,
     seed: int = 0,
-    settings: LinkSettings = LinkSettings(),  # noqa: B008 (frozen)
+    settings: LinkSettings = LinkSettings(),
     spacecraft: int = SPACECRAFT,
 ) -> Rows:
     """Return CADUs, one per row."""

@@ -150,7 +150,7 @@ def _flown(
     path.write_bytes(pack_catalogue_table(table))
     flown = replace(
         scenario,
-        window=replace(scenario.window, start=start, direction=direction),  # type: ignore[arg-type]  # its words
+        window=replace(scenario.window, start=start, direction=direction),
         navigation=replace(scenario.navigation, anchoring_catalogue=str(path)),
     )
     emulate(flown, data, archive)

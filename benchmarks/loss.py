@@ -16,6 +16,7 @@ At the end every acknowledged job must be done and no packet may be missing or d
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import os
@@ -23,7 +24,7 @@ import random
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -171,8 +172,7 @@ def losses(folder: Path, names: tuple[str, ...], rate: float) -> dict[str, Any]:
             with open_ground(service.home, database_url=service.url) as ground:
                 session = Session(service.apis, add_user(ground, "ann", "operator"))
                 uploads = Uploads(session, stream, rate)
-                ready: Callable[[], bool] = lambda: has_scheduler(ground)  # noqa: E731
-                wait_until(ready, "scheduler")
+                wait_until(functools.partial(has_scheduler, ground), "scheduler")
                 supervisor.start()
                 for thread in uploads.threads:
                     thread.start()

@@ -31,7 +31,7 @@ SCIPY_DAYS = 0.25
 
 
 @njit
-def textbook(c, s, gm, radius, positions, out):  # type: ignore[no-untyped-def]
+def textbook(c, s, gm, radius, positions, out):
     """Cunningham's recursion as in Montenbruck and Gill, section 3.2.4, order by order, unnormalised coefficients."""
     degree = c.shape[0] - 1
     v = np.zeros((degree + 2, degree + 2))

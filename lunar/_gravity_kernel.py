@@ -329,7 +329,7 @@ def plain_sums(
         head = rows + (stop - first) * _ROW
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic  # type: ignore[untyped-decorator]  # numba has no types
 def sums(
     typing_context: Any,
     coefficients: Any,

@@ -712,7 +712,7 @@ def _encode(packet: str, f: Field, value: object) -> int | float:
         raise ValueRefused(packet, f.name, value, _expectation(f))
     if not f.is_float and not f.is_calibrated and f.minimum is None and f.maximum is None:
         try:
-            code = operator.index(value)  # type: ignore[arg-type]
+            code = operator.index(value)  # type: ignore[arg-type]  # refused below
         except TypeError:
             raise ValueRefused(packet, f.name, value, _expectation(f)) from None
         least, greatest = f.raw_limits

@@ -12,7 +12,7 @@ import functools
 import os
 import platform
 import uuid
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ from ground_service.store.stored_files import register_file
 from lunar.errors import LunarError
 from lunar.timescales import format_utc
 
-Progress = Callable[[Sequence[Any], int], Iterator[Any]]
+Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
 
 def run_regression(
@@ -123,7 +123,7 @@ def fly_shards(
         futures = [pool.submit(do_replay, ground, digest, build) for digest, build in shards]
         try:
             done = as_completed(futures)
-            for future in progress(done, len(futures)) if progress else done:  # type: ignore[arg-type]
+            for future in progress(done, len(futures)) if progress else done:
                 future.result()
         except BaseException:
             for future in futures:

@@ -14,13 +14,11 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.scenario import shipped_file
-from payload_emulator.session.typed_toml import TableFault, read_table
-
-T = TypeVar("T")
+from payload_emulator.session.typed_toml import Record, TableFault, read_table
 
 SPLITS = ("train", "val", "test")
 PAPER_SPLIT = "80/15/5"
@@ -193,7 +191,7 @@ def load_recipe(path: Path) -> Recipe:
     return _read(path, "dataset", Recipe, settings, empty)
 
 
-def _read(path: Path, where: str, kind: type[T], table: object, present: T | None = None) -> T:
+def _read(path: Path, where: str, kind: type[Record], table: object, present: Record | None = None) -> Record:
     try:
         return read_table(kind, table, present=present)
     except TableFault as fault:

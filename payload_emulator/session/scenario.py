@@ -11,19 +11,17 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
+from payload_emulator.session.typed_toml import Record, TableFault, read_table, toml_text
 from payload_emulator.sim.board.contact_plan import parse_outage
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
 from payload_emulator.sim.instruments import simulated_instruments
 from payload_emulator.sim.render.sensor import SensorModel
-
-T = TypeVar("T")
 
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -434,7 +432,7 @@ def _section(name: str, values: Any) -> list[str]:
     ]
 
 
-def _read(kind: type[T], table: object, source: str, path: str = "") -> T:
+def _read(kind: type[Record], table: object, source: str, path: str = "") -> Record:
     """Return a section, or the scenario, from its table; a fault becomes one line that names source and key."""
     try:
         return read_table(kind, table, path)

@@ -13,12 +13,15 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
 from types import NoneType, UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import PydanticCustomError
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Record = TypeVar("Record", bound="DataclassInstance")
 Bounds = Callable[[str], tuple[float, float]]
 """Function that returns the least and the greatest value of a number by the name of its key."""
 
@@ -62,13 +65,13 @@ class TableFault(ValueError):
 
 
 def read_table(
-    kind: type[T],
+    kind: type[Record],
     table: object,
     path: str = "",
     *,
-    present: T | None = None,
+    present: Record | None = None,
     bounds: Bounds | None = None,
-) -> T:
+) -> Record:
     """Return a dataclass with the values of a table.
 
     Parameters
@@ -86,7 +89,7 @@ def read_table(
         An unknown key, a value of a wrong type or out of bounds, or no value for a field without a default.
     """
     try:
-        given = _model(kind, bounds).model_validate(table)  # type: ignore[arg-type]  # classes are hashable
+        given = _model(kind, bounds).model_validate(table)
     except ValidationError as error:
         raise _fault(kind, error, path) from None
     return _merged(kind, given, path, present)
@@ -168,7 +171,7 @@ def _within(kind: type, limits: tuple[float, float] | None) -> Callable[[object]
     return check
 
 
-def _merged(kind: type[T], given: BaseModel, path: str, present: T | None) -> T:
+def _merged(kind: type[Record], given: BaseModel, path: str, present: Record | None) -> Record:
     """Return an instance with the values that a model was given."""
     hints = get_type_hints(kind)
     values = {}
@@ -181,10 +184,9 @@ def _merged(kind: type[T], given: BaseModel, path: str, present: T | None) -> T:
             value = tuple(_merged(inner, item, f"{place}[{k}]", None) for k, item in enumerate(value))
         values[name] = value
     try:
-        # mypy takes any class for T.
-        return kind(**values) if present is None else dataclasses.replace(present, **values)  # type: ignore[type-var]
+        return kind(**values) if present is None else dataclasses.replace(present, **values)
     except TypeError:
-        known = ", ".join(item.name for item in dataclasses.fields(kind))  # type: ignore[arg-type]
+        known = ", ".join(item.name for item in dataclasses.fields(kind))
         raise TableFault(path, f"all of {known}", ", ".join(values) or "none") from None
 
 

@@ -27,7 +27,7 @@ def _grid(**given: object) -> ResourceGrid:
         "storage_octets": 2500.0,
         "downlink_within_s": 2 * 3600.0,
     }
-    return ResourceGrid(**{**values, **given})  # type: ignore[arg-type]  # a grid of mixed columns
+    return ResourceGrid(**{**values, **given})
 
 
 def _options() -> list[Option]:

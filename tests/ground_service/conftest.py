@@ -118,7 +118,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
         frames: int = 40,
         seed: int = 1,
         encode: Callable[[list[bytes]], bytes] = encode_downlink,
-        camera: PinholeCamera = PinholeCamera(),  # noqa: B008
+        camera: PinholeCamera = PinholeCamera(),
         tilt_rad: float = 0.0,
         filter_nis: float | None = None,
         mission: str = "",

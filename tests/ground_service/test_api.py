@@ -478,7 +478,7 @@ def test_a_socket_opens_whose_server_announces_the_client_late(client: TestClien
     async def opened() -> dict[str, Any]:
         arriving: asyncio.Queue[Any] = asyncio.Queue()
         sent: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
-        handler = asyncio.ensure_future(client.app(scope, arriving.get, sent.put))  # type: ignore[arg-type]
+        handler = asyncio.ensure_future(client.app(scope, arriving.get, sent.put))
         await asyncio.sleep(0.5)
         await arriving.put({"type": "websocket.connect"})
         try:

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import yaml
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from prometheus_client.parser import text_string_to_metric_families
 
 from ground_service import tracing
@@ -380,7 +381,7 @@ def test_the_log_of_a_request_and_of_its_job_have_the_trace_of_the_caller(
     tmp_path: Path, synthetic_pass: Any, lines: Lines
 ) -> None:
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
-        pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)  # type: ignore[attr-defined]
+        pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)
         lines.entries.clear()
         asked = client.post(f"/api/v1/passes/{pass_id}/reports", headers={"traceparent": PARENT})
         assert asked.status_code in (201, 202), asked.text
@@ -405,12 +406,11 @@ def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Grou
 
 
 def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, synthetic_pass: Any) -> None:
-    memory = pytest.importorskip("opentelemetry.sdk.trace.export.in_memory_span_exporter")
-    exporter = memory.InMemorySpanExporter()
+    exporter = InMemorySpanExporter()
     tracing.configure(None, exporter=exporter)
     try:
         with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
-            pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)  # type: ignore[attr-defined]
+            pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)
             exporter.clear()
             client.post(f"/api/v1/passes/{pass_id}/reports", headers={"traceparent": PARENT})
     finally:

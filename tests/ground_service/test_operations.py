@@ -95,7 +95,7 @@ def test_every_operation_refuses_unknown_query_keys(client: TestClient, operatio
 
 
 def test_times_are_read_by_the_date_types_of_python(client: TestClient) -> None:
-    ground = client.app.state.ground  # type: ignore[attr-defined]
+    ground = client.app.state.ground
     start = 1_880_777_100_123_456_789
     key = define_pass(ground, name="p", start_utc_ns=start, stop_utc_ns=start + 10**9, spacecraft_id=76)
     shown = client.get(f"/api/v1/passes/{key}").json()
@@ -146,7 +146,7 @@ def test_a_fault_is_answered_with_what_was_expected_and_found(
 
 
 def test_pages_of_a_list_link_to_each_other(client: TestClient) -> None:
-    ground = client.app.state.ground  # type: ignore[attr-defined]
+    ground = client.app.state.ground
     for number in range(5):
         define_pass(ground, name=f"w{number}", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=77)
     total = client.get("/api/v1/passes").json()["total"]

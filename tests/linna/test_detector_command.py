@@ -207,7 +207,6 @@ def test_bench_reports_latency_memory_and_size(capsys):
 
 
 def test_a_variant_that_there_is_not_is_refused(tmp_path, capsys):
-    pytest.importorskip("torch")
     assert (
         run(["detector", "ablate", str(tmp_path), "--out", str(tmp_path), "--only", "recipe", "magic"]) == 2
     )
@@ -215,14 +214,12 @@ def test_a_variant_that_there_is_not_is_refused(tmp_path, capsys):
 
 
 def test_a_run_without_its_data_set_is_refused(tmp_path, capsys):
-    pytest.importorskip("torch")
     recipe = str(tmp_path / "r.toml")
     assert run(["detector", "make", recipe, "--out", str(tmp_path), "--run", str(tmp_path)]) == 2
     assert "--run: expected the data set it was trained on" in capsys.readouterr().err
 
 
 def test_making_from_no_recipe_is_refused(tmp_path, capsys):
-    pytest.importorskip("torch")
     assert run(["detector", "make", str(tmp_path / "r.toml"), "--out", str(tmp_path)]) == 2
     assert "expected a TOML file" in capsys.readouterr().err
 

@@ -143,7 +143,7 @@ LAUGHS = """<?xml version="1.0"?>
         (lambda text: "<a>" * 20 + "</a>" * 20, "expected"),
     ],
 )  # fmt: skip
-def test_faults_of_xml_are_named_with_their_line(change, message) -> None:  # type: ignore[no-untyped-def] # a lambda
+def test_faults_of_xml_are_named_with_their_line(change, message) -> None:
     text = change(format_oem_xml(ephemeris()))
     with pytest.raises(DataFileError, match=message):
         parse_oem_xml(text.encode(), "orbit.xml")
@@ -169,7 +169,7 @@ def zipped(*contents: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("compress", [gzip.compress, zipped])
-def test_compressed_oem_is_read(tmp_path: Path, compress) -> None:  # type: ignore[no-untyped-def] # two functions
+def test_compressed_oem_is_read(tmp_path: Path, compress) -> None:
     path = tmp_path / "orbit"
     for text in (format_oem(ephemeris()), format_oem_xml(ephemeris())):
         path.write_bytes(compress(text.encode()))

@@ -42,7 +42,7 @@ def circular(seconds: np.ndarray, turn: float = 0.0) -> tuple[np.ndarray, np.nda
 
 def arc(first_s: int, last_s: int, step_s: int = 60, **fields: object) -> EphemerisSegment:
     seconds = np.arange(first_s, last_s + 1, step_s)
-    return EphemerisSegment(START + seconds * NS, *circular(seconds.astype(float)), **fields)  # type: ignore[arg-type] # fields of the segment
+    return EphemerisSegment(START + seconds * NS, *circular(seconds.astype(float)), **fields)
 
 
 def test_ephemeris_time_is_that_of_spice(tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_without_spiceypy_one_line_names_the_extra(monkeypatch: pytest.MonkeyPat
     def without(name: str, *rest: object) -> object:
         if name == "spiceypy":
             raise ImportError(name)
-        return usual(name, *rest)  # type: ignore[arg-type] # as called
+        return usual(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(

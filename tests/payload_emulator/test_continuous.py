@@ -360,7 +360,7 @@ def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
 
 
 def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> None:
-    """A session that is resumed after its end has passed waits for `run`, whoever connects first."""
+    """A session that is resumed after its end has passed waits for `run`, and tells every client of its end."""
     state = tmp_path / "session.state"
     flown(scenario(), 1.0, checkpoint_file=state)
     session = ContinuousSession(

@@ -72,7 +72,7 @@ def test_a_station_sends_a_number_up_once_and_refuses_without_a_contact() -> Non
 
     station = StationPorts("madrid", "127.0.0.1", receive, keeps=True, taken={3})
     station.telecommand.close()
-    replies = station.telecommand = Replies()  # type: ignore[assignment] # a hand-written fake
+    replies = station.telecommand = Replies()
     stream = transmission(256, b"abc") + transmission(3, b"known") + transmission(256, b"abc")
     for octet in stream:
         station._take(1, bytes([octet]))

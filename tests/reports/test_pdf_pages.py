@@ -33,7 +33,7 @@ def pages_of(octets: bytes) -> list[str]:
 
 
 def document(*blocks: object) -> Document:
-    return Document("Test", "Title", "t", (), blocks)  # type: ignore[arg-type]
+    return Document("Test", "Title", "t", (), blocks)
 
 
 def test_it_is_a_pdf_of_numbered_a4_pages(octets: bytes) -> None:

@@ -41,7 +41,7 @@ def quantise(model_octets: bytes, datasets: Sequence[Dataset], frames: int = 48)
         raise DatasetError("quantisation: expected frames of the split 'val', found none")
     chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, frames).astype(int))]
 
-    class Reader(CalibrationDataReader):  # type: ignore[misc]
+    class Reader(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
         def __init__(self) -> None:
             self.left = iter(chosen)
 

@@ -89,7 +89,7 @@ def test_the_client_lists_formats_and_names_a_fault(rich_ground: Ground, tmp_pat
 
 def test_the_server_gives_the_file_with_its_name(rich_pass: RichPass, tmp_path: Path) -> None:
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
-        ground = client.app.state.ground  # type: ignore[attr-defined] # the application of the service
+        ground = client.app.state.ground
         import_archive(ground, rich_pass.folder)
         headers = {"Authorization": f"Bearer {add_user(ground, 'viewer', 'viewer')}"}
         assert client.post("/api/v1/exports", json={"pass_id": 1, "format": "opm"}).status_code == 401

@@ -412,7 +412,7 @@ def test_a_pass_without_content_of_a_format_is_one_line(rich_ground: Ground) -> 
         ("geojson", "lunar orientation"),
     ):
         with pytest.raises(EvaluationError, match=message):
-            export_pass(rich_ground, ExportRequest(pass_id=empty, format=kind))  # type: ignore[arg-type] # a name
+            export_pass(rich_ground, ExportRequest(pass_id=empty, format=kind))
     with pytest.raises(NotFound, match="pass 999: not found"):
         export_pass(rich_ground, ExportRequest(pass_id=999, format="images"))
 

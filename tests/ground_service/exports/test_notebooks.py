@@ -123,7 +123,7 @@ def test_without_pandas_one_line_names_the_extra(
     def without(name: str, *rest: object) -> object:
         if name == "pandas":
             raise ImportError(name)
-        return usual(name, *rest)  # type: ignore[arg-type] # as called
+        return usual(name, *rest)
 
     with linna.open(rich_ground.home) as archive:
         monkeypatch.setattr(builtins, "__import__", without)

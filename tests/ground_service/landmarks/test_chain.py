@@ -24,6 +24,10 @@ from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.replay import FlightBuild, replay_archive
 from payload_emulator.session.suite import suite_scenarios, write_suite
+from payload_emulator.training.data.feeder import TrainParameters
+from payload_emulator.training.evaluate.landmarks import load_landmarks
+from payload_emulator.training.model.export import export
+from payload_emulator.training.model.train import train
 from tests.ground_service.conftest import write_manifest
 from tests.payload_emulator.training.conftest import write_blob_dataset
 from tmtc.dictionary import DICTIONARY
@@ -64,7 +68,7 @@ def linna(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
             assert cli.run([str(word) for word in (*words, "--home", home, "--json")]) == status, words
         return json.loads(output.getvalue())
 
-    run.home = home  # type: ignore[attr-defined]  # an attribute of a function
+    run.home = home
     return run
 
 
@@ -77,7 +81,7 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     full = load_catalogue(written.folder / "catalogue.csv")
     thin = full.select(np.arange(len(full)) % KEPT == 0)
     save_catalogue(thin, folder / "old.csv")
-    with open_ground(linna.home) as ground:  # type: ignore[attr-defined]  # as above
+    with open_ground(linna.home) as ground:
         ids = [
             import_archive(ground, _pass(written.folder, folder, name, thin)) for name in ("first", "second")
         ]
@@ -98,7 +102,7 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
 @pytest.fixture(scope="module")
 def build(learned: Learned) -> Path:
     """A build of a small network that was trained with the labels."""
-    return _trained(pytest.importorskip("payload_emulator.training.model.train"), learned.folder)
+    return _trained(learned.folder)
 
 
 def test_the_gate_judges_the_network_trained_with_the_labels_on_an_archived_pass(
@@ -137,7 +141,7 @@ def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) 
         _flown(learned, "unaware", (folder / "old.bin").read_bytes(), learned.thin),
         _flown(learned, "aware", onboard, extended),
     ]
-    with open_ground(linna.home) as ground:  # type: ignore[attr-defined]  # as above
+    with open_ground(linna.home) as ground:
         ids = [import_archive(ground, one) for one in archives]
         unaware, aware = (pass_summary(ground, one)["detector"]["precision"] for one in ids)
         used = [_matched(ground, one) for one in ids]
@@ -176,18 +180,14 @@ def _matched(ground: Ground, pass_id: int) -> int:
     return int(anchored.matched.sum())
 
 
-def _trained(training: object, folder: Path) -> Path:
-    from payload_emulator.training.data.feeder import TrainParameters
-    from payload_emulator.training.evaluate.landmarks import load_landmarks
-    from payload_emulator.training.model.export import export
-
+def _trained(folder: Path) -> Path:
     dataset = write_blob_dataset(folder / "set", {"train": 4, "val": 2})
     parameters = TrainParameters(
         minutes=0.0, steps=2, batch=2, crop_px=128, warm_up_steps=1, validation_frames=1, replicas=1,
         detail_blocks=0,
     )  # fmt: skip
     landmarks = load_landmarks(folder / "labels.csv")
-    training.train([dataset], folder / "run", parameters, landmarks=landmarks)  # type: ignore[attr-defined]  # a module
+    train([dataset], folder / "run", parameters, landmarks=landmarks)
     export(folder / "run" / "checkpoint.pt", folder / "learned.onnx", [dataset])
     build = folder / "build.toml"
     build.write_text('schema_version = 1\nname = "learned"\nversion = "1"\nmodel = "learned.onnx"\n')

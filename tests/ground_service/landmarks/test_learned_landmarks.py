@@ -30,6 +30,7 @@ from ground_service.landmarks.service import (
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
+from payload_emulator.training.evaluate.landmarks import load_landmarks
 from tests.ground_service.conftest import SyntheticPass, write_manifest
 from tmtc.dictionary import DICTIONARY
 from tmtc.large_data import LargeDataReceiver
@@ -273,9 +274,8 @@ def _catalogue_file(folder: Path) -> Path:
 
 
 def test_labels_are_what_training_reads(tmp_path: Path) -> None:
-    landmarks = pytest.importorskip("payload_emulator.training.evaluate.landmarks")
     (tmp_path / "labels.csv").write_text(format_labels([_landmark(1), _landmark(2, "rejected")]))
-    labels = landmarks.load_landmarks(tmp_path / "labels.csv")
+    labels = load_landmarks(tmp_path / "labels.csv")
     assert np.degrees(labels.latitude_rad).tolist() == [11.0]
     assert labels.diameter_m.tolist() == [8000.0] and labels.sightings.tolist() == [5]
 

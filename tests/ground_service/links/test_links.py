@@ -298,7 +298,7 @@ def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Stati
     try:
         runner._open()
         ingesting.start()
-        runner._down = line  # type: ignore[assignment]  # a stand-in for a connection
+        runner._down = line
         line.blocks = [stream[: 2 * CADU + 100]]
         runner._receive()
         now[0] += 3600 * 10**9

@@ -28,7 +28,7 @@ def grid(hours: int = 24, **changes: object) -> ResourceGrid:
         observing_w=20.0,
         storage_octets=10_000.0,
     )
-    return replace(plain, **changes)  # type: ignore[arg-type]  # fields of the dataclass by name
+    return replace(plain, **changes)
 
 
 def window(start_h: float, hours: float, octets: int = 100, value: float = 1.0, period: int = 0) -> Option:

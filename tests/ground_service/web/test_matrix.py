@@ -209,7 +209,7 @@ class Faults:
         """Look at an opened page in all forms."""
         page.evaluate(LONG_LOG)
         for scheme in SCHEMES:
-            page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]  # one of its words
+            page.emulate_media(color_scheme=scheme)
             for font, family in FONTS.items():
                 page.evaluate(
                     "(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", family

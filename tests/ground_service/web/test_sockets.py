@@ -305,7 +305,7 @@ def test_a_slow_socket_skips_values_and_no_events() -> None:
     async def run() -> None:
         nonlocal session
         session = sockets.Session(
-            Slow(),  # type: ignore[arg-type]  # only what is sent matters
+            Slow(),  # only what is sent matters
             sockets.LOCAL_CALLER, None, asyncio.get_running_loop().create_future(), values={},
         )  # fmt: skip
         session.offer(1, "event 1")

@@ -293,7 +293,7 @@ def test_a_failed_action_skips_those_after_it_and_states_why(
     def broken(*_: Any) -> Any:
         raise InvalidInput("pass", "", "a pass", "none")
 
-    monkeypatch.setitem(actions.DOING, "align", broken)  # type: ignore[arg-type]  # a dictionary behind a Mapping
+    monkeypatch.setitem(actions.DOING, "align", broken)
     monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)

@@ -4,6 +4,7 @@ import hashlib
 import json
 
 import numpy as np
+import onnx
 import pytest
 
 from payload_emulator.errors import ModelError
@@ -142,7 +143,6 @@ def test_octets_that_are_no_network_are_refused():
 
 
 def test_a_network_with_other_inputs_is_refused():
-    onnx = pytest.importorskip("onnx")
     tensor = onnx.TensorProto.FLOAT
     graph = onnx.helper.make_graph(
         [onnx.helper.make_node("Identity", ["x"], ["y"])],

@@ -20,8 +20,6 @@ from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.photograph import PhotographTerrain
 from tests.payload_emulator.sim.rasters import write_raster
 
-rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
-
 NONE = make_catalogue([], [], [], source="none")
 LATITUDE, LONGITUDE = 15.0, 14.0
 

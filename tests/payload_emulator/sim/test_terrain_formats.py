@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import rasterio
 
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -13,8 +14,6 @@ from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.rasters import open_layers
-
-rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
 
 NONE = make_catalogue([], [], [], source="none")
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}

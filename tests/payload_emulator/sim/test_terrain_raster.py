@@ -13,8 +13,6 @@ from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.rasters import open_layers
 from tests.payload_emulator.sim.rasters import write_raster
 
-rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
-
 NONE = make_catalogue([], [], [], source="none")
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
 

@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.training.data.dataset import Dataset
 from payload_emulator.training.data.feeder import Feeder, TrainParameters

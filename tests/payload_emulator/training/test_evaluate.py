@@ -24,6 +24,7 @@ from payload_emulator.training.evaluate.evaluate import (
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds
 from payload_emulator.training.evaluate.report import detector_report
 from payload_emulator.training.evaluate.scoring import FrameDetections
+from payload_emulator.training.model.quantise import quantise
 from reports.json_form import to_json
 from reports.render import render_html
 from studies.trials import (
@@ -195,9 +196,6 @@ def test_trials_and_eight_bits_refuse_frames_of_another_camera(detector, make_bl
     other.index["camera"]["fov_deg"] = 90.0
     with pytest.raises(DatasetError, match="expected frames of the detector's camera"):
         run_trials(detector, [other])
-    pytest.importorskip("onnx")
-    from payload_emulator.training.model.quantise import quantise
-
     detector.metadata["camera_fov_deg"] = "120"
     with pytest.raises(DatasetError, match="expected frames of the detector's camera"):
         quantise(load_shipped_model(), [other])

@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.training.data.feeder import TrainParameters

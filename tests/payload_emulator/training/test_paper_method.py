@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 from lunar.camera import PinholeCamera
 from lunar.datafolder import find_data
 from payload_emulator.errors import DatasetError, ModelError

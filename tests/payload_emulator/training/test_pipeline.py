@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import pytest
 
-pytest.importorskip("torch")
-
 from linna.output import as_json
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import DatasetError, ModelError

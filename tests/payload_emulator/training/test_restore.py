@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from payload_emulator.errors import ModelError  # noqa: E402
-from payload_emulator.flight.models import load_shipped_model  # noqa: E402
-from payload_emulator.flight.vision.detector import OnnxDetector, decode  # noqa: E402
-from payload_emulator.training.model.export import keep_blocked, onnx_model  # noqa: E402
-from payload_emulator.training.model.model import CraterNet, ExportedCraterNet, ModelConfig  # noqa: E402
-from payload_emulator.training.model.restore import count_statistics, enlarging, network_from_onnx  # noqa: E402
+from payload_emulator.errors import ModelError
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.detector import OnnxDetector, decode
+from payload_emulator.training.model.export import keep_blocked, onnx_model
+from payload_emulator.training.model.model import CraterNet, ExportedCraterNet, ModelConfig
+from payload_emulator.training.model.restore import count_statistics, enlarging, network_from_onnx
 
 
 class Crops:

@@ -9,16 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from payload_emulator.errors import DatasetError, ModelError  # noqa: E402
-from payload_emulator.training.data.feeder import Feeder, TrainParameters  # noqa: E402
-from payload_emulator.training.data.refits import RefittedRims  # noqa: E402
-from payload_emulator.training.evaluate.landmarks import Landmarks  # noqa: E402
-from payload_emulator.training.model import train as training  # noqa: E402
-from payload_emulator.training.model.export import load_network  # noqa: E402
-from payload_emulator.training.model.train import train  # noqa: E402
+from payload_emulator.errors import DatasetError, ModelError
+from payload_emulator.training.data.feeder import Feeder, TrainParameters
+from payload_emulator.training.data.refits import RefittedRims
+from payload_emulator.training.evaluate.landmarks import Landmarks
+from payload_emulator.training.model import train as training
+from payload_emulator.training.model.export import load_network
+from payload_emulator.training.model.train import train
 
 SHORT = TrainParameters(
     minutes=0.0,

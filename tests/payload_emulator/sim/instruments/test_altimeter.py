@@ -69,7 +69,7 @@ def situation(utc_ns: int = 5, tilt_rad: float = 0.0) -> Situation:
 
 
 def ranges(settings: AltimeterSection, ground: Ground, count: int, seed: int = 1) -> Any:
-    there: Any = Surroundings(ground, seed)  # type: ignore[arg-type]  # only heights are asked for
+    there: Any = Surroundings(ground, seed)  # only heights are asked for
     return np.array([measure(settings, None, there, situation(k))[1][0] for k in range(count)])
 
 
@@ -86,16 +86,16 @@ def test_an_oblique_ray_meets_the_sphere_where_geometry_says() -> None:
     radius = MOON_RADIUS_M - 2_000.0
     at_ground = np.pi - np.arcsin((MOON_RADIUS_M + ALTITUDE_M) / radius * np.sin(angle))
     expected = radius * np.sin(np.pi - angle - at_ground) / np.sin(angle)
-    found = ground_ranges_m(Ground(-2_000.0), position, direction)  # type: ignore[arg-type]
+    found = ground_ranges_m(Ground(-2_000.0), position, direction)
     assert found[0] == pytest.approx(expected, abs=0.01)
     for away in (np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])):
-        assert np.isnan(ground_ranges_m(Ground(), position, away)).all()  # type: ignore[arg-type]
+        assert np.isnan(ground_ranges_m(Ground(), position, away)).all()
 
 
 def test_the_boresight_is_that_of_the_camera() -> None:
     quiet = AltimeterSection(range_noise_m=1e-9, divergence_mrad=0.0, dropout_share=0.0)
     tilt = np.radians(20.0)
-    (leaning,) = measure(quiet, None, Surroundings(Ground(), 1), situation(5, tilt))[1]  # type: ignore[arg-type]
+    (leaning,) = measure(quiet, None, Surroundings(Ground(), 1), situation(5, tilt))[1]
     distance = MOON_RADIUS_M + ALTITUDE_M
     sine = distance / MOON_RADIUS_M * np.sin(tilt)
     expected = distance * np.cos(tilt) - MOON_RADIUS_M * np.sqrt(1.0 - sine**2)

@@ -40,7 +40,7 @@ from tmtc.instruments import ATTITUDE
 UTC_NS = parse_utc("2029-08-07T00:00:00Z")
 ARCSEC = math.radians(1.0 / 3600.0)
 DISTANCE_M = MOON_RADIUS_M + 30_000.0
-AROUND: Any = Surroundings(None, 3)  # type: ignore[arg-type]  # a star tracker asks nothing of the terrain
+AROUND: Any = Surroundings(None, 3)  # a star tracker asks nothing of the terrain
 STEADY = StarTrackerSection(
     alignment_deg=0.0,
     outages_per_hour=0.0,
@@ -140,7 +140,7 @@ def test_the_bias_of_the_gyroscopes_walks() -> None:
     settings = replace(STEADY, gyro_bias_deg_h=0.0, gyro_walk_deg_h_sqrt_h=2.0)
     ends = []
     for seed in range(300):
-        around: Any = Surroundings(None, seed)  # type: ignore[arg-type]
+        around: Any = Surroundings(None, seed)
         state = start(settings, around)
         for k in range(4):
             state, _ = measure(
