@@ -38,11 +38,12 @@ class Image(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Detections: centres (k, 2), logarithms of diameters (k,) and variances of the centres per axis (k,)."""
+    """Detections: centres (k, 2), logarithms of diameters, variances of the centres per axis and scores, each (k,)."""
 
     uv_px: FloatArray
     log_diameter: FloatArray
     variance_px2: FloatArray
+    score: FloatArray
 
 
 class Craters(NamedTuple):
@@ -156,11 +157,12 @@ def log_evidence(
 ) -> float:
     """Return how much likelier the detections are with the camera at a place than scattered, as a logarithm.
 
-    Given the sizes of all detections, each lies anywhere in the image if it is scattered. At the right place it is,
-    with a probability that follows from the numbers of craters and of detections of about its size, one of the
-    craters, each of which is as likely as its size agrees. A detection without a pair counts as scattered although
-    craters may be near, and the positions of pairs have a normal distribution. So the mean ratio of scattered
-    detections is at most one, and chance exceeds a ratio r with a probability of at most 1 / r (Markov's inequality).
+    Given the sizes and scores of all detections, each lies anywhere in the image if it is scattered. At the right place
+    it is, with a probability that follows from its score and from the numbers of craters and of detections of about its
+    size, one of the craters, each of which is as likely as its size agrees. A detection without a pair counts as
+    scattered although craters may be near, and the positions of pairs have a normal distribution. So the mean ratio of
+    scattered detections is at most one, and chance exceeds a ratio r with a probability of at most 1 / r (Markov's
+    inequality).
 
     Parameters
     ----------
@@ -175,8 +177,9 @@ def log_evidence(
         for m in range(members):
             of_craters += _density(found.log_diameter[i] - seen.log_diameter[m], log_diameter_sigma)
         for k in range(count):
-            of_detections += _density(found.log_diameter[i] - found.log_diameter[k], log_diameter_sigma)
-        share[i] = of_craters / of_detections
+            alike = _density(found.log_diameter[i] - found.log_diameter[k], log_diameter_sigma)
+            of_detections += found.score[k] * alike
+        share[i] = found.score[i] * of_craters / of_detections
         m = nearest[i]
         if m < 0 or of_craters <= 0.0:
             continue

@@ -113,12 +113,12 @@ def vote(
     gate
         Largest difference of the logarithms of diameters.
     work
-        Work space of at least rows times columns, cleared here: score times 256 plus the detection that voted last.
+        Work space of at least rows times columns with any content: score times 256 plus the detection that voted last.
     listed
         Places found so far, columns `SCORE` to `DISTANCE`, shape (n, 4). The best `kept` are kept.
     """
     board = work[: blocks.rows * blocks.columns].reshape(blocks.rows, blocks.columns)
-    board[:] = _FULL_SCORE
+    cleared = 0
     at = np.empty((_LISTED, 2), dtype=np.int64)
     columns_per_rad = np.empty(blocks.rows)
     for r in range(blocks.rows):
@@ -126,8 +126,13 @@ def vote(
     count, threshold = 0, _LOWEST_THRESHOLD
     if int(listed[0, SCORE]) == kept:
         threshold = max(threshold, int(listed[kept, SCORE]) + 1)
-    turned, pieces, votes = _pieces(distance_m, radius_m, seen, gate, craters)
+    turned, pieces, votes, reach = _pieces(distance_m, radius_m, seen, gate, craters)
     for t in range(craters.tile_start.size - 1):
+        # Rows are cleared only before the first tile that can vote for them, so that they are still in the cache.
+        north = _northmost(craters, t) + reach
+        needed = min(max(math.ceil((north - blocks.south) / blocks.cell) + 1, cleared), blocks.rows)
+        board[cleared:needed] = _FULL_SCORE
+        cleared = needed
         for i in range(votes.size):
             weight = _weight(votes[i], blocks, weight_limit)
             if weight < 1:
@@ -136,13 +141,18 @@ def vote(
                 first, stop = pieces[i, b]
                 if first < stop:
                     count, threshold = _cast(
-                        board, at, count, threshold, weight, i, turned[i, craters.bin_height[b]], first, stop,
+                        board[:cleared], at, count, threshold, weight, i, turned[i, craters.bin_height[b]], first, stop,
                         craters, blocks, columns_per_rad,
                     )  # fmt: skip
-    total = int(listed[0, SCORE])
+    values = np.empty(count)
     for k in range(count):
-        value = float(int(board[at[k, 0], at[k, 1]]) >> 8)
-        total = _insert(listed, total, kept, value, float(at[k, 0]), float(at[k, 1]), distance_m)
+        values[k] = float(int(board[at[k, 0], at[k, 1]]) >> 8)
+    total = int(listed[0, SCORE])
+    # From the best on: once the list is full of better places, no other enters it.
+    for k in np.argsort(-values, kind="mergesort"):
+        if total == kept and values[k] <= listed[total, SCORE]:
+            break
+        total = _insert(listed, total, kept, values[k], float(at[k, 0]), float(at[k, 1]), distance_m)
     listed[0, SCORE] = total
     return total
 
@@ -165,19 +175,22 @@ def _below_ground(distance_m: float, radius_m: float, seen: Directions, i: int) 
 @njit
 def _pieces(
     distance_m: float, radius_m: float, seen: Directions, gate: float, craters: SortedCraters
-) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return how detections turn to the camera, the craters that fit each in size, and how many these are (k,).
+) -> tuple[FloatArray, IntArray, IntArray, float]:
+    """Return how detections turn to the camera, the craters that fit each in size, how many these are, and the reach.
 
     Turns have a row for each height and the columns `EAST` to `LENGTH`, (k, h, 4). Of each bin the first crater that
-    fits and the end are given, (k, b, 2), equal where none fits.
+    fits and the end are given, (k, b, 2), equal where none fits. The numbers of craters have the shape (k,). The reach
+    is the largest arc from the camera to a crater that a detection sees.
     """
     detections, heights, bins = seen.off_nadir.size, craters.height.size, craters.bin_height.size
     turned, wanted = np.zeros((detections, heights, 4)), np.empty((detections, heights))
     pieces, votes = np.zeros((detections, bins, 2), dtype=np.int64), np.zeros(detections, dtype=np.int64)
+    reach = 0.0
     for i in range(detections):
         for h in range(heights):
             gamma, size = _below_ground(distance_m, radius_m + craters.height[h], seen, i)
             wanted[i, h] = size if gamma >= 0.0 else math.nan
+            reach = max(reach, gamma)
             north = math.sin(gamma) * math.cos(seen.azimuth[i])
             turned[i, h, EAST] = math.sin(gamma) * math.sin(seen.azimuth[i])
             turned[i, h, TURN] = math.atan2(north, math.cos(gamma))
@@ -192,7 +205,15 @@ def _pieces(
             pieces[i, b, 0] = start + np.searchsorted(piece, size - gate)
             pieces[i, b, 1] = start + np.searchsorted(piece, size + gate)
             votes[i] += pieces[i, b, 1] - pieces[i, b, 0]
-    return turned, pieces, votes
+    return turned, pieces, votes, reach
+
+
+@njit
+def _northmost(craters: SortedCraters, tile: int) -> float:
+    """Return the largest latitude of the craters of a tile."""
+    first = craters.bin_start[craters.tile_start[tile]]
+    stop = craters.bin_start[craters.tile_start[tile + 1]]
+    return float(craters.latitude[first:stop].max())
 
 
 @njit
@@ -233,7 +254,7 @@ def _cast(
                 continue
             latitude, aside = math.asin(s) - turn, math.asin(t)
         row = math.floor((latitude - blocks.south) / blocks.cell)
-        if row < 1 or row >= blocks.rows:
+        if row < 1 or row >= board.shape[0]:
             continue
         away = craters.longitude[j] - aside - blocks.west
         for r in range(row - 1, row + 1):
@@ -271,22 +292,14 @@ def _above(board: NDArray[np.uint16], at: IntArray, threshold: int) -> int:
 def _insert(
     listed: FloatArray, total: int, kept: int, value: float, row: float, column: float, distance_m: float
 ) -> int:
-    """Keep a list of the best places, rows 1 to `kept`, best first; neighbours on the same level count once."""
-    if total == kept and value <= listed[total, SCORE]:
-        return total
+    """Add a place to the best, rows 1 to `kept`, best first, unless a neighbour at the same distance is among them."""
     for k in range(1, total + 1):
         if (
             listed[k, DISTANCE] == distance_m
             and abs(listed[k, ROW] - row) <= 2
             and abs(listed[k, COLUMN] - column) <= 2
         ):
-            if listed[k, SCORE] >= value:
-                return total
-            # The better neighbour takes the place of the worse.
-            for m in range(k, total):
-                listed[m] = listed[m + 1]
-            total -= 1
-            break
+            return total
     k = min(total + 1, kept)
     while k > 1 and listed[k - 1, SCORE] < value:
         listed[k] = listed[k - 1]

@@ -15,11 +15,13 @@ inequality). Near a place, the average over poses follows from the fit and its n
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
@@ -53,8 +55,12 @@ _WEIGHT_LIMIT = 6.0
 _LOG_GATE_FACTOR = 1.25
 # Smallest cosine of latitude: near a pole a margin in longitude would otherwise grow without bound.
 _POLE_COSINE = 0.1
+# Cells of the vote, kept between searches of a thread.
+_KEPT = threading.local()
 # The repeatability of a detector is not better than this.
 _SMALLEST_SIGMA_PX = 0.3
+# Scores of detections in the evidence: that of a detection without one, and the smallest.
+_UNKNOWN_SCORE, _LEAST_SCORE = 0.5, 0.01
 # Angle off nadir up to which the depth of the ground is taken from the direction.
 _LARGEST_OFF_NADIR_RAD = 1.5
 # A fit may end this far outside the altitudes that were voted on, which are steps.
@@ -112,7 +118,7 @@ class LostParameters:
     gate: float = 10.6
     false_fix_limit: float = 1e-4
     rival_ratio: float = 1e3
-    cells: int = 12_000_000
+    cells: int = 24_000_000
     votes: int = 8_000_000
 
 
@@ -263,7 +269,7 @@ def candidate_places(
     chosen, sigma = found.select(usable), np.maximum(sigma_px[usable], _SMALLEST_SIGMA_PX)
     uv = np.stack([chosen.u_px, chosen.v_px], axis=1)
     places = _voted(uv, chosen.diameter_px, index, camera, parameters, camera_from_enu)
-    fits = _fitted(places, uv, chosen.diameter_px, sigma, index, camera, parameters, camera_from_enu)
+    fits = _fitted(places, chosen, sigma, index, camera, parameters, camera_from_enu)
     fits.sort(key=lambda place: place.log_false)
     apart: list[Place] = []
     for place in fits:
@@ -373,9 +379,7 @@ def _voted(
     low, high = parameters.minimum_altitude_m, parameters.maximum_altitude_m
     steps = math.ceil(math.log(high / low) / math.log1p(parameters.altitude_step)) + 1
     listed = np.zeros((parameters.places + 1, 4))
-    # The widest parallel of the map: the equator where it holds it.
-    widest = math.cos(max(south, -north, 0.0))
-    smallest = math.sqrt((north - south) * width * widest / parameters.cells)
+    smallest = math.sqrt((north - south) * width * _widest(index) / parameters.cells)
     craters = SortedCraters(
         index.tile_start,
         index.bin_start,
@@ -390,12 +394,10 @@ def _voted(
     cells = np.maximum(0.5 * parameters.block_px * altitudes_m / camera.focal_px / MOON_RADIUS_M, smallest)
     order = np.argsort(-diameter_px, kind="stable")[:_VOTERS]
     order = order[: _affordable(log_size[order], altitudes_m, cells, index, parameters)]
-    work = np.empty(0, dtype=np.uint16)
+    # Cells grow with altitude: the lowest has most of them.
+    work = _work_space(math.prod(_grid(index, float(cells[0]))))
     for altitude_m, cell in zip(altitudes_m, cells, strict=True):
-        rows = math.ceil((north - south) / cell) + 1
-        columns = math.ceil(width * widest / cell) + 2
-        if not work.size:
-            work = np.empty(rows * columns, dtype=np.uint16)
+        rows, columns = _grid(index, float(cell))
         vote(
             MOON_RADIUS_M + float(altitude_m),
             MOON_RADIUS_M,
@@ -416,6 +418,29 @@ def _voted(
     return np.stack(
         [flat * np.cos(longitude), flat * np.sin(longitude), distance_m * np.sin(latitude)], axis=1
     )
+
+
+def _grid(index: PlaceIndex, cell_rad: float) -> tuple[int, int]:
+    """Return rows and columns of the cells of an edge that cover the map."""
+    south, north, _, width, _ = index.extent
+    return math.ceil((north - south) / cell_rad) + 1, math.ceil(width * _widest(index) / cell_rad) + 2
+
+
+def _widest(index: PlaceIndex) -> float:
+    """Return the radius of the longest parallel of the map as a share of the equator's."""
+    south, north = index.extent[:2]
+    return math.cos(max(south, -north, 0.0))
+
+
+def _work_space(cells: int) -> NDArray[np.uint16]:
+    """Return memory for at least so many cells, the same in each search of a thread.
+
+    New memory costs a page fault for each page that is written first, together as much as half of a search.
+    """
+    kept: NDArray[np.uint16] | None = getattr(_KEPT, "cells", None)
+    if kept is None or kept.size < cells:
+        kept = _KEPT.cells = np.empty(cells, dtype=np.uint16)
+    return kept
 
 
 def _affordable(
@@ -451,8 +476,7 @@ def _affordable(
 
 def _fitted(
     places: FloatArray,
-    uv: FloatArray,
-    diameter_px: FloatArray,
+    chosen: Detections,
     sigma_px: FloatArray,
     index: PlaceIndex,
     camera: PinholeCamera,
@@ -465,7 +489,9 @@ def _fitted(
     landmarks = index.landmarks
     half_px = 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
     image = Image(camera.focal_px, np.array(camera.centre_px), half_px)
-    found = Found(uv, np.log(diameter_px), sigma_px**2)
+    uv = np.stack([chosen.u_px, chosen.v_px], axis=1)
+    score = np.nan_to_num(chosen.score, nan=_UNKNOWN_SCORE)
+    found = Found(uv, np.log(chosen.diameter_px), sigma_px**2, np.clip(score, _LEAST_SCORE, 1.0))
     craters = Craters(
         landmarks.latitude_rad,
         landmarks.position_mcmf_m,

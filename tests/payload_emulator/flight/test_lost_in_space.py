@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,6 +20,7 @@ from payload_emulator.flight.navigation.lost_in_space import (
     LostParameters,
     PlaceIndex,
     _affordable,
+    _work_space,
     candidate_places,
     find_place,
     find_place_in_frames,
@@ -232,27 +234,51 @@ def test_tiles_do_not_change_the_place_found(seed: int, index: PlaceIndex) -> No
     np.testing.assert_array_equal(tiled.detection, single.detection)
 
 
+def test_what_a_search_left_in_memory_does_not_change_the_next(index: PlaceIndex) -> None:
+    _, found = frame(index.landmarks, 3.0, 359.7, 40e3, seed=5)
+    before = candidate_places(found, found.sigma_px, index, CAMERA, RULES)
+    _work_space(1)[:] = np.random.default_rng(4).integers(0, 1 << 16, _work_space(1).size)
+    after = candidate_places(found, found.sigma_px, index, CAMERA, RULES)
+    assert [place.log_false for place in after] == [place.log_false for place in before]
+    assert _work_space(1) is _work_space(2)
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(_work_space, 1).result() is not _work_space(1)
+
+
+@pytest.mark.parametrize("beyond_deg", [-0.9, 0.9])
+def test_a_camera_beyond_the_last_craters_is_found(beyond_deg: float, index: PlaceIndex) -> None:
+    """It is over rows of the vote that belong to no tile of the map."""
+    latitude = np.degrees(index.landmarks.latitude_rad)
+    edge = latitude.min() if beyond_deg < 0.0 else latitude.max()
+    place, found = frame(index.landmarks, edge + beyond_deg, 1.0, 45e3, seed=3, recall=0.9, false=1)
+    result = find_place(found, found.sigma_px, index, CAMERA, RULES)
+    assert result is not None and np.linalg.norm(result.position_mcmf_m - place) < 2_000.0
+
+
 IMAGE = Image(100.0, np.array([50.0, 50.0]), np.array([50.0, 50.0]))
 PREDICTED_PX = np.array([[20.0, 20.0], [80.0, 30.0], [40.0, 70.0], [75.0, 80.0]])
 
 
-def evidence_of(uv_px: FloatArray, diameter_px: FloatArray, pairs: list[int]) -> float:
+def evidence_of(
+    uv_px: FloatArray, diameter_px: FloatArray, pairs: list[int], score: FloatArray | None = None
+) -> float:
     """Return the evidence of detections for four craters of 8 to 64 px predicted in an image of 100 by 100."""
     seen = Seen(PREDICTED_PX, np.log([8.0, 16.0, 32.0, 64.0]), np.zeros((4, 3)), np.zeros(4))
-    found = Found(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2))
+    score = np.full(len(uv_px), 0.5) if score is None else score
+    found = Found(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2), score)
     return log_evidence(np.array(pairs), seen, found, IMAGE, 0.1)
 
 
 def test_scattered_detections_have_no_evidence_on_average() -> None:
     """The mean likelihood ratio is one for pairs at any distance, and less where only near ones count."""
     rng = np.random.default_rng(2)
-    pairs, diameter = [0, 1, 3], np.array([8.5, 17.0, 60.0])
+    pairs, diameter, score = [0, 1, 3], np.array([8.5, 17.0, 60.0]), np.array([0.9, 0.3, 0.6])
     every, near = np.empty((2, 20_000))
     for k in range(every.size):
         uv = rng.uniform(0.0, 100.0, (3, 2))
-        every[k] = math.exp(evidence_of(uv, diameter, pairs))
+        every[k] = math.exp(evidence_of(uv, diameter, pairs, score))
         away = np.linalg.norm(uv - PREDICTED_PX[pairs], axis=1)
-        near[k] = math.exp(evidence_of(uv, diameter, np.where(away < 6.0, pairs, -1).tolist()))
+        near[k] = math.exp(evidence_of(uv, diameter, np.where(away < 6.0, pairs, -1).tolist(), score))
     doubt = every.std() / math.sqrt(every.size)
     assert doubt < 0.1 and abs(every.mean() - 1.0) < 3.0 * doubt
     assert near.mean() < every.mean()
@@ -268,6 +294,28 @@ def test_evidence_grows_with_agreement_of_place_and_size() -> None:
     more = np.array([*exact, [50.0, 50.0]])
     assert evidence_of(more, np.append(diameter, 200.0), [*pairs, -1]) == pytest.approx(best, abs=1e-6)
     assert evidence_of(more, np.append(diameter, 32.0), [*pairs, -1]) < best - 0.1
+
+
+def test_detections_with_a_high_score_count_more() -> None:
+    """Of two detections of about a crater's size, the one at its place is the evidence."""
+    diameter, uv = np.array([16.0, 16.5]), np.array([[80.0, 30.0], [10.0, 90.0]])
+    equal, sure, doubtful = (
+        evidence_of(uv, diameter, [1, -1], np.array(score)) for score in ([0.5, 0.5], [0.8, 0.2], [0.2, 0.8])
+    )
+    assert doubtful + 0.5 < equal < sure - 0.1
+    # Scores are compared with each other: those of another detector may be lower throughout.
+    assert evidence_of(uv, diameter, [1, -1], np.array([0.4, 0.1])) == pytest.approx(sure)
+
+
+def test_detections_without_scores_are_searched(index: PlaceIndex) -> None:
+    _, found = frame(index.landmarks, -8.0, 355.0, 28_000.0, 0)
+    sigma = np.full(len(found), SIGMA_PX)
+    known, unknown = (
+        find_place(replace(found, score=np.full(len(found), score)), sigma, index, CAMERA, RULES)
+        for score in (0.7, math.nan)
+    )
+    assert known is not None and unknown is not None
+    assert unknown.log_false == pytest.approx(known.log_false)
 
 
 def test_the_same_detections_vote_at_all_altitudes_within_the_bound_of_work(index: PlaceIndex) -> None:
