@@ -435,7 +435,8 @@ def _widest(index: PlaceIndex) -> float:
 def _work_space(cells: int) -> NDArray[np.uint16]:
     """Return memory for at least so many cells, the same in each search of a thread.
 
-    New memory costs a page fault for each page that is written first, together as much as half of a search.
+    New memory costs a page fault for each page that is written first. On a virtual machine that can take as long as the
+    search.
     """
     kept: NDArray[np.uint16] | None = getattr(_KEPT, "cells", None)
     if kept is None or kept.size < cells:
