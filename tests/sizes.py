@@ -1,0 +1,124 @@
+"""Sizes of the packages: lines and code tokens, and the table that limits them.
+
+`python tests/sizes.py` prints the sizes, and what the uncommitted change adds; `--write` lowers the table to them.
+"""
+
+from __future__ import annotations
+
+import ast
+import csv
+import io
+import subprocess
+import sys
+import tokenize
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+TABLE = ROOT / "tests" / "sizes.csv"
+PACKAGES = (
+    "ground_service", "payload_emulator", "tmtc", "lunar", "reports", "linna", "studies",
+    "benchmarks", "db", "deploy", "tests",
+)  # fmt: skip
+LAYOUT = {
+    tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING,
+    tokenize.ENDMARKER,
+}  # fmt: skip
+Sizes = dict[str, tuple[int, int]]
+
+
+def size_of(source: str) -> tuple[int, int]:
+    """Return lines and code tokens of a module; comments, docstrings and layout are no tokens."""
+    tokens = [
+        token for token in tokenize.generate_tokens(io.StringIO(source).readline) if token.type not in LAYOUT
+    ]
+    starts = _docstrings(source)
+    return len(source.splitlines()), sum(token.start not in starts for token in tokens)
+
+
+def _docstrings(source: str) -> set[tuple[int, int]]:
+    """Return line and column of each docstring."""
+    places = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
+            first = node.body[0]
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                places.add((first.lineno, first.col_offset))
+    return places
+
+
+def sizes_of(root: Path) -> Sizes:
+    """Return lines and code tokens of each package of a checkout."""
+    found = {}
+    for package in PACKAGES:
+        sizes = [
+            size_of(file.read_text(encoding="utf-8"))
+            for file in sorted((root / package).rglob("*.py"))
+            if not {"node_modules", "__pycache__"} & set(file.parts)
+        ]
+        found[package] = (sum(lines for lines, _ in sizes), sum(tokens for _, tokens in sizes))
+    return found
+
+
+def load_table(text: str) -> Sizes:
+    """Return the limits by package from a table with the columns package, lines and tokens."""
+    return {
+        row["package"]: (int(row["lines"]), int(row["tokens"])) for row in csv.DictReader(io.StringIO(text))
+    }
+
+
+def above(sizes: Sizes, limits: Sizes) -> list[str]:
+    """Return a line for each package that is larger than its limit, or has none."""
+    excess = []
+    for package, measured in sizes.items():
+        for unit, size, limit in zip(("lines", "tokens"), measured, limits.get(package, (0, 0)), strict=True):
+            if size > limit:
+                excess.append(
+                    f"{package}: {size} {unit}, limit {limit}: "
+                    f"remove {size - limit} there, or lower another entry by more"
+                )
+    return excess
+
+
+def unpaid(before: Sizes, after: Sizes) -> list[str]:
+    """Return why a change of the table is refused: entries it raises need others that fall by more."""
+    refused = []
+    for place, unit in enumerate(("lines", "tokens")):
+        change = {package: after[package][place] - before.get(package, (0, 0))[place] for package in after}
+        raised = sum(step for step in change.values() if step > 0)
+        lowered = -sum(step for step in change.values() if step < 0)
+        gone = sum(before[package][place] for package in before if package not in after)
+        if raised and lowered + gone <= raised:
+            refused.append(
+                f"limits of {unit} rise by {raised} and fall by {lowered + gone}: a rise needs a larger fall"
+            )
+    return refused
+
+
+def committed_table(revision: str) -> Sizes | None:
+    """Return the table of a revision; None where it had none or there is no repository."""
+    command = ["git", "-C", str(ROOT), "show", f"{revision}:tests/sizes.csv"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    return load_table(result.stdout) if result.returncode == 0 else None
+
+
+def main(arguments: list[str]) -> int:
+    """Print the sizes beside their limits; with `--write`, store them as the limits."""
+    sizes = sizes_of(ROOT)
+    limits = load_table(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
+    for package, (lines, tokens) in sizes.items():
+        limit = limits.get(package, (0, 0))
+        print(
+            f"{package:18} {lines:7} lines ({lines - limit[0]:+}) {tokens:8} tokens ({tokens - limit[1]:+})"
+        )
+    if "--write" in arguments:
+        rows = "".join(f"{package},{lines},{tokens}\n" for package, (lines, tokens) in sizes.items())
+        TABLE.write_text("package,lines,tokens\n" + rows, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

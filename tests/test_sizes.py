@@ -1,0 +1,68 @@
+"""The packages stay within the table of sizes, and the table only falls."""
+
+import importlib.util
+import itertools
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+_SPEC = importlib.util.spec_from_file_location("sizes", Path(__file__).with_name("sizes.py"))
+assert _SPEC is not None and _SPEC.loader is not None
+sizes = importlib.util.module_from_spec(_SPEC)
+sys.modules["sizes"] = sizes
+_SPEC.loader.exec_module(sizes)
+
+
+def test_no_package_is_larger_than_the_table_allows() -> None:
+    limits = sizes.load_table(sizes.TABLE.read_text(encoding="utf-8"))
+    assert sizes.above(sizes.sizes_of(sizes.ROOT), limits) == []
+
+
+def test_each_change_of_the_table_that_raises_an_entry_lowers_another_by_more() -> None:
+    log = ["git", "-C", str(sizes.ROOT), "log", "--format=%H", "--", "tests/sizes.csv"]
+    revisions = subprocess.run(log, capture_output=True, text=True, check=False).stdout.split()
+    tables = [sizes.load_table(sizes.TABLE.read_text(encoding="utf-8"))]
+    tables += [table for table in map(sizes.committed_table, revisions) if table is not None]
+    refused = [sizes.unpaid(before, after) for after, before in itertools.pairwise(tables)]
+    assert [reasons for reasons in refused if reasons] == []
+
+
+def test_tokens_do_not_count_comments_docstrings_and_line_breaks() -> None:
+    long = '"""A module."""\n\n\ndef f(a):  # why\n    """Return a."""\n    return (\n        a\n    )\n'
+    assert sizes.size_of("def f(a): return (a)\n")[1] == sizes.size_of(long)[1] == 10
+    assert sizes.size_of(long)[0] == 8
+    assert sizes.size_of("a = '''text'''\n")[1] == 3
+
+
+@pytest.mark.parametrize(
+    ("sized", "expected"),
+    [
+        ((10, 100), []),
+        ((9, 101), ["p: 101 tokens, limit 100: remove 1 there, or lower another entry by more"]),
+        ((11, 100), ["p: 11 lines, limit 10: remove 1 there, or lower another entry by more"]),
+    ],
+)
+def test_a_package_above_its_limit_is_named(sized: tuple[int, int], expected: list[str]) -> None:
+    assert sizes.above({"p": sized}, {"p": (10, 100)}) == expected
+
+
+def test_a_package_that_the_table_does_not_know_is_above_its_limit() -> None:
+    assert len(sizes.above({"new": (1, 1)}, {"p": (10, 100)})) == 2
+
+
+@pytest.mark.parametrize(
+    ("after", "refused"),
+    [
+        ({"a": (9, 9), "b": (10, 10)}, 0),
+        ({"a": (11, 10), "b": (10, 10)}, 1),
+        ({"a": (11, 10), "b": (9, 10)}, 1),  # as much as it rises is not more
+        ({"a": (11, 10), "b": (8, 10)}, 0),
+        ({"a": (11, 11), "b": (8, 10)}, 1),
+        ({"b": (10, 10), "c": (9, 9)}, 0),  # renamed and smaller
+        ({"b": (10, 10), "c": (10, 9)}, 1),
+    ],
+)
+def test_a_limit_rises_only_if_another_falls_by_more(after: dict[str, tuple[int, int]], refused: int) -> None:
+    assert len(sizes.unpaid({"a": (10, 10), "b": (10, 10)}, after)) == refused
