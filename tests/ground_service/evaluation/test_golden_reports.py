@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from ground_service.evaluation.core import summary_of
+from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import evaluate
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, instance_of, read_manifest
 from ground_service.passes.service import completeness, define_pass
 from lunar.lens import BrownCamera
+from lunar.timescales import ticks_from_utc_ns
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement
-from tests.ground_service.conftest import CADENCE_S, NS, SPACECRAFT, encode_downlink, write_manifest
+from tests.ground_service.conftest import CADENCE_S, NS, SPACECRAFT, START, encode_downlink, write_manifest
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
@@ -196,6 +198,35 @@ def test_packets_that_came_twice(make_pass: Callable[..., Any], ground: Ground) 
     came_again = {apid: one.duplicates for apid, one in report.packets.by_apid.items() if one.duplicates}
     assert came_again == {HOUSEKEEPING: 2, DETECTIONS: 2, STATES: 4, OUTCOMES: 4}
     assert rows(report)["completeness.packets"].status == "met"
+
+
+def test_of_two_reports_on_one_image_one_counts(make_pass: Callable[..., Any], ground: Ground) -> None:
+    """Image 3 comes down again with another detection and another state of each estimator."""
+    ticks = int(ticks_from_utc_ns(START + 3 * CADENCE_S * NS))
+    image = {"frame_number": 3, "image_ticks": ticks}
+    one = {"u_px": 9.0, "v_px": 9.0, "diameter_px": 50.0, "score": 0.5, "size_class": 1, "sigma_px": 1.0}
+    nothing = [np.nan] * 3
+    place = {"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 37_000.0, "matched": 5}
+    unknown = {"velocity_icrf_m_s": nothing, "sigma_rtn_m": nothing, "nis": np.nan}
+
+    def again(packets: list[bytes]) -> bytes:
+        items = {name: np.array([value]) for name, value in one.items()}
+        more = [("detections", {**image, "image_quality": 0, "items": items})]
+        more += [
+            ("navigation_state", {**image, "estimator": code, "outcome": "multi", **place, **unknown})
+            for code in (0, 1)
+        ]
+        second = [
+            DICTIONARY.pack(name, values, ticks=ticks + 900, sequence_count=5_000 + k)
+            for k, (name, values) in enumerate(more)
+        ]
+        return encode_downlink([*packets, *second])
+
+    key = import_archive(ground, make_pass(frames=FRAMES, seed=53, encode=again, mission=MISSION).folder)
+    inputs = load_pass_inputs(ground, key)
+    assert inputs.detections.frame_number.tolist() == list(range(FRAMES))
+    assert len(inputs.detections.offsets) == FRAMES + 1
+    assert [part.frame_number.tolist() for part in inputs.navigation] == 2 * [list(range(FRAMES))]
 
 
 def test_a_damaged_file_of_another_pass_changes_nothing(

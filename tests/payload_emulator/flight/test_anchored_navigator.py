@@ -241,6 +241,19 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit: Orbit) -> None
     np.testing.assert_allclose(navigator.state.landmarks.sigma_m[index], 60.0)
 
 
+def test_craters_enter_the_state_with_the_lasting_share_of_the_detection_error(orbit: Orbit) -> None:
+    """Detections of 3 px are worth 600 m at 30 km: nearly all of it lasts, or all of it is new in each frame."""
+    found = replace(orbit.detections(0), sigma_px=np.full(len(orbit.detections(0)), 3.0))
+    spread = []
+    for share in (0.0, 0.9):
+        navigator = orbit.navigator(detection_persistence=share)
+        navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0))
+        assert navigator.estimate.craters.size > 5
+        spread.append(np.sqrt(np.diag(navigator.estimate.covariance)[kalman.SIZE :: 3]))
+    assert spread[0].max() <= 60.0  # the catalogue's own
+    assert spread[1].min() > 120.0
+
+
 def test_a_share_that_the_detector_states_replaces_the_parameter(orbit: Orbit) -> None:
     navigator = orbit.navigator(detection_persistence=0.3)
     found = orbit.detections(0)
