@@ -123,18 +123,17 @@ def _add_continuous(parser: argparse.ArgumentParser) -> None:
     endless.add_argument(
         "--end-with-console", action="store_true", help="end when the last connection of the console ends"
     )
-    endless.add_argument("--state", type=Path, metavar="FILE", help="state to go on from, kept up to date")
     endless.add_argument(
-        "--snapshot",
+        "--state",
         type=Path,
         metavar="FILE",
-        help="exact state of the simulation, written on save on the console; a start goes on from it",
+        help="exact state, written after contacts, on save on the console and at the end; a start goes on from it",
     )
     endless.add_argument(
         "--journal",
         type=Path,
         metavar="FILE",
-        help="transmissions that stations have confirmed; a start from --snapshot repeats those after it",
+        help="transmissions that stations have confirmed; a start from --state repeats those after it",
     )
     endless.add_argument("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
     endless.add_argument(
@@ -296,8 +295,7 @@ def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
         console_port=arguments.console_port,
         mission_port=arguments.mission_port,
         station_ports=_station_ports(arguments.station_port, scenario.link.stations),
-        checkpoint_file=arguments.state,
-        snapshot_file=arguments.snapshot,
+        state_file=arguments.state,
         journal_file=arguments.journal,
         clock_file=arguments.clock_file,
         keeps=arguments.keep_unacknowledged,

@@ -36,22 +36,14 @@ from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import sunlit_fraction
 from payload_emulator.flight.onboard.modes import PayloadMode
-from payload_emulator.session.checkpoint import (
-    Account,
-    BoardState,
-    Checkpoint,
-    LinkState,
-    load_checkpoint,
-    save_checkpoint,
-)
 from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector
 from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.live import TelecommandBuffer
 from payload_emulator.session.live_ports import Server
 from payload_emulator.session.loading import LoadedPayload, launch_payload
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.snapshot import load_snapshot, save_snapshot
 from payload_emulator.session.spacecraft import Spacecraft, new_board
+from payload_emulator.session.state import load_state, save_state
 from payload_emulator.session.station_ports import KEPT_LIMIT_OCTETS, StationPorts
 from payload_emulator.session.uplink_journal import JournalEntry, add_to_journal, load_journal
 from payload_emulator.session.world import (
@@ -96,6 +88,21 @@ _EXACT = (
 """Fields of a session that make up its exact state outside of observations, with the flight."""
 
 
+@dataclass(slots=True)
+class Account:
+    """What a session has done since its epoch."""
+
+    frames: int = 0
+    packets: int = 0
+    frames_sent: int = 0
+    frames_lost: int = 0
+    packets_lost_on_link: int = 0
+    contacts: int = 0
+    telecommands: int = 0
+    telecommand_octets_lost: int = 0
+    resets: int = 0
+
+
 @dataclass(slots=True, eq=False)
 class ContinuousSession:
     """A spacecraft that flies until it is told to stop.
@@ -108,13 +115,12 @@ class ContinuousSession:
         Whether time stands still at the beginning and the end of contacts until the console says `run`.
     stop_utc_ns
         End of the session; None: none.
-    checkpoint_file
-        Where the state is kept between contacts and at the end.
-    snapshot_file
-        Where the exact state is written when the console says `save`, and read at the start if it exists.
+    state_file
+        Where the exact state is written outside of observations: after each contact, when the console says `save`, and
+        at the end. A start goes on from it.
     journal_file
-        Where transmissions that the stations confirm are recorded. A start from the exact state repeats those after
-        it at their times, so that the session goes on as if the process had not ended.
+        Where transmissions that the stations confirm are recorded. A start from a state repeats those after it at their
+        times, so that the session goes on as if the process had not ended.
     clock_file
         Where the mission time is written for the ground (`LINNA_CLOCK_FILE`).
     keeps
@@ -137,8 +143,7 @@ class ContinuousSession:
     console_port: int = 0
     mission_port: int = 0
     station_ports: dict[str, tuple[int, int]] = field(default_factory=dict)
-    checkpoint_file: Path | None = None
-    snapshot_file: Path | None = None
+    state_file: Path | None = None
     journal_file: Path | None = None
     clock_file: Path | None = None
     keeps: bool = False
@@ -181,21 +186,15 @@ class ContinuousSession:
         self._loaded = launch_payload(scenario, self.world.camera, self.data, self.catalogue)
         self.utc_ns = scenario.epoch_utc_ns
         self._planned_until_ns = self.utc_ns
-        checkpoint = load_checkpoint(self.checkpoint_file, scenario.name) if self.checkpoint_file else None
-        board = new_board(scenario.seed)
-        if checkpoint is not None:
-            checkpoint.board.put_on(board)
         self.spacecraft = Spacecraft(
             self._loaded,
-            board,
+            new_board(scenario.seed),
             scenario.epoch_utc_ns,
             tuple(parse_fault(text) for text in scenario.faults.events),
             CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
         )
-        if checkpoint is not None:
-            self._restore(checkpoint)
-        if self.snapshot_file is not None:
-            self._continue_exactly(self.snapshot_file)
+        if self.state_file is not None:
+            self._continue_from(self.state_file)
         if scenario.camera.images != "reduced":
             self.world.terrain.reserve()
         if self.journal_file is not None:
@@ -316,7 +315,7 @@ class ContinuousSession:
         self._send_message(self._contact_message())
         while self._held and not self.stopping.is_set():
             self._serve(selector, _POLL_S)
-        if self.contact is None and self.spacecraft.payload.mode is not PayloadMode.observing:
+        if self.contact is None:
             self._save()
 
     def _contact_message(self) -> dict[str, Any]:
@@ -564,7 +563,7 @@ class ContinuousSession:
         elif words == ["pause"]:
             self.paused = True
         elif words == ["save"]:
-            self._save_exactly()
+            self._send_message({"kind": "saved", "saved": self._save()})
         elif words == ["quit"]:
             self.stopping.set()
         elif words == ["state"]:
@@ -600,39 +599,18 @@ class ContinuousSession:
             self._clock_map = np.memmap(self.clock_file, dtype="<i8", mode="r+", shape=(1,))
         self._clock_map[0] = self.utc_ns
 
-    def _save(self) -> None:
-        """Keep the state of the session; of an observation in progress only what the board keeps."""
-        if self.checkpoint_file is None:
-            return
-        spacecraft = self.spacecraft
-        position, velocity = self.world.truth.states(self.utc_ns)
-        save_checkpoint(
-            self.checkpoint_file,
-            Checkpoint(
-                scenario=self.scenario.name,
-                utc_ns=self.utc_ns,
-                board=BoardState.of(spacecraft.board),
-                resets=spacecraft.resets,
-                clock_error_ticks=spacecraft.clock_error_ticks,
-                begun=sorted(spacecraft.begun, key=lambda one: (one.at_s, one.kind)),
-                link=LinkState.of(self._receiver, self._transmitter),
-                state_icrf=np.concatenate([position[0], velocity[0]]).tolist(),
-                account=self.account,
-            ),
-        )
+    def _save(self) -> bool:
+        """Write the exact state, outside of observations; return whether it was written."""
+        if self.state_file is None or self.spacecraft.payload.mode is PayloadMode.observing:
+            return False
+        values = {name: getattr(self, name) for name in _EXACT}
+        values |= {"truth": self.world.truth, "burns": self.world.burns}
+        save_state(self.state_file, self.scenario.name, values, self._known_objects())
+        return True
 
-    def _save_exactly(self) -> None:
-        """Write the exact state, outside of observations; say whether it was written."""
-        idle = self.spacecraft.payload.mode is not PayloadMode.observing
-        if self.snapshot_file is not None and idle:
-            values = {name: getattr(self, name) for name in _EXACT}
-            values |= {"truth": self.world.truth, "burns": self.world.burns}
-            save_snapshot(self.snapshot_file, self.scenario.name, values, self._known_objects())
-        self._send_message({"kind": "saved", "saved": self.snapshot_file is not None and idle})
-
-    def _continue_exactly(self, path: Path) -> None:
-        """Continue from an exact state, if the file is there, as if the process had not ended."""
-        values = load_snapshot(path, self.scenario.name, self._known_objects())
+    def _continue_from(self, path: Path) -> None:
+        """Go on from a state, if the file is there, as if the process had not ended."""
+        values = load_state(path, self.scenario.name, self._known_objects())
         if values is None:
             return
         self.world = replace(self.world, truth=values.pop("truth"), burns=values.pop("burns"))
@@ -649,22 +627,6 @@ class ContinuousSession:
             "tables": loaded.tables,
             "orientation": self.world.truth.orientation,
         }
-
-    def _restore(self, state: Checkpoint) -> None:
-        """Go on where a checkpoint was made."""
-        self.utc_ns = self._planned_until_ns = state.utc_ns
-        self.account = state.account
-        state.link.put_on(self._receiver, self._transmitter)
-        self.spacecraft.resume(state.utc_ns, state.resets, state.clock_error_ticks, state.begun)
-        start = self.world
-        truth = Truth(
-            lambda tdb_s: np.broadcast_to(state.state_icrf, (tdb_s.size, 6)).copy(),
-            state.utc_ns,
-            state.utc_ns,
-            start.truth.orientation,
-        )
-        longer, burns = extended_flight(replace(start, truth=truth), CHUNK_S)
-        self.world = replace(start, truth=longer, burns=burns)
 
 
 def pruned(truth: Truth, days: int) -> Truth:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -187,20 +187,6 @@ class Spacecraft:
     def clock_error_ticks(self) -> int:
         """How far clock jumps have set the on-board clock ahead of the clock of the scenario."""
         return self._clock_error_ticks
-
-    @property
-    def begun(self) -> set[Fault]:
-        """Faults that have begun."""
-        return set(self._begun)
-
-    def resume(
-        self, utc_ns: int, resets: Sequence[int], clock_error_ticks: int, begun: Iterable[Fault]
-    ) -> None:
-        """Go on at a time with a board that has been kept; the payload starts as after a loss of power."""
-        self._last_utc_ns, self._clock_error_ticks = utc_ns, clock_error_ticks
-        self._begun = set(begun)
-        self.resets = list(resets)
-        self._reset(ResetCause.brown_out)
 
     def _boot(self) -> Payload:
         self._booted = self.board.reset_cause

@@ -22,13 +22,13 @@ class Checkpoints:
     home
         Folder of the ground service with its SQLite database; None: the archive of a server is not put back, since
         it may be ahead of the spacecraft, which repeats what it did.
-    snapshot
+    state
         File of the exact state of the spacecraft.
     """
 
     folder: Path
     home: Path | None
-    snapshot: Path
+    state: Path
 
     def keep(self, progress: Path) -> None:
         """Make a checkpoint of the present files in place of the one before.
@@ -38,7 +38,7 @@ class Checkpoints:
         new = self.folder / "checkpoint.new"
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir(mode=0o700)
-        shutil.copyfile(self.snapshot, new / SPACECRAFT)
+        shutil.copyfile(self.state, new / SPACECRAFT)
         shutil.copyfile(progress, new / PROGRESS)
         if self.home is not None:
             self._keep_archive(self.home, new / ARCHIVE)
@@ -60,7 +60,7 @@ class Checkpoints:
     def restore(self) -> Path | None:
         """Put spacecraft and archive back to the newest checkpoint, or to nothing without one; return its progress."""
         found = next((one for one in (self._place, self.folder / "checkpoint.old") if one.exists()), None)
-        self.snapshot.unlink(missing_ok=True)
+        self.state.unlink(missing_ok=True)
         if self.home is not None:
             shutil.rmtree(self.home / "incoming", ignore_errors=True)
             for suffix in ("", "-wal", "-shm"):
@@ -71,7 +71,7 @@ class Checkpoints:
                 shutil.copyfile(found / ARCHIVE, self.home / "linna.db")
         if found is None:
             return None
-        shutil.copyfile(found / SPACECRAFT, self.snapshot)
+        shutil.copyfile(found / SPACECRAFT, self.state)
         return found / PROGRESS
 
     @property

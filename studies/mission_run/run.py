@@ -182,11 +182,11 @@ class MissionRun:
             folder / "craters.csv",
             folder / "operations.toml",
             folder / "spacecraft.log",
-            folder / "spacecraft.snapshot",
+            folder / "spacecraft.state",
             folder / "spacecraft.journal",
         )
         home = None if terms.distributed else folder / "ground"
-        self._checkpoints = Checkpoints(folder, home, self._files.snapshot)
+        self._checkpoints = Checkpoints(folder, home, self._files.state)
         self._progress_file = folder / "progress.json"
         self._progress = Progress()
         self._begun_s = self._kept_s = time.monotonic()

@@ -38,7 +38,7 @@ class SpacecraftFiles:
     craters: Path
     operations: Path
     log: Path
-    snapshot: Path
+    state: Path
     journal: Path
 
 
@@ -79,7 +79,7 @@ class SpacecraftProcess:
         self.mission_port = mission
         words = ["emulate", files.scenario, "--continuous", "--days", self._days, "--rate", self._rate]
         words += ["--hold-contacts", "--journal", files.journal]
-        words += ["--console-port", console, "--mission-port", mission, "--snapshot", files.snapshot]
+        words += ["--console-port", console, "--mission-port", mission, "--state", files.state]
         words += ["--clock-file", files.clock, "--operations", files.operations, "--craters", files.craters]
         words += ["--keep-unacknowledged", "--paused", "--end-with-console"]
         words += ["--json"]

@@ -21,9 +21,7 @@ from ground_service.missions.model import parse_mission
 from linna import cli
 from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc, tai_ns_from_utc_ns
-from payload_emulator.errors import RecordError, ScenarioError
-from payload_emulator.flight.ports import ResetCause
-from payload_emulator.session.checkpoint import load_checkpoint
+from payload_emulator.errors import ScenarioError
 from payload_emulator.session.continuous import ContinuousSession
 from payload_emulator.session.mission import operations_mission_text
 from payload_emulator.session.scenario import Scenario, parse_scenario
@@ -291,20 +289,6 @@ def test_the_uplink_carries_no_more_than_its_rate() -> None:
     assert session.account.telecommand_octets_lost == pytest.approx(sent[0] - seconds, abs=2 * packet)
 
 
-def test_a_session_goes_on_from_its_state(tmp_path: Path) -> None:
-    state = tmp_path / "session.state"
-    first, _ = flown(scenario(), 4.0, checkpoint_file=state)
-    kept = load_checkpoint(state, "continuous")
-    assert kept is not None and kept.utc_ns == first.utc_ns
-    second, _ = flown(scenario(), 6.0, checkpoint_file=state)
-    assert second.account.contacts >= first.account.contacts
-    assert second.spacecraft.resets == [ResetCause.brown_out]
-    whole = ContinuousSession(scenario(), DataFolder(None), stop_utc_ns=EPOCH + 6 * HOUR_NS)
-    whole.run()
-    there, here = second.world.truth.states(second.utc_ns), whole.world.truth.states(whole.utc_ns)
-    assert np.linalg.norm(there[0] - here[0]) < 1.0
-
-
 def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_path: Path) -> None:
     """The state is written between the uplink of a window and the window; it has the schedule of the payload."""
     snapshot = tmp_path / "exact"
@@ -315,13 +299,11 @@ def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_pat
                 ground.command("set_time_report_rate", rate_exponent=0),
                 ground.at(EPOCH + 5 * HOUR_NS, ground.function("start_observation", 600.0, 15.0)),
             )
-        elif contact["state"] == "ended":
-            ground.order("save")
 
     whole, heard = flown(scenario(SHORT), 29.0, act)
-    first, before = flown(scenario(SHORT), 4.5, act, snapshot_file=snapshot)
+    first, before = flown(scenario(SHORT), 4.5, act, state_file=snapshot)
     assert first.account.frames == 0
-    second, after = flown(scenario(SHORT), 29.0, snapshot_file=snapshot)
+    second, after = flown(scenario(SHORT), 29.0, state_file=snapshot)
     assert second.spacecraft.resets == []
     assert second.account == whole.account and whole.account.frames == 40
     assert before.records + after.records == heard.records and len(after.records) > 0
@@ -337,9 +319,9 @@ def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path:
             ground.order("save")
 
     whole, heard = flown(slow, 5.0, act)
-    first, _ = flown(slow, 3.5, act, snapshot_file=tmp_path / "exact")
+    first, _ = flown(slow, 3.5, act, state_file=tmp_path / "exact")
     assert first.account.telecommands < 60 == whole.account.telecommands
-    second, after = flown(slow, 5.0, snapshot_file=tmp_path / "exact")
+    second, after = flown(slow, 5.0, state_file=tmp_path / "exact")
     assert second.account == whole.account
     assert heard.records.endswith(after.records) and len(after.records) > 0
 
@@ -362,10 +344,8 @@ def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
 def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> None:
     """A session that is resumed after its end has passed waits for `run`, and tells every client of its end."""
     state = tmp_path / "session.state"
-    flown(scenario(), 1.0, checkpoint_file=state)
-    session = ContinuousSession(
-        scenario(), DataFolder(None), holds=True, stop_utc_ns=EPOCH, checkpoint_file=state
-    )
+    flown(scenario(), 1.0, state_file=state)
+    session = ContinuousSession(scenario(), DataFolder(None), holds=True, stop_utc_ns=EPOCH, state_file=state)
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
     try:
@@ -394,17 +374,6 @@ def test_images_that_the_payload_refuses_to_look_at_are_no_frames() -> None:
     session, _ = flown(scenario(SHORT), 6.0, act)
     payload = session.spacecraft.payload
     assert session.account.frames == payload.frames == 0
-
-
-def test_a_damaged_or_foreign_state_is_refused_in_one_line(tmp_path: Path) -> None:
-    state = tmp_path / "session.state"
-    state.write_bytes(b"nothing")
-    with pytest.raises(RecordError, match="found a file that begins with b'nothing'"):
-        load_checkpoint(state, "continuous")
-    flown(scenario(), 1.0, checkpoint_file=tmp_path / "other")
-    other = parse_scenario(SCENARIO.replace('"continuous"', '"another"'))
-    with pytest.raises(RecordError, match="expected the state of scenario another, found that of continuous"):
-        load_checkpoint(tmp_path / "other", other.name)
 
 
 def test_records_that_are_not_acknowledged_come_again_on_the_next_connection() -> None:

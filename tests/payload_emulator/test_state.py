@@ -1,0 +1,166 @@
+"""Exact states: views, known objects, refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter, deque
+from hashlib import sha256
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from payload_emulator.errors import RecordError
+from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.state import VERSION, load_state, pack_state, save_state, unpack_state
+from payload_emulator.sim.board.faults import parse_fault
+from tmtc.uplink import Farm
+
+
+def kept(value: Any) -> Any:
+    """Return a value as it comes back."""
+    return unpack_state(pack_state("a", {"value": value}, {}), "a", {})["value"]
+
+
+def test_views_stay_views_of_their_memory() -> None:
+    memory = np.arange(24, dtype=np.uint8)
+    found = kept({"software": [memory, memory[6:20:2]], "words": memory.view(np.uint16)[3:]})
+    whole, ring = found["software"]
+    assert np.array_equal(ring, memory[6:20:2])
+    whole[6:8] = 255
+    assert ring[0] == 255 and found["words"][0] == 65_535
+    assert memory[6] == 6
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None, True, 2**200, 0.1 + 0.2, -0.0, float("inf"), "µ\n", b"\x00\xff", (1, (2,)), {1, 2}, frozenset({3}),
+        {2.5: [1], "b": None}, deque([1, 2], maxlen=2), Counter("abba"), MappingProxyType({"one": 1}),
+        np.float32(0.1), np.arange(6).reshape(2, 3), np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        np.zeros((0, 7)), Farm(2, expected=9, lockout=True), {parse_fault("camera_dark at 3 for 5")}, PayloadMode.safe,
+    ],
+    ids=repr,
+)  # fmt: skip
+def test_a_value_comes_back_equal_and_of_its_type(value: Any) -> None:
+    found = kept([value, value])
+    assert type(found[0]) is type(value) and repr(found[0]) == repr(value)
+    if isinstance(value, np.ndarray):
+        assert found[0].dtype == value.dtype and found[0].flags.fnc == value.flags.fnc
+    if not isinstance(value, bool | int | float | str | None):
+        assert found[0] is found[1]
+
+
+def test_a_value_may_contain_itself() -> None:
+    value: dict[str, Any] = {"list": []}
+    value["list"].append(value)
+    found = kept(value)
+    assert found["list"][0] is found
+
+
+def test_random_numbers_go_on() -> None:
+    generator = np.random.default_rng((3, 2**41))
+    generator.integers(0, 9, 7, dtype=np.uint8)
+    found = kept(generator)
+    assert found.random(5).tolist() == generator.random(5).tolist()
+    assert found.integers(0, 9, 5).tolist() == generator.integers(0, 9, 5).tolist()
+
+
+def test_known_objects_are_those_of_the_reader() -> None:
+    network, other = object(), object()
+    octets = pack_state("a", {"one": [network]}, {"network": network})
+    assert unpack_state(octets, "a", {"network": other})["one"] == [other]
+    with pytest.raises(RecordError, match=r"found damage .*network"):
+        unpack_state(octets, "a", {})
+
+
+class Pair(NamedTuple):
+    one: int
+
+
+@pytest.mark.parametrize(
+    "value", [lambda: None, Path("x"), Pair(1), np.array([None]), np.zeros(2, "i4,f8")], ids=repr
+)
+def test_what_cannot_be_kept_is_refused_in_one_line(value: Any) -> None:
+    with pytest.raises(RecordError, match=r"state: expected .*, found"):
+        pack_state("a", {"value": value}, {})
+
+
+def test_the_state_of_another_scenario_or_version_is_refused() -> None:
+    octets = pack_state("a", {"one": 1}, {})
+    with pytest.raises(RecordError, match="expected the state of scenario b, found that of a"):
+        unpack_state(octets, "b", {})
+    other = octets.replace(f"version {VERSION}".encode(), b"version 1", 1)
+    with pytest.raises(RecordError, match=f"expected version {VERSION} of the state, found 1"):
+        unpack_state(other, "a", {})
+
+
+def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "exact"
+    assert load_state(path, "a", {}) is None
+    save_state(path, "a", {"one": np.arange(40)}, {})
+    whole = path.read_bytes()
+    found = load_state(path, "a", {})
+    assert found is not None and np.array_equal(found["one"], np.arange(40))
+    assert [one.name for one in tmp_path.iterdir()] == ["exact"]
+    begin = whole.index(b"\n") + 1
+    for length in (0, 1, 20, begin - 1, begin, begin + 1, begin + 60, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(RecordError, match=r"exact: expected the state of a spacecraft process .*, found"):
+            load_state(path, "a", {})
+    for place in (3, begin + 2, begin + 100, len(whole) - 2):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        with pytest.raises(RecordError, match=r"exact: expected the state of a spacecraft process .*, found"):
+            load_state(path, "a", {})
+
+
+def test_a_failure_while_writing_leaves_the_state_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "exact"
+    save_state(path, "a", {"one": 1}, {})
+
+    def fail(_: int) -> None:
+        raise OSError("no space")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError):
+        save_state(path, "a", {"one": 2}, {})
+    assert load_state(path, "a", {}) == {"one": 1}
+
+
+def sealed(root: Any) -> bytes:
+    """Return a document with the header that fits."""
+    document = json.dumps(root).encode()
+    return (
+        f"LINNA spacecraft state, version {VERSION}, SHA-256 {sha256(document).hexdigest()}\n".encode()
+        + document
+    )
+
+
+@pytest.mark.parametrize(
+    "node",
+    [
+        7, None, ["list", 1], ["ref", 9], ["dict", ["one"]], ["dict", ["one", ["known", "x"]]], ["unknown"], [],
+        ["dict", ["one", ["object", "subprocess:Popen"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.state:Path"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.state:pack_state"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.state:json.JSONDecoder"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.none:Any"]]],
+        ["dict", ["one", ["object", "payload_emulator.flight.onboard.modes:PayloadMode"]]],
+        ["dict", ["one", ["enum", "tmtc.uplink:Farm", 1]]],
+        ["dict", ["one", ["trajectory", ["dict"]]]],
+        ["dict", ["one", ["array", "O", [1], "C", "eJxjYAACAAAIAAE="]]],
+        ["dict", ["one", ["view", ["array", "|u1", [8], "C", "eJxjYAACAAAIAAE="], 0, [1], [8], "O"]]],
+        ["dict", ["one", ["view", ["array", "|u1", [8], "C", "eJxjYAACAAAIAAE="], 4, [1], [8], "<i8"]]],
+        ["dict", ["one", ["bytes", "no base64"]]],
+        ["dict", ["one", ["object", "tmtc.uplink:Farm", ["unknown", 1]]]],
+    ],
+    ids=json.dumps,
+)  # fmt: skip
+def test_another_document_with_a_fitting_checksum_is_refused_and_calls_nothing(node: Any) -> None:
+    with pytest.raises(RecordError, match="found damage"):
+        unpack_state(sealed(["a", node]), "a", {})
