@@ -92,7 +92,7 @@ bench: $(VENV)/.bench
 
 # The plans of the planner and optimal ones; OR-Tools has an environment of its own.
 bench-planning: $(VENV)/.dev $(VENV)-ortools/.stamp
-	$(BIN)/python -m benchmarks planning
+	$(BIN)/python -m benchmarks.planning
 
 mutation: $(VENV)/.mutation
 	$(BIN)/python -m benchmarks.mutation --sample $(SAMPLE) --seed $(SEED) $(if $(GROUP),--group $(GROUP))

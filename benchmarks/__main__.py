@@ -1,30 +1,37 @@
-"""`python -m benchmarks [name ...]`: all benchmarks in sequence, each compared with its named alternatives."""
+"""`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
 
-import subprocess
+Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load,
+loss, upgrade, year, capacity, campaigns) has a command of its own and is not in this list.
+"""
+
+import argparse
 import sys
-from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
+from benchmarks._rows import measure, report
+
+NAMES = (
+    "tmtc", "xtce", "downlink", "downlink_memory", "ground", "orbit", "ephemeris", "render", "detector", "machine",
+    "gate_error_rates", "planning", "report_pages", "pages",
+)  # fmt: skip
+"""Benchmarks of `make bench`, in this order."""
 
 
-def main(wanted: list[str]) -> int:
-    """Run the benchmarks named (all when none is); the number of those that failed comes back."""
-    files = sorted(file for file in HERE.glob("*.py") if not file.name.startswith("_"))
-    unknown = set(wanted) - {file.stem for file in files}
-    if unknown:
-        known = ", ".join(file.stem for file in files)
-        print(
-            f"benchmarks: no benchmark named {', '.join(sorted(unknown))}; there are {known}", file=sys.stderr
-        )
+def main(words: list[str]) -> int:
+    """Run the benchmarks that are named, all when none is."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks", description=(__doc__ or "").split("\n\n")[0]
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--rows-of", choices=NAMES, help=argparse.SUPPRESS)
+    given = parser.parse_args(words)
+    if given.rows_of:
+        measure(given.rows_of)
+        return 0
+    if unknown := [name for name in given.names if name not in NAMES]:
+        print(f"benchmarks: expected {', '.join(NAMES)}; found {', '.join(unknown)}", file=sys.stderr)
         return 2
-    failed = 0
-    for file in files:
-        if wanted and file.stem not in wanted:
-            continue
-        print(f"\n== {file.stem}", flush=True)
-        command = [sys.executable, "-m", f"benchmarks.{file.stem}"]
-        failed += subprocess.run(command, cwd=HERE.parent, check=False).returncode != 0
-    return failed
+    return report(given.names or NAMES, as_json=given.json)
 
 
 if __name__ == "__main__":

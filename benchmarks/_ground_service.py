@@ -6,9 +6,11 @@ import asyncio
 import itertools
 import os
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +94,15 @@ def wait_for_job(client: httpx.Client, job: str) -> dict[str, Any]:
 
 
 def memory_of_a_stream(different: bytes, megabytes: int) -> dict[str, Any]:
-    """Resident memory of the service while it takes and ingests a downlink of a size in one upload.
+    """Return the memory of the service while it takes and ingests a downlink of a size in one upload.
 
-    The stream is `different` again and again, so most of its packets are stored already when they come.
+    Anonymous memory, sampled: pages of the mapped raw file belong to the page cache and can be dropped at any time. The
+    stream is `different` again and again, so most of its packets are stored already when they come.
     """
     with tempfile.TemporaryDirectory() as name:
         service = Laptop(Path(name), LINNA_UPLOAD_LIMIT_MIB=str(megabytes + 1))
         try:
-            idle = resident_mib(service.parts["api"], "VmHWM")
+            idle = resident_mib(service.parts["api"], "RssAnon")
             clock = time.perf_counter()
             copies = max(round(megabytes * 1e6 / len(different)), 1)
 
@@ -107,22 +110,39 @@ def memory_of_a_stream(different: bytes, megabytes: int) -> dict[str, Any]:
                 for _ in range(copies):
                     yield from (different[at : at + (1 << 20)] for at in range(0, len(different), 1 << 20))
 
-            with httpx.Client(base_url=f"{service.api}/api/v1", timeout=600.0) as client:
+            client = httpx.Client(base_url=f"{service.api}/api/v1", timeout=600.0)
+            with client, _peak_anonymous_mib(service.parts["api"]) as peak:
                 answer = client.post("/telemetry?spacecraft_id=76", content=pieces())
                 answer.raise_for_status()
-                taken = resident_mib(service.parts["api"], "VmHWM")
                 row = wait_for_job(client, answer.json()["job_id"])
             return {
                 "stream_megabytes": round(copies * len(different) / 1e6),
                 "stream_state": row["state"],
                 "stream_packets": (row["result"] or {}).get("packets"),
                 "stream_s": round(time.perf_counter() - clock, 1),
-                "idle_peak_rss_mib": idle,
-                "upload_peak_rss_mib": taken,
-                "stream_peak_rss_mib": resident_mib(service.parts["api"], "VmHWM"),
+                "idle_anonymous_mib": idle,
+                "stream_peak_anonymous_mib": max(peak),
             }
         finally:
             service.stop()
+
+
+@contextmanager
+def _peak_anonymous_mib(part: Part) -> Iterator[list[int]]:
+    """Sample the anonymous memory of a part, in MiB, into the list while the context lasts."""
+    samples, done = [resident_mib(part, "RssAnon")], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.05):
+            samples.append(resident_mib(part, "RssAnon"))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield samples
+    finally:
+        done.set()
+        watcher.join()
 
 
 def processor_s(part: Part) -> float:

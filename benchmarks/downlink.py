@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks._rows import Row
 from tmtc import reed_solomon
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder, decode
@@ -380,6 +381,14 @@ def compare(names: Sequence[str]) -> Iterator[dict[str, Any]]:
             and not by_check.false + by_ingest.false
             and by_check.octets == by_ingest.octets == size,
         }
+
+
+def rows() -> Iterator[Row]:
+    """Yield the packets that `tm check` and `ingest` find beside those that can be found."""
+    for one in compare(list(STREAMS)):
+        found = f"check {one['check']}, ingest {one['ingest']}, false {one['false']}"
+        wrong = "" if one["right"] else found
+        yield Row(one["stream"], one["ingest"], "packets", "that can be found", one["packets_true"], wrong)
 
 
 def noise_found(files: int) -> dict[str, int]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks._rows import Row
 from benchmarks.downlink import cadus
 from ground_service.errors import GroundError
 from ground_service.ingest.stream import DownlinkReader, reaches_of
@@ -92,6 +93,16 @@ def measure(octets: int) -> list[dict[str, float | int | str]]:
                 }
             )
     return rows
+
+
+def rows() -> Iterator[Row]:
+    """Yield peak and rate of each content at two sizes; a peak that grows with the file is an error."""
+    small, large = (measure(size) for size in (32 << 20, 128 << 20))
+    for before, one in zip(small, large, strict=True):
+        low, high = float(before["peak_mib"]), float(one["peak_mib"])
+        wrong = "" if high < low + 64 else "the peak grows with the file"
+        yield Row(f"{one['content']}, 128 MiB: anonymous memory", high, "MiB", "a file of 32 MiB", low, wrong)
+        yield Row(f"{one['content']}, 128 MiB", float(one["mb_per_s"]), "MB/s")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,13 @@ import json
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks._rows import Row
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.ephemeris_files import load_ephemeris
 from lunar.oem import save_oem
@@ -53,6 +54,23 @@ def bench() -> dict[str, Any]:
         }
         figures["rivals"] = _rivals(month, epochs, Path(folder))
     return figures
+
+
+def rows() -> Iterator[Row]:
+    """Yield times of files and interpolation beside the oem package and a spline of SciPy."""
+    figures = bench()
+    rivals = figures.pop("rivals")
+    read = rivals["oem package: read, s per 86,400 states (from 5,000)"]
+    rate, error = (rivals[f"scipy CubicHermiteSpline (degree 3): {key}"] for key in ("epochs/s", "error, m"))
+    slow = rivals["oem package: interpolation, epochs/s"]
+    quick = figures["interpolation_epochs_per_s"]
+    found_m = figures["interpolation_error_m"]
+    wrong = "" if found_m < 1e-3 else "interpolation is wrong by more than 1 mm"
+    yield Row("OEM of 86,400 states: read", figures["oem_read_s"], "s", "oem package", read)
+    yield Row("OEM of 86,400 states: write", figures["oem_write_s"], "s")
+    yield Row("interpolation", quick, "epochs/s", "SciPy cubic spline", rate, wrong)
+    yield Row("interpolation", quick, "epochs/s", "oem package", slow, wrong)
+    yield Row("interpolation error", found_m, "m", "SciPy cubic spline", error, wrong)
 
 
 def _rivals(month: Ephemeris, epochs: np.ndarray, folder: Path) -> dict[str, Any]:

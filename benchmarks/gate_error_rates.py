@@ -10,10 +10,11 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from benchmarks._rows import Row
 from ground_service.regression.gates.core import GatePolicy, GateRule, judge, verdict_of
 from ground_service.regression.gates.samples import EstimatorFrames, PassFrames
 
@@ -129,6 +130,19 @@ def outcomes(passes: int, frames: int, margins: float, pairs: int) -> dict[str, 
             found.setdefault(gate.name, Counter())[gate.outcome] += 1
         found.setdefault("verdict", Counter())[verdict_of(gates)] += 1
     return found
+
+
+def rows() -> Iterator[Row]:
+    """Yield shares of verdicts over 40 pairs of builds; a wrong verdict above its level is an error."""
+    pairs = 40
+    for passes, frames in SUITES:
+        for margins, wrong_claim in ((0.0, "fail"), (2.0, "pass")):
+            counts = outcomes(passes, frames, margins, pairs)["verdict"]
+            share = counts[wrong_claim] / pairs
+            wrong = "" if share <= 0.1 else f"{wrong_claim} in {share:.0%}"
+            right = counts["pass" if wrong_claim == "fail" else "fail"] / pairs
+            what = f"{passes} x {frames} frames, {margins:.0f} margins worse: right verdict"
+            yield Row(what, right, "share", wrong=wrong)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks._rows import Row
 from payload_emulator.flight.ports import BareBoard
 
 _MINUTE_TICKS = 60 * 65_536
@@ -76,6 +78,15 @@ def bench(days: float = 365.0, minutes: int = 10) -> dict[str, Any]:
         "cpu_s": round(seconds, 1),
         "turns_per_cpu_s": round(turns / seconds),
     }
+
+
+def rows() -> Iterator[Row]:
+    """Yield memory and speed of the flight software over 90 days; growth of a month is an error."""
+    figures = bench(90.0)
+    first, last = figures["resident_mib_by_month"][0], figures["resident_mib_by_month"][-1]
+    wrong = "" if last - first < 1.0 else "memory grows by more than 1 MiB in two months"
+    yield Row("resident memory after three months", last, "MiB", "after one month", first, wrong)
+    yield Row("housekeeping", figures["turns_per_cpu_s"], "turns/s")
 
 
 def _resident_mib() -> float:

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks._rows import Row, needs
 from ground_service.ground import open_ground
 from ground_service.passes.service import define_pass
 from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
@@ -189,6 +190,13 @@ def bench(passes: int, rows: int, home: Path | None) -> dict[str, Any]:
         return {"passes": passes, "rows": rows, "seed_s": round(seeded), "interactive_ms": found}
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def rows() -> Iterator[Row]:
+    """Yield the time to interactive of each page; the peer is the limit of one second."""
+    needs("Chromium", "chromium", "chromium-browser", "google-chrome")
+    for path, found in bench(200, 200_000, None)["interactive_ms"].items():
+        yield Row(f"{path}: interactive", found["clock"], "ms", "limit", 1000.0)
 
 
 def main() -> None:

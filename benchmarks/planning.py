@@ -27,12 +27,13 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csr_array
 
+from benchmarks import _rows
 from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between
 from ground_service.planning.filling import DAY_NS, NS, Option, ResourceGrid, choose, take_in_order, violation
 from lunar.camera import PinholeCamera
 from lunar.datafolder import default_orientation, find_data
 from payload_emulator.session.orbit import force_model, propagate_scenario, sample
-from payload_emulator.session.scenario import load_scenario
+from payload_emulator.session.scenario import Scenario, load_scenario
 
 CADENCE_S = 15.0
 STEP_S = 600.0
@@ -99,13 +100,6 @@ def main(words: Sequence[str]) -> int:
     )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(words)
-    data = find_data(None)
-    scenario = load_scenario(arguments.scenario)
-    model = force_model(scenario, data)
-    orbit = propagate_scenario(scenario, model, (arguments.days + 1.0) * 86_400.0)
-    ephemeris, _ = sample(orbit, 60.0)
-    start = ephemeris.start_utc_ns + 10 * NS
-    stop = start + round(arguments.days * DAY_NS)
     python = arguments.ortools if arguments.ortools.is_file() else None
     if python is None:
         print(
@@ -113,20 +107,12 @@ def main(words: Sequence[str]) -> int:
             "make bench-planning installs it",
             file=sys.stderr,
         )
-    rows: list[Row] = []
-    for case in CASES:
-        planner = Planner(ephemeris, default_orientation(data), case.resources, PinholeCamera())
-        options = candidates(planner, start, stop)
-        grid = grid_of(planner, case, start, stop)
-        rows += compared(case, grid, options, arguments.limit_s, python)
+    scenario, options, rows = plans_of(arguments.scenario, arguments.days, arguments.limit_s, python)
     if arguments.json:
         plans = [{name: getattr(row, name) for name in Row.__slots__} for row in rows]
-        print(json.dumps({"scenario": scenario.name, "candidates": len(options), "plans": plans}))
+        print(json.dumps({"scenario": scenario.name, "candidates": options, "plans": plans}))
         return 0
-    print(
-        f"{scenario.name}, {arguments.days:g} days, {len(options)} candidates of 5 to 25 min, Sun 2 to 60 deg, "
-        f"gravity field {model.gravity.name}"
-    )
+    print(f"{scenario.name}, {arguments.days:g} days, {options} candidates of 5 to 25 min, Sun 2 to 60 deg")
     print(f"{'case':<31} {'plan':<26} {'windows':>7} {'hours':>6} {'frames':>7} {'bound':>8} {'seconds':>8}")
     for row in rows:
         bound = "" if row.bound is None else f"{row.bound:.1f}"
@@ -135,6 +121,35 @@ def main(words: Sequence[str]) -> int:
             f"{bound:>8} {row.seconds:>8.1f}"
         )
     return 0
+
+
+def plans_of(name: str, days: float, limit_s: float, python: Path | None) -> tuple[Scenario, int, list[Row]]:
+    """Return the scenario, the number of candidates, and the yield of each plan of each case."""
+    data = find_data(None)
+    scenario = load_scenario(name)
+    orbit = propagate_scenario(scenario, force_model(scenario, data), (days + 1.0) * 86_400.0)
+    ephemeris, _ = sample(orbit, 60.0)
+    start = ephemeris.start_utc_ns + 10 * NS
+    stop = start + round(days * DAY_NS)
+    table: list[Row] = []
+    options: list[Option] = []
+    for case in CASES:
+        planner = Planner(ephemeris, default_orientation(data), case.resources, PinholeCamera())
+        options = candidates(planner, start, stop)
+        table += compared(case, grid_of(planner, case, start, stop), options, limit_s, python)
+    return scenario, len(options), table
+
+
+def rows() -> Iterator[_rows.Row]:
+    """Yield the windows of a week of the planner beside the optimal number; more than the bound is an error."""
+    _, _, plans = plans_of("selenita", 7.0, 10.0, None)
+    best = {one.case: one for one in plans if one.plan == "optimal windows, HiGHS"}
+    for one in plans:
+        if one.bound is None:
+            optimal = best[one.case]
+            wrong = "" if one.windows <= (optimal.bound or 0) + 1e-6 else "more windows than possible"
+            what = f"{one.case}: {one.plan}"
+            yield _rows.Row(what, one.windows, "windows", "optimal", optimal.windows, wrong)
 
 
 def candidates(planner: Planner, start: int, stop: int) -> list[Option]:

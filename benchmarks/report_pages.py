@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+from benchmarks._rows import Row
 from reports.render import render_html, render_pdf, to_json
 from tests.reports import example
 
@@ -29,6 +30,20 @@ def bench() -> dict[str, Any]:
             "json": _measured(lambda r=report: to_json(r).encode()),
         }
     return figures
+
+
+def rows() -> Iterator[Row]:
+    """Yield the processor time of each document; the peer is the same report as data."""
+    for report, documents in bench().items():
+        for form in ("html", "pdf"):
+            spent = documents[form]["cpu_s"]
+            yield Row(
+                f"report of {report.replace('_', ' ')}: {form}",
+                spent,
+                "s",
+                "JSON",
+                documents["json"]["cpu_s"],
+            )
 
 
 def _measured(make: Callable[[], bytes]) -> dict[str, float]:

@@ -15,12 +15,13 @@ import struct
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks._rows import Row
 from tmtc import reed_solomon
 from tmtc.downlink import LinkSettings, decode, encode_cadus
 from tmtc.schema import Dictionary, Field, Group, PacketDefinition
@@ -117,6 +118,21 @@ def bench(packets: int = PACKETS) -> dict[str, Any]:
         "variable, to ccsdspy": _ratio(variable_rates, "ccsdspy VariableLength, no checksum"),
     }
     return figures
+
+
+def rows() -> Iterator[Row]:
+    """Yield rates of decoding beside the quickest rivals; different values are an error."""
+    figures = bench()
+    wrong = "" if figures["values_equal"] else "values of the decoders differ"
+    for kind in ("fixed_62_octets", "variable_mean_267_octets"):
+        rates = figures[kind]
+        ours = rates["linna, checksum"]["packets_per_s"]
+        for peer, rate in rates.items():
+            if peer != "linna, checksum":
+                yield Row(kind.replace("_", " "), ours, "packets/s", peer, rate["packets_per_s"], wrong)
+    for what in ("reed_solomon_mb_per_s", "downlink_mb_per_s"):
+        for name, rate in figures[what].items():
+            yield Row(f"{what.split('_mb')[0].replace('_', '-')}: {name}", rate, "MB/s")
 
 
 def _ours(octets: bytes) -> Any:

@@ -17,11 +17,13 @@ import json
 import tempfile
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks._rows import Row
 from benchmarks.tmtc import DICTIONARY, fixed_packets
 from tests.tmtc import foreign
 from tmtc.stream import PacketCut, cut_packets
@@ -46,6 +48,14 @@ def bench(packets: int = PACKETS, interpreted: int = INTERPRETED) -> dict[str, A
         "mixed, dynamic sizes": (foreign.BUS, *_capture(mixed * times)),
     }
     return {name: _compare(*given, interpreted) for name, given in captures.items()}
+
+
+def rows() -> Iterator[Row]:
+    """Yield rates of the compiled definition beside the interpreter."""
+    for name, one in bench().items():
+        wrong = "" if one["values_equal"] else "values of the interpreter differ"
+        rates = one["linna_packets_per_s"], one["space_packet_parser_packets_per_s"]
+        yield Row(name, rates[0], "packets/s", "space_packet_parser", rates[1], wrong)
 
 
 def _capture(packets: list[bytes]) -> tuple[bytes, PacketCut]:
