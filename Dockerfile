@@ -19,6 +19,7 @@ COPY requirements/hashed requirements
 RUN /opt/linna/bin/pip install --require-hashes -r requirements/runtime.txt -r requirements/postgres.txt \
     -r requirements/parquet.txt -r requirements/traces.txt -r requirements/oidc.txt -r requirements/objects.txt
 COPY pyproject.toml README.md LICENSE ./
+COPY kernels kernels
 COPY lunar lunar
 COPY tmtc tmtc
 COPY reports reports

@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = (
     "tmtc",
     "lunar",
+    "kernels",
     "reports",
     "ground_service",
     "payload_emulator",

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from kernels.compiled import njit
 from lunar import _dynamics_kernel, _gravity_kernel
-from lunar._compile import njit
 from lunar.datafolder import default_gravity, default_orientation, find_data
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.gravity import GravityField

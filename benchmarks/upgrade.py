@@ -44,7 +44,7 @@ from ground_service.store.database import known_revisions, schema_revisions
 from studies.mission_run.parts import Part, PostgresServer, bare_environment, free_port, listens
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "linna", "scenarios")
+PACKAGES = ("kernels", "lunar", "tmtc", "reports", "payload_emulator", "studies", "linna", "scenarios")
 REVISION = "9.9_works_with_1.0"
 MIGRATION = f'''
 import sqlalchemy as sa

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar._gravity_kernel import acceleration, acceleration_gradient
 from lunar.arrays import FloatArray
 

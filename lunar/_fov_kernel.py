@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import FloatArray, IntArray
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
 
-from lunar._compile import njit  # before numba: it sets how numba compiles
+from kernels.compiled import njit  # before numba: it sets how numba compiles
 from lunar.arrays import FloatArray
 
 from numba.core import cgutils, types  # isort: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna")
+PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna", "kernels")
 
 
 def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:

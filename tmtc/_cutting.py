@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tmtc._compile import njit
+from kernels.compiled import njit
 from tmtc.arrays import RecordArray
 
 GOOD = 0
@@ -50,7 +50,7 @@ def powers_of_octets() -> RecordArray:
     return np.array(powers, dtype=np.int32)
 
 
-@njit
+@njit(nogil=True)
 def _crc(buffer: RecordArray, start: int, stop: int, tables: RecordArray) -> int:
     crc = 0xFFFF
     i = start
@@ -72,14 +72,14 @@ def _crc(buffer: RecordArray, start: int, stop: int, tables: RecordArray) -> int
     return crc
 
 
-@njit
+@njit(nogil=True)
 def checksums_hold(rows: RecordArray, tables: RecordArray, holds: RecordArray) -> None:
     """Write whether the last two octets of each row (n, length) are the checksum of those before."""
     for n in range(rows.shape[0]):
         holds[n] = _crc(rows[n], 0, rows.shape[1], tables) == 0
 
 
-@njit
+@njit(nogil=True)
 def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
     """Octets of the packet whose header stands at `p`, or 0 where no such header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:
@@ -90,12 +90,12 @@ def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest:
     return length
 
 
-@njit
+@njit(nogil=True)
 def is_idle(buffer: RecordArray, p: int) -> bool:
     return (buffer[p] & 0x0F) == 0x07 and buffer[p + 1] == 0xFF
 
 
-@njit
+@njit(nogil=True)
 def walk(
     buffer: RecordArray,
     p: int,
@@ -124,7 +124,7 @@ def walk(
     return p, count
 
 
-@njit
+@njit(nogil=True)
 def is_pus(buffer: RecordArray, p: int, length: int, packet_type: int) -> bool:
     """Whether a PUS-C secondary header stands where it should."""
     if not buffer[p] & 0x08:
@@ -134,7 +134,7 @@ def is_pus(buffer: RecordArray, p: int, length: int, packet_type: int) -> bool:
     return length >= _PUS_TC_LENGTH and buffer[p + 6] >> 4 == 2
 
 
-@njit
+@njit(nogil=True)
 def _multiply(a: int, b: int) -> int:
     product = 0
     for bit in range(15, -1, -1):
@@ -144,7 +144,7 @@ def _multiply(a: int, b: int) -> int:
     return product
 
 
-@njit
+@njit(nogil=True)
 def _prefix_holds(
     buffer: RecordArray,
     p: int,
@@ -171,7 +171,7 @@ def _prefix_holds(
     return prefix[e] == _multiply(np.int64(prefix[p]) ^ 0xFFFF, np.int64(powers[length]))
 
 
-@njit
+@njit(nogil=True)
 def _stands(
     buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
@@ -183,7 +183,7 @@ def _stands(
     return is_idle(buffer, p) or _prefix_holds(buffer, p, length, prefix, known, tables, powers)
 
 
-@njit
+@njit(nogil=True)
 def chain_start(
     buffer: RecordArray, first: int, end: int, packet_type: int, longest: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
@@ -204,7 +204,7 @@ def chain_start(
     return found
 
 
-@njit
+@njit(nogil=True)
 def search(
     buffer: RecordArray, first: int, limit: int, stop: int, packet_type: int, longest: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
@@ -233,7 +233,7 @@ CHAIN = 32
 _AHEAD = 256
 
 
-@njit
+@njit(nogil=True)
 def header_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
     """Octets that the header at `p` claims, whether or not they are there; 0 where no header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:
@@ -242,7 +242,7 @@ def header_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest:
     return length if length <= longest else 0
 
 
-@njit
+@njit(nogil=True)
 def walk_unchecked(
     buffer: RecordArray,
     p: int,
@@ -273,7 +273,7 @@ def walk_unchecked(
     return p, count
 
 
-@njit
+@njit(nogil=True)
 def proves(
     buffer: RecordArray, q: int, stop: int, packet_type: int, longest: int, last: RecordArray, is_begin: bool
 ) -> bool:
@@ -305,7 +305,7 @@ def proves(
     return is_begin
 
 
-@njit
+@njit(nogil=True)
 def search_unchecked(
     buffer: RecordArray, first: int, stop: int, packet_type: int, longest: int, last: RecordArray
 ) -> int:

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from tmtc._compile import njit
+from kernels.compiled import njit
 from tmtc.arrays import RecordArray
 
 
-@njit
+@njit(nogil=True)
 def copy_items(
     octets: RecordArray,
     starts: RecordArray,

@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 
-from tmtc._compile import njit
+from kernels.compiled import njit
 from tmtc.arrays import RecordArray
 
 _HIGH, _LOW = 0x1ACF, 0xFC1D
@@ -22,7 +22,7 @@ def tables() -> RecordArray:
     return np.stack([np.bitwise_count(words ^ np.uint16(half)) for half in (_HIGH, _LOW)])
 
 
-@njit
+@njit(nogil=True)
 def find_markers(
     octets: RecordArray, first: int, stop: int, tolerance: int, distance: RecordArray, found: RecordArray
 ) -> tuple[int, int]:
@@ -67,7 +67,7 @@ def second_octets() -> RecordArray:
     return result
 
 
-@njit
+@njit(nogil=True)
 def find_undamaged(
     octets: RecordArray, first: int, stop: int, second: RecordArray, found: RecordArray
 ) -> tuple[int, int]:

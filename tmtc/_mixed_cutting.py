@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tmtc._compile import njit
+from kernels.compiled import njit
 from tmtc._cutting import GOOD, _crc, header_at, is_idle, length_at, search
 
 Array = npt.NDArray[Any]
 
 
-@njit
+@njit(nogil=True)
 def _is_unchecked(buffer: Array, p: int, unchecked: Array) -> bool:
     return unchecked[(np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])]
 
 
-@njit
+@njit(nogil=True)
 def unchecked_length(
     buffer: Array, p: int, stop: int, packet_type: int, longest: int, unchecked: Array
 ) -> int:
@@ -36,7 +36,7 @@ def unchecked_length(
     return length
 
 
-@njit
+@njit(nogil=True)
 def follows(
     buffer: Array,
     e: int,
@@ -62,7 +62,7 @@ def follows(
     return length_at(buffer, e, stop, packet_type, longest) > 0 and _crc(buffer, e, e + claimed, tables) == 0
 
 
-@njit
+@njit(nogil=True)
 def walk_mixed(
     buffer: Array, p: int, stop: int, packet_type: int, longest: int, tables: Array, rows: Array, count: int,
     unchecked: Array, open_end: bool,
@@ -85,7 +85,7 @@ def walk_mixed(
     return p, count
 
 
-@njit
+@njit(nogil=True)
 def search_mixed(
     buffer: Array, first: int, limit: int, stop: int, packet_type: int, longest: int,
     prefix: Array, known: Array, tables: Array, powers: Array, unchecked: Array,

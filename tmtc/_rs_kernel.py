@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from tmtc._compile import njit
+from kernels.compiled import njit
 from tmtc.arrays import RecordArray
 
 CODEWORD = 255
 _GROUP = 16
 
 
-@njit
+@njit(nogil=True)
 def add_checks(words: RecordArray, first: int, symbols: int, table: RecordArray, check: RecordArray) -> None:
     """Add the check symbols of each codeword to `check` (n, interleave, parity / 8) uint64.
 
@@ -49,7 +49,7 @@ def add_checks(words: RecordArray, first: int, symbols: int, table: RecordArray,
                         check[n, c, 1] ^= rows[value, 1]
 
 
-@njit
+@njit(nogil=True)
 def correct(
     words: RecordArray,
     fill: int,
@@ -128,7 +128,7 @@ def correct(
         counts[n] = degree
 
 
-@njit
+@njit(nogil=True)
 def _find_places(
     locator: RecordArray,
     degree: int,
@@ -154,7 +154,7 @@ def _find_places(
     return number == degree
 
 
-@njit
+@njit(nogil=True)
 def _evaluate(
     syndromes: RecordArray,
     locator: RecordArray,
@@ -172,7 +172,7 @@ def _evaluate(
         evaluator[k] = total
 
 
-@njit
+@njit(nogil=True)
 def _error_values(
     found: RecordArray,
     locator: RecordArray,
@@ -212,7 +212,7 @@ def _error_values(
     return True
 
 
-@njit
+@njit(nogil=True)
 def _locate(
     syndromes: RecordArray,
     parity: int,

@@ -52,6 +52,7 @@ _FLIGHT_CODE = (
     "payload_emulator/session/replay.py",
     "payload_emulator/session/recording.py",
     "payload_emulator/session/parameter_file.py",
+    "kernels",
     "lunar",
     "tmtc",
 )

@@ -34,6 +34,7 @@ from pydantic.dataclasses import dataclass
 from ground_service.sandbox import host
 from ground_service.sandbox.host import Run, SandboxRefused
 from ground_service.sandbox.runner_checks import build_remains, runner_faults
+from kernels import cache_folder
 
 DOWNLINKS = ("downlink.cadu", "downlink.packets")
 PERFORMANCE = "performance.json"
@@ -106,14 +107,17 @@ def run_in_sandbox(
         if confined.refusal:
             raise SandboxRefused(confined.refusal)
         archive, folder, private = "/archive", "/build", ""
-        inputs = tuple(
-            host.Part("bind", str((staged / name).absolute()), f"/{name}") for name in ("archive", "build")
-        )
+        folders = {"archive": staged / "archive", "build": staged / "build", "kernels": cache_folder()}
+        inputs = [
+            host.Part("bind", str(path.absolute()), f"/{name}")
+            for name, path in folders.items()
+            if path.is_dir()
+        ]
         view = (*host.program_view(), *inputs)
-        home = "/home/build"
+        home, compiled = "/home/build", {"NUMBA_CACHE_DIR": "/kernels"}
     else:
         archive, folder, private = str(staged / "archive"), str(staged / "build"), "{private}"
-        view, home = (), "{private}/home"
+        view, home, compiled = (), "{private}/home", {}
     places = {
         "{python}": sys.executable,
         "{archive}": archive,
@@ -124,7 +128,7 @@ def run_in_sandbox(
         mode,
         tuple(_placed(word, places) for word in request.words),
         f"{private}/out",
-        environment(home, f"{private}/tmp"),
+        {**environment(home, f"{private}/tmp"), **compiled},
         dict(request.limits),
         OUTPUTS,
         str(written.absolute()),

@@ -18,7 +18,7 @@ from typing import Any, Literal
 GRACE_S = 180.0
 """Time after the time limit of a run within which its launcher must end."""
 
-PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
+PACKAGES = ("kernels", "lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
 """Packages that the flight code of this project needs; scenarios, migrations and tests are not visible."""
 
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib64", "/lib32")

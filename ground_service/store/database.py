@@ -200,7 +200,7 @@ def open_database(url: str) -> Database:
     except SQLAlchemyError:
         raise DatabaseUnavailable(url.split("@")[-1], "expected a URL such as sqlite:///file.db") from None
     if parsed.get_backend_name() == "sqlite":
-        if parsed.database and parsed.database != ":memory:":
+        if parsed.database and not parsed.database.startswith((":memory:", "file:")):
             _make_folder(Path(parsed.database))
         engine = create_engine(
             parsed, connect_args={"timeout": BUSY_TIMEOUT_MS / 1000}, json_serializer=_json_text

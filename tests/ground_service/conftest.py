@@ -15,6 +15,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,7 +27,8 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from ground_service.ground import Ground, open_ground
-from ground_service.store.database import prepare_database
+from ground_service.store import database as databases
+from ground_service.store.database import Database, open_database, prepare_database, schema_revisions
 from ground_service.worker.follow_up import follow_in_process
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class
@@ -58,6 +60,27 @@ def name_of_the_test_client() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Database], None]]:
+    """Copy the tables of new SQLite databases from one that was migrated; the migration itself is yielded."""
+    migrate, lock = databases.upgrade_database, threading.Lock()
+    made = open_database(f"sqlite:///{tmp_path_factory.mktemp('schema') / 'linna.db'}")
+    migrate(made)
+    whole = schema_revisions(made)
+
+    def upgrade(database: Database) -> None:
+        with lock:
+            if database.dialect != "sqlite" or schema_revisions(database) != (None, *whole[1:]):
+                return migrate(database)
+            with made.engine.connect() as source, database.engine.connect() as target:
+                source.connection.driver_connection.backup(target.connection.driver_connection)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(databases, "upgrade_database", upgrade)
+        yield migrate
+    made.engine.dispose()
 
 
 @dataclass(frozen=True)
@@ -302,10 +325,7 @@ def synthetic_pass(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
 @pytest.fixture(params=["sqlite", "postgresql"])
 def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
     """An empty service on each database."""
-    url = None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
+    url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as ground:
         follow_in_process(ground)
         yield ground
@@ -508,20 +528,27 @@ def postgres_server() -> Iterator[str]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def _create_database(server: str, name: str, template: str = "template1") -> str:
+    engine = create_engine(f"{server}/postgres", isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name} TEMPLATE {template}"))
+    engine.dispose()
+    return f"{server}/{name}"
+
+
 @pytest.fixture(scope="session")
 def new_postgres_database(postgres_server: str) -> Callable[[], str]:
     """A function that makes an empty database on the PostgreSQL server and returns its URL."""
     numbers = itertools.count(1)
+    return lambda: _create_database(postgres_server, f"empty_{next(numbers)}")
 
-    def make() -> str:
-        name = f"linna_{next(numbers)}"
-        engine = create_engine(f"{postgres_server}/postgres", isolation_level="AUTOCOMMIT")
-        with engine.connect() as connection:
-            connection.execute(text(f"CREATE DATABASE {name}"))
-        engine.dispose()
-        return f"{postgres_server}/{name}"
 
-    return make
+@pytest.fixture(scope="session")
+def migrated_postgres(postgres_server: str) -> Callable[[], str]:
+    """A function that makes a database with the newest schema, a copy of one that was migrated; it returns the URL."""
+    numbers = itertools.count(1)
+    prepare_database(_create_database(postgres_server, "migrated"), upgrade=True).engine.dispose()
+    return lambda: _create_database(postgres_server, f"linna_{next(numbers)}", "migrated")
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import contextlib
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import httpx
@@ -11,20 +12,19 @@ from benchmarks.campaigns._deployment import ManyApis
 from benchmarks.dashboard import Prometheus, fill, panels
 from ground_service.ground import open_ground
 from ground_service.jobs.service import enter_job
-from ground_service.store.database import prepare_database
 from tests.ground_service.conftest import wait_for
 
 
-def test_every_query_of_the_dashboard_has_data(tmp_path: Path, postgres_url: str) -> None:
+def test_every_query_of_the_dashboard_has_data(tmp_path: Path, migrated_postgres: Callable[[], str]) -> None:
     for program in ("prometheus", "redis-server"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed")
     backups = tmp_path / "backups"
-    prepare_database(postgres_url, upgrade=True).engine.dispose()
-    with open_ground(tmp_path / "home", database_url=postgres_url) as ground:
+    url = migrated_postgres()
+    with open_ground(tmp_path / "home", database_url=url) as ground:
         fill(ground, tmp_path, backups)
         enter_job(ground, "plan", {})  # waits: there is no worker
-    with ManyApis(tmp_path, postgres_url, count=1, LINNA_BACKUPS=str(backups)) as service:
+    with ManyApis(tmp_path, url, count=1, LINNA_BACKUPS=str(backups)) as service:
         prometheus = Prometheus(tmp_path, service.ports)
         service.parts["prometheus"] = prometheus.part
         empty = {target["expr"] for panel in panels() for target in panel["targets"]}

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar._gravity_kernel import acceleration as field_acceleration
 from lunar._gravity_kernel import acceleration_gradient
 from lunar.arrays import FloatArray

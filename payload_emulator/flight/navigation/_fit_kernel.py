@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import FloatArray, IntArray
 
 _ROUNDS = 9

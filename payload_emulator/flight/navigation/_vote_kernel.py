@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import FloatArray, IntArray
 
 _LISTED = 20_000

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import Float32Array, Int32Array
 from lunar.constants import MOON_RADIUS_M
 

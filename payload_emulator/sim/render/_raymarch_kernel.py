@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import Float32Array, FloatArray, Int32Array
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.terrain.tiles import ALBEDO_SHIFT, TILE_SHIFT

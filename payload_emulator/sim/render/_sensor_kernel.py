@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import Float32Array
 
 

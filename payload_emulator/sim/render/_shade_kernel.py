@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import Float32Array, Int32Array
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.render._grid_kernel import INLINED, LINE, NODE_STEP, Grid, Nodes, Tiles

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import Float32Array, FloatArray, Int32Array
 from payload_emulator.sim.render._grid_kernel import BLOCK_SHIFT, INLINED, LINE, Grid
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from lunar._compile import njit
+from kernels.compiled import njit
 from lunar.arrays import Float32Array, FloatArray, Int32Array, IntArray
 
 PROFILE_REACH = 2.6

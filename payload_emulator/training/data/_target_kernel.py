@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar._compile import njit
+from kernels.compiled import njit
 
 
 @njit(nogil=True)

@@ -25,7 +25,6 @@ from ground_service.ground import ground_from_settings
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
-from ground_service.store.database import prepare_database
 
 with warnings.catch_warnings():
     # The test client's next version wants another HTTP library.
@@ -76,8 +75,7 @@ def client(
 ) -> Iterator[TestClient]:
     deployment = Settings(home=tmp_path_factory.mktemp("fuzz"))
     if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
+        url = request.getfixturevalue("migrated_postgres")()
         deployment = deployment.model_copy(update={"database_url": SecretStr(url)})
     with ground_from_settings(deployment) as ground:
         import_archive(ground, synthetic_pass.folder)

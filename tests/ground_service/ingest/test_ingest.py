@@ -20,7 +20,6 @@ from ground_service.ingest import edge_store as edges
 from ground_service.ingest.edges import MIDDLE
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
-from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import archive_hash
 from tmtc.crc import append_crc
@@ -433,7 +432,7 @@ def test_two_workers_give_the_same_archive(
     packets: list[bytes],
     expected: str,
     tmp_path: Path,
-    new_postgres_database: Callable[[], str],
+    migrated_postgres: Callable[[], str],
     seed: int,
     placed: bool,
 ) -> None:
@@ -441,8 +440,7 @@ def test_two_workers_give_the_same_archive(
 
     Without places no CADU is cut more often than `MIDDLES_IN_A_CADU` allows.
     """
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
     cuts = np.unique(np.random.default_rng(seed).integers(1, len(stream), 24 if placed else 10)).tolist()
     pieces = [(a, stream[a:b]) for a, b in itertools.pairwise([0, *cuts, len(stream)])]

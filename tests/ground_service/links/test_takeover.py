@@ -14,7 +14,6 @@ import pytest
 
 from ground_service.ground import open_ground
 from ground_service.links import service
-from ground_service.store.database import prepare_database
 from tests.ground_service.links.conftest import Station, declare, until
 from tests.ground_service.links.test_links import hash_of, octets_of, packets_of, released
 
@@ -22,10 +21,9 @@ CADU = 1279
 
 
 def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
-    new_postgres_database: Callable[[], str], tmp_path: Path, station: Station, synthetic_pass: Any
+    migrated_postgres: Callable[[], str], tmp_path: Path, station: Station, synthetic_pass: Any
 ) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     environment = os.environ | {
         "LINNA_DATABASE_URL": url,

@@ -34,7 +34,6 @@ from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
 from ground_service.passes.store import get_pass as stored_pass
 from ground_service.settings import Settings
-from ground_service.store.database import prepare_database
 from linna import cli
 from tests.ground_service.conftest import write_manifest
 
@@ -364,9 +363,7 @@ def test_commands_check_enter_list_and_show_a_description(tmp_path: Path, capsys
 def test_several_that_enter_one_description_at_once_get_one_revision(
     kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    url = request.getfixturevalue("new_postgres_database")() if kind == "postgresql" else None
-    if url is not None:
-        prepare_database(url, upgrade=True).engine.dispose()
+    url = request.getfixturevalue("migrated_postgres")() if kind == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as ground, ThreadPoolExecutor(4) as pool:
         entered = list(pool.map(lambda _: add_mission(ground, TEXT.encode()), range(8)))
         assert len({one.id for one in entered}) == 1

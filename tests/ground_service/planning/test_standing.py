@@ -23,7 +23,6 @@ from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
-from ground_service.store.database import prepare_database
 from ground_service.worker.follow_up import follow_in_process
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
@@ -83,8 +82,7 @@ def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
     """An empty service on each database, which does not follow its events: only the tests plan."""
     url = None
     if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
+        url = request.getfixturevalue("migrated_postgres")()
     with open_ground(tmp_path / "home", database_url=url) as opened:
         yield opened
 
@@ -319,10 +317,9 @@ def test_contradictory_terms_are_refused(ground: Ground) -> None:
 
 
 def test_processes_that_plan_at_the_same_time_make_one_plan(
-    new_postgres_database, oem: Path, tmp_path: Path, now: Now
+    migrated_postgres, oem: Path, tmp_path: Path, now: Now
 ) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]
     prepare(grounds[0], oem)
     key = request(grounds[0])

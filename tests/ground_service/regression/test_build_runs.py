@@ -140,6 +140,22 @@ def test_a_program_sees_what_the_payload_was_given_and_nothing_of_the_truth(fly)
     assert not {"reference.oem", "truth.oem", "catalogue.csv", "downlink.cadu", "LINNA_DATA"} & set(told)
 
 
+def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(
+    fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "kernels"
+    cache.mkdir()
+    (cache / "one").write_text("code")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    run = fly(
+        "folder, told = pathlib.Path(os.environ['NUMBA_CACHE_DIR']), ''\n"
+        "try: (folder / 'two').touch()\n"
+        "except OSError as error: told = error.strerror\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text((folder / 'one').read_text() + told)\n"
+    )
+    assert run.downlink is not None and run.downlink.read_text() == "codeRead-only file system"
+
+
 def test_a_program_that_damages_its_archive_damages_a_copy(fly, archive: Path) -> None:
     before = (archive / "frames/000000.png").read_bytes()
     fly("pathlib.Path(sys.argv[1], 'frames/000000.png').write_bytes(b'')")

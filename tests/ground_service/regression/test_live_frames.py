@@ -16,7 +16,6 @@ from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.pass_archives import keep_pass
 from ground_service.regression.rendering import settle_archive
 from ground_service.regression.service import run_regression
-from ground_service.store.database import prepare_database
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run import run as mission_run
@@ -36,8 +35,7 @@ def flown(
     """Folder and database of a mission that has flown one window."""
     folder, url = tmp_path_factory.mktemp("mission"), None
     if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
+        url = request.getfixturevalue("migrated_postgres")()
 
     def opened(home: Path, data: DataFolder, clock_file: Path) -> EmbeddedGround:
         set_mission_clock(ClockFile(clock_file).read)

@@ -11,7 +11,7 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
     if request.param == "sqlite":
         url = f"sqlite:///{tmp_path / 'linna.db'}"
     else:
-        url = request.getfixturevalue("new_postgres_database")()
-    opened = prepare_database(url, upgrade=True)
+        url = request.getfixturevalue("migrated_postgres")()
+    opened = prepare_database(url)
     yield opened
     opened.engine.dispose()

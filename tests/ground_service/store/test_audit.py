@@ -185,9 +185,9 @@ def test_several_processes_at_once_make_one_chain(database: Database) -> None:
         assert all(b[2] == a[2] + 1 for a, b in zip(mine[::2], mine[1::2], strict=True))
 
 
-def test_the_lock_is_only_held_at_the_end(new_postgres_database: Callable[[], str]) -> None:
+def test_the_lock_is_only_held_at_the_end(migrated_postgres: Callable[[], str]) -> None:
     """A long transaction with an audit entry does not keep another from being committed."""
-    database = prepare_database(new_postgres_database(), upgrade=True)
+    database = prepare_database(migrated_postgres())
     with database.writing() as long:
         audit.add_note(long, audit.Note(5, "slow", "work", "", {}))
         with database.writing() as short:

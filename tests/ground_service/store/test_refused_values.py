@@ -10,7 +10,7 @@ import pytest
 from ground_service.errors import DatabaseBusy, InvalidInput, public_text
 from ground_service.ground import Ground, open_ground
 from ground_service.store import repository
-from ground_service.store.database import database_error, prepare_database
+from ground_service.store.database import database_error
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,8 @@ def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: di
         assert repository.page(connection, repository.JOBS).total == 0
 
 
-def test_text_with_nul_is_refused_by_postgresql_as_input(new_postgres_database: Any, tmp_path: Path) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres: Any, tmp_path: Path) -> None:
+    url = migrated_postgres()
     with (
         open_ground(tmp_path, database_url=url) as ground,
         pytest.raises(InvalidInput, match="can hold"),

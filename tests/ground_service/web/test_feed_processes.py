@@ -19,7 +19,6 @@ from benchmarks.campaigns._deployment import ManyApis
 from ground_service.app import create_app
 from ground_service.settings import Settings
 from ground_service.store import wakeups
-from ground_service.store.database import prepare_database
 from ground_service.web import sockets
 from tests.ground_service.links.conftest import HEAD, Station
 from tmtc.dictionary import DICTIONARY
@@ -35,12 +34,11 @@ LIVE = "/api/v1/live?values=true"
 
 
 @pytest.fixture
-def server_url(new_postgres_database: Callable[[], str]) -> str:
+def server_url(migrated_postgres: Callable[[], str]) -> str:
     """An empty PostgreSQL database with the schema."""
     if shutil.which("redis-server") is None:
         pytest.skip("redis-server is not installed")
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     return url
 
 

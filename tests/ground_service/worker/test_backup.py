@@ -16,7 +16,6 @@ from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
-from ground_service.store.database import prepare_database
 from ground_service.store.models import METADATA
 from ground_service.worker.backup import backup, restore
 from ground_service.worker.integrity import verify
@@ -149,10 +148,9 @@ def test_a_backup_names_rows_that_were_damaged_before(filled: tuple[Ground, str]
 
 
 def test_a_backup_goes_from_either_database_into_either(
-    filled: tuple[Ground, str], saved: Path, tmp_path: Path, new_postgres_database: Callable[[], str]
+    filled: tuple[Ground, str], saved: Path, tmp_path: Path, migrated_postgres: Callable[[], str]
 ) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     with open_ground(tmp_path / "pg", database_url=url) as other:
         restore(saved, other)
         assert everything(other) == everything(filled[0])

@@ -12,7 +12,6 @@ import pytest
 from ground_service.ground import open_ground
 from ground_service.jobs.service import get_job, unfinished_jobs
 from ground_service.settings import Settings
-from ground_service.store.database import prepare_database
 from ground_service.worker.app import queued_jobs
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.scheduler import Scheduler
@@ -30,10 +29,9 @@ def broker(tmp_path: Path) -> Iterator[RedisServer]:
 
 
 def test_jobs_survive_a_broker_that_is_killed(
-    new_postgres_database: Callable[[], str], broker: RedisServer, tmp_path: Path
+    migrated_postgres: Callable[[], str], broker: RedisServer, tmp_path: Path
 ) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     settings = Settings(home=tmp_path / "home", database_url=url, broker_url=broker.url)
     with open_ground(settings.home, database_url=url) as ground:
         dispatcher = dispatcher_for(ground, settings)

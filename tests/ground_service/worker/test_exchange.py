@@ -22,7 +22,7 @@ from ground_service.ingest.store import results_of_vehicle
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store import repository
-from ground_service.store.database import open_database, prepare_database
+from ground_service.store.database import open_database
 from ground_service.store.files import FileArchive
 from ground_service.store.models import METADATA
 from ground_service.worker.exchange import export_database, import_database
@@ -75,11 +75,10 @@ def exported(
 
 
 def test_an_export_goes_into_either_database_and_back(
-    exported: tuple[Ground, Path, str], tmp_path: Path, new_postgres_database: Callable[[], str]
+    exported: tuple[Ground, Path, str], tmp_path: Path, migrated_postgres: Callable[[], str]
 ) -> None:
     ground, path, token = exported
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     tables = json.loads(zipfile.ZipFile(path).read("manifest.json"))["tables"]
     with open_ground(tmp_path / "pg", database_url=url) as other:
         result = import_database(other, path)
@@ -93,8 +92,7 @@ def test_an_export_goes_into_either_database_and_back(
             import_database(other, path)
     with open_ground(tmp_path / "pg2", database_url=url) as other:
         other.database.engine.dispose()
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     with open_ground(tmp_path / "third", database_url=url) as other, open_ground(tmp_path / "back") as back:
         import_database(other, path)
         again = export(other, tmp_path / "again.zip")

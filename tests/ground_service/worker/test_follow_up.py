@@ -28,7 +28,6 @@ from ground_service.jobs.service import unfinished_jobs
 from ground_service.passes.service import define_pass
 from ground_service.store import events as log
 from ground_service.store import repository
-from ground_service.store.database import prepare_database
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process, open_following
 from lunar.timescales import parse_utc
@@ -175,10 +174,9 @@ def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recor
 
 
 def test_several_processes_handle_each_event_once(
-    new_postgres_database: Callable[[], str], recorded: Recorded, tmp_path: Path
+    migrated_postgres: Callable[[], str], recorded: Recorded, tmp_path: Path
 ) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     grounds = [open_following(tmp_path / f"{k}", database_url=url) for k in range(3)]
 
     def run(ground: Ground, first: int) -> None:

@@ -27,7 +27,6 @@ from ground_service.regression.builds import build_of, registered_build
 from ground_service.regression.jobs import missing_replays, prepared
 from ground_service.settings import Settings
 from ground_service.store import repository
-from ground_service.store.database import prepare_database
 from ground_service.worker.backup import backup, restore
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
@@ -100,14 +99,13 @@ def result_of(ground: Ground, key: str, seconds: float = 180.0) -> dict[str, Any
 
 def test_upload_report_and_regression_on_hosts_without_a_common_folder(
     server: ObjectServer,
-    new_postgres_database: Callable[[], str],
+    migrated_postgres: Callable[[], str],
     redis_url: str,
     make_flyable: Callable[..., Any],
     make_build: Callable[..., Path],
     tmp_path: Path,
 ) -> None:
-    url = new_postgres_database()
-    prepare_database(url, upgrade=True).engine.dispose()
+    url = migrated_postgres()
     common = {"database_url": url, "broker_url": redis_url}
     environment = {
         **{f"LINNA_{name.upper()}": value for name, value in common.items()},

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from ground_service.app import create_app
 from ground_service.ground import ground_from_settings
 from ground_service.server import bind
 from ground_service.settings import Settings
-from ground_service.store.database import prepare_database
 from linna.cli import run
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
@@ -204,10 +203,13 @@ def test_a_day_on_a_laptop(capsys: pytest.CaptureFixture[str], tmp_path: Path, m
 
 
 def test_a_day_on_postgresql_redis_and_two_workers(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any, postgres_url: str, redis_url: str
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: Any,
+    migrated_postgres: Callable[[], str],
+    redis_url: str,
 ) -> None:
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "operator"))
-    prepare_database(postgres_url, upgrade=True).engine.dispose()
-    settings = Settings(home=tmp_path / "home", database_url=postgres_url, broker_url=redis_url)
+    settings = Settings(home=tmp_path / "home", database_url=migrated_postgres(), broker_url=redis_url)
     with workers(settings, tmp_path, 2), served(settings) as where:
         operate(capsys, where, tmp_path)

@@ -15,7 +15,6 @@ import pytest
 from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
 from ground_service.store import leases
-from ground_service.store.database import prepare_database
 from ground_service.worker import scheduler as scheduling
 from ground_service.worker.scheduler import LEASE, LEASE_NS, Scheduler, has_scheduler
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
@@ -208,11 +207,10 @@ PROCESS = """
 
 
 def test_processes_on_postgresql_have_the_lease_one_after_the_other(
-    new_postgres_database: Callable[[], str], tmp_path: Path
+    migrated_postgres: Callable[[], str], tmp_path: Path
 ) -> None:
     """The one with the lease is killed, twice; each next one begins after the end of the lease before."""
-    url, lines, lease_ns = new_postgres_database(), tmp_path / "lines", 700_000_000
-    prepare_database(url, upgrade=True).engine.dispose()
+    url, lines, lease_ns = migrated_postgres(), tmp_path / "lines", 700_000_000
     command = [sys.executable, "-c", textwrap.dedent(PROCESS), str(tmp_path / "home"), url, str(lines)]
     processes = [subprocess.Popen([*command, str(lease_ns)]) for _ in range(3)]
 

@@ -1,0 +1,184 @@
+"""Compiled functions (numba) and their cache on disk; only modules with kernels import this module.
+
+The import takes half a second, so that other modules import kernels inside the functions that call them. Superword-
+level vectorisation can only be switched on before the first import of numba; it makes the gravity kernel several
+times faster.
+
+A file of the cache is named after the hash of all that its machine code depends on. Processes, clones and versions
+of the program share one folder. This is the only place that uses private parts of numba.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import os
+import pickle
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any, TypeVar, overload
+
+import numpy as np
+
+os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
+
+import numba
+from numba.core.compiler import CompileResult
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+
+from kernels import cache_folder
+
+__all__ = ["njit"]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+KEPT_S = 90 * 86_400.0
+"""Age at which a file is deleted: the version of the program that it belongs to may be gone."""
+
+_DIGEST_OCTETS = 32
+_texts: dict[str, str] = {}
+
+
+@overload
+def njit(function: Function, /) -> Function: ...
+@overload
+def njit(**options: Any) -> Callable[[Function], Function]: ...
+def njit(function: Function | None = None, /, **options: Any) -> Any:
+    """Return ``function`` compiled on first call and cached on disk; options as for ``numba.njit``."""
+    compiler = numba.njit(**options)
+
+    def compiled(source: Function) -> Any:
+        kernel = compiler(source)
+        if isinstance(kernel, Dispatcher):  # not with NUMBA_DISABLE_JIT
+            file = source.__code__.co_filename
+            _texts[file] = _hash_of_file(file)  # as imported: it may change before the first call
+            kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
+        return kernel
+
+    return compiled if function is None else compiled(function)
+
+
+class _KernelCache:
+    """Cache of one kernel, in numba's terms: one file for each signature and processor, replaced in one piece."""
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel
+        self._folder = cache_folder()
+        self.cache_path = str(self._folder)
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """Return the compiled version for a signature, or None."""
+        target.refresh()
+        try:
+            content = self._file(signature, target.codegen()).read_bytes()
+        except OSError:
+            return None
+        digest, octets = content[:_DIGEST_OCTETS], content[_DIGEST_OCTETS:]
+        if hashlib.sha256(octets).digest() != digest:
+            return None
+        return CompileResult._rebuild(target, *pickle.loads(octets))
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Store a compiled version, unless the folder cannot be written."""
+        if compiled.library.has_dynamic_globals or not all(part.can_cache for part in compiled.lifted):
+            return
+        octets = dumps(compiled._reduce())
+        file = self._file(signature, compiled.codegen)
+        with suppress(OSError):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            part = self._folder / uuid.uuid4().hex
+            part.write_bytes(hashlib.sha256(octets).digest() + octets)
+            part.replace(file)
+            for other in self._folder.iterdir():
+                if other.stat().st_mtime < time.time() - KEPT_S:
+                    other.unlink()
+
+    def flush(self) -> None:
+        """Delete nothing: a file never becomes wrong."""
+
+    @functools.cached_property
+    def _dependencies(self) -> str:
+        """Hash of what determines the machine code apart from signature and processor."""
+        versions = (numba.__version__, np.__version__, numba.config.SLP_VECTORIZE)
+        return _hash("\n".join([repr(versions), *_parts(self._kernel, set())]))
+
+    def _file(self, signature: Any, codegen: Any) -> Path:
+        types = [part for one in signature for part in _type_parts(one)]
+        key = _hash(repr((types, codegen.magic_tuple(), self._dependencies)))
+        return self._folder / f"{self._kernel.py_func.__name__}-{key}"
+
+
+def _type_parts(one: Any) -> Iterator[str]:
+    """Yield the name of a numba type and the names of the fields of tuples, which are not part of it."""
+    yield f"{one} {getattr(one, 'fields', '')}"
+    for inner in getattr(one, "types", ()):
+        yield from _type_parts(inner)
+
+
+def _parts(value: Any, seen: set[int]) -> Iterator[str]:
+    """Yield texts that differ if kernels compiled with this value may differ; follow the kernels that it calls."""
+    if isinstance(value, Dispatcher):
+        if id(value) in seen:
+            return
+        seen.add(id(value))
+        function = value.py_func
+        yield repr([(name, _ordered(option)) for name, option in sorted(value.targetoptions.items())])
+        yield repr(function.__defaults__)
+        names = set()
+        for code in _codes(function.__code__):
+            names |= set(code.co_names)
+            constants = [one for one in code.co_consts if not isinstance(one, CodeType)]
+            yield repr((code.co_code, code.co_exceptiontable, code.co_names, code.co_varnames, constants))
+        for used in _used(function, sorted(names)):
+            yield from _parts(used, seen)
+    elif isinstance(value, np.ndarray):
+        yield repr((value.dtype, value.shape, hashlib.sha256(value.tobytes()).hexdigest()))
+    elif isinstance(value, tuple):
+        yield f"{type(value)} {len(value)}"
+        for one in value:
+            yield from _parts(one, seen)
+    elif not isinstance(value, ModuleType):
+        try:  # a class, an intrinsic or a function: all of its file
+            file = inspect.getfile(inspect.unwrap(value))
+        except TypeError:
+            yield repr(value)
+        else:
+            yield _texts.get(file) or _hash_of_file(file)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Yield the code of a function and of those inside it."""
+    yield code
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _codes(inner)
+
+
+def _used(function: Any, names: list[str]) -> Iterator[Any]:
+    """Yield the values outside a function that it names, also as members of modules."""
+    for value in [function.__globals__[name] for name in names if name in function.__globals__]:
+        yield value
+        if isinstance(value, ModuleType):
+            yield from (getattr(value, name) for name in names if hasattr(value, name))
+    yield from (cell.cell_contents for cell in function.__closure__ or ())
+
+
+def _ordered(option: Any) -> Any:
+    return sorted(option) if isinstance(option, set | frozenset) else option
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _hash_of_file(name: str) -> str:
+    try:
+        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
+    except OSError:  # not from a file
+        return name

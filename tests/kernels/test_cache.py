@@ -1,0 +1,176 @@
+"""The cache of compiled functions is shared by processes and clones, and never gives code of other sources."""
+
+import importlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kernels import compiled
+
+ROOT = Path(__file__).resolve().parents[2]
+CALLEE = """
+from typing import NamedTuple
+import numpy as np
+from kernels.compiled import njit
+from numba.extending import intrinsic
+
+STEP = 1
+STEPS = np.arange(2000)
+OPTIONS = {"fastmath": {"nsz", "contract"}}
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+@intrinsic
+def same(context, x):
+    def write(context, builder, signature, arguments):
+        return arguments[0]
+    return x(x), write
+
+@njit
+def inner(x, by=1):
+    return x + by
+"""
+CALLER = """
+import callee
+from callee import OPTIONS, STEP, STEPS, inner, same
+from kernels.compiled import njit
+
+@njit(**OPTIONS)
+def outer(x):
+    return inner(x) * 10 + callee.STEP - STEP
+
+@njit
+def of_array(x):
+    return x + STEPS[1000]
+
+@njit
+def of_intrinsic(x):
+    return same(x)
+
+@njit
+def of_pair(pair):
+    return pair.first
+"""
+KERNELS = ("outer", "of_array", "of_intrinsic", "of_pair")
+CALL = "import caller; print(caller.outer(1), sum(caller.outer.stats.cache_hits.values()))"
+
+
+def write(folder: Path, old: str = "", new: str = "") -> Path:
+    """Write both modules, the first with a change."""
+    assert old in CALLEE
+    folder.mkdir(exist_ok=True)
+    (folder / "callee.py").write_text(CALLEE.replace(old, new) if old else CALLEE)
+    (folder / "caller.py").write_text(CALLER)
+    return folder
+
+
+def start(folder: Path, cache: Path, **variables: str) -> subprocess.Popen[str]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CACHE_DIR": str(cache),
+        **variables,
+    }
+    return subprocess.Popen([sys.executable, "-c", CALL], stdout=subprocess.PIPE, text=True, env=environment)
+
+
+def run(folder: Path, cache: Path, **variables: str) -> str:
+    """Result of `outer(1)`, and how often it came from the cache."""
+    process = start(folder, cache, **variables)
+    output, _ = process.communicate()
+    assert process.returncode == 0
+    return output.strip()
+
+
+def test_clones_share_compiled_code_until_a_callee_changes(tmp_path: Path) -> None:
+    cache, first, second = tmp_path / "cache", write(tmp_path / "first"), write(tmp_path / "second")
+    assert run(first, cache) == "20 0"
+    assert run(second, cache) == "20 1"  # compiled by another clone
+    write(second, "x + by", "x - by")
+    assert run(second, cache) == "0 0"
+    assert run(first, cache) == "20 1"  # both versions are kept
+    assert run(first, cache, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="") == "20 0"
+
+
+def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> None:
+    cache, folder = tmp_path / "cache", write(tmp_path / "code")
+    processes = [start(folder, cache) for _ in range(3)]
+    assert {process.communicate()[0].split()[0] for process in processes} == {"20"}
+    assert len(list(cache.iterdir())) == 2  # outer and inner, without remains
+    assert run(folder, cache) == "20 1"
+
+
+def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path: Path) -> None:
+    cache, folder = tmp_path / "cache", write(tmp_path / "code")
+    run(folder, cache)
+    forgotten = cache / "forgotten"
+    forgotten.touch()
+    os.utime(forgotten, (0.0, time.time() - compiled.KEPT_S - 60.0))
+    for file in cache.glob("outer-*"):
+        file.write_bytes(file.read_bytes()[:-1])
+    assert run(folder, cache) == "20 0"
+    assert run(folder, cache) == "20 1"
+    assert not forgotten.exists()
+    assert run(folder, folder / "caller.py") == "20 0"  # not a folder
+
+
+def imported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The modules of a folder, not compiled."""
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(folder)
+        for name in ("caller", "callee"):
+            patch.delitem(sys.modules, name, raising=False)
+        module = importlib.import_module("caller")
+        patch.delitem(sys.modules, "callee")
+        patch.delitem(sys.modules, "caller")
+    return module
+
+
+def dependencies(module: Any) -> dict[str, str]:
+    """What the compiled code of each kernel depends on, as a hash."""
+    return {name: getattr(module, name)._cache._dependencies for name in KERNELS}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changed"),
+    [
+        ("STEP = 1", "STEP = 2", {"outer"}),
+        ("by=1", "by=2", {"outer"}),
+        ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}),
+        ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),
+        ("np.arange(2000)", "np.arange(2000) + (np.arange(2000) == 1000)", {"of_array"}),
+        ('"nsz", "contract"', '"contract", "nsz"', set()),
+        ("return arguments[0]", "return builder.neg(arguments[0])", set()),
+    ],
+)
+def test_a_kernel_depends_on_all_that_it_names_and_on_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, changed: set[str]
+) -> None:
+    before = dependencies(imported(write(tmp_path / "one"), monkeypatch))
+    after = dependencies(imported(write(tmp_path / "two", old, new), monkeypatch))
+    # An intrinsic writes instructions with any code of its file, so that every change of the file counts.
+    assert {name for name in KERNELS if before[name] != after[name]} == changed | {"of_intrinsic"}
+
+
+def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba import typeof
+    from numba.core.registry import cpu_target
+
+    files = []
+    for folder, old, new in (
+        ("one", "", ""),
+        ("two", "first: float\n    second", "second: float\n    first"),
+    ):
+        module = imported(write(tmp_path / folder, old, new), monkeypatch)
+        signature = (typeof((module.callee.Pair(1.0, 2.0),)),)
+        files.append(module.of_pair._cache._file(signature, cpu_target.target_context.codegen()))
+    assert files[0] != files[1]
+    assert files[0].name.startswith("of_pair-")
