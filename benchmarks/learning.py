@@ -27,10 +27,12 @@ from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import PageOf
 from ground_service.landmarks.core import PASSES_NEEDED, SIGHTINGS_NEEDED
 from ground_service.landmarks.documents import extended_catalogue, extended_table
-from ground_service.landmarks.model import Landmark
-from ground_service.landmarks.service import decide_landmark, list_landmarks, update_landmarks
+from ground_service.landmarks.model import Landmark, LandmarkFilter
+from ground_service.landmarks.service import decide_landmark, update_landmarks
+from ground_service.landmarks.store import list_landmarks
 from ground_service.passes.archive_import import import_archive
 from linna.data import data_folder
 from lunar.arrays import IntArray
@@ -292,7 +294,10 @@ def _compared(
 
 
 def _all(ground: Ground, state: Any) -> list[Landmark]:
-    return list_landmarks(ground, state=state, limit=100_000)[0]
+    def page(offset: int) -> PageOf[Landmark]:
+        return ground.read(list_landmarks, LandmarkFilter(state=state, limit=1000, offset=offset))
+
+    return [one for offset in range(0, page(0).total, 1000) for one in page(offset).items]
 
 
 if __name__ == "__main__":

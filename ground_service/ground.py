@@ -6,9 +6,10 @@ import functools
 import logging
 import stat
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
 from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
@@ -19,9 +20,14 @@ from ground_service.store.wakeups import Waker, is_redis
 from lunar.datafolder import DataFolder, default_orientation, find_data
 
 if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
     from ground_service.settings import Settings
     from lunar.frames import Orientation
 
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +57,16 @@ class Ground:
         """
         if self.stopping.is_set():
             raise Stopping
+
+    def read(
+        self,
+        work: Callable[Concatenate[Connection, Arguments], Result],
+        *given: Arguments.args,
+        **named: Arguments.kwargs,
+    ) -> Result:
+        """Return the result of a function of a store, called in a transaction that reads."""
+        with self.database.reading() as connection:
+            return work(connection, *given, **named)
 
     @property
     def orientation(self) -> Orientation:

@@ -25,6 +25,7 @@ from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.client import Client
 from ground_service.ground import ground_from_settings, open_ground
+from ground_service.http.model import Paging
 from ground_service.missions import store as missions
 from ground_service.planning.model import Window
 from ground_service.server import bind
@@ -224,9 +225,10 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
         flying.join(PATIENCE_S)
     with open_ground(settings.home) as ground, ground.database.reading() as connection:
         tables = {"passes": repository.PASSES, "windows": repository.WINDOWS, "reports": repository.REPORTS}
-        rows = {name: repository.page(connection, table).rows for name, table in tables.items()}
+        rows = {name: repository.newest(connection, table, Paging())[0] for name, table in tables.items()}
         revisions = {
-            row["id"]: row["revision"] for row in repository.page(connection, missions.MISSIONS).rows
+            row["id"]: row["revision"]
+            for row in repository.newest(connection, missions.MISSIONS, Paging())[0]
         }
     return Both(of_live, of_archive, planned, rows, revisions, mission)
 

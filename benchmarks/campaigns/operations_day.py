@@ -35,8 +35,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.campaigns._deployment import Deployment, Laptop, connected, service_environment, wait_until
-from ground_service.access.audit_log import list_entries
+from ground_service.access.model import AuditFilter
 from ground_service.access.service import add_user
+from ground_service.access.store import list_audit
 from ground_service.client import Client
 from ground_service.ground import Ground, open_ground
 from ground_service.worker.integrity import verify
@@ -256,7 +257,8 @@ def refuse_strangers(desk: Transcript, api: str) -> list[int]:
 
 def look_at_audit(desk: Transcript, ground: Ground) -> dict[str, Any]:
     """Return the audit summary of the day, and whether its chain and the rows are undamaged."""
-    entries, total = list_entries(ground, limit=1000)
+    page = ground.read(list_audit, AuditFilter(limit=1000))
+    entries, total = page.items, page.total
     for (action, actor), count in sorted(Counter((one.action, one.actor) for one in entries).items()):
         desk.say(f"# audit: {actor} {action} {count}")
     result = verify(ground)

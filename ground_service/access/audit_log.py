@@ -2,40 +2,10 @@
 
 from __future__ import annotations
 
-from ground_service.access import store
-from ground_service.access.model import AuditEntry, AuditHead
+from ground_service.access.model import AuditHead
 from ground_service.errors import AuditBroken, InvalidInput
 from ground_service.ground import Ground
 from ground_service.store import audit as chain
-
-
-def list_entries(
-    ground: Ground,
-    *,
-    actor: str | None = None,
-    action: str | None = None,
-    target: str | None = None,
-    since_utc_ns: int | None = None,
-    until_utc_ns: int | None = None,
-    limit: int = 100,
-    offset: int = 0,
-) -> tuple[list[AuditEntry], int]:
-    """Return a page of entries, newest first, and the total number.
-
-    `actor` and `target` must be equal; `action` may be a part of the name: "telecommand" finds "release telecommand".
-    The interval does not include `until_utc_ns`.
-    """
-    with ground.database.reading() as connection:
-        return store.list_entries(
-            connection,
-            actor=actor,
-            action=action,
-            target=target,
-            since_utc_ns=since_utc_ns,
-            until_utc_ns=until_utc_ns,
-            limit=limit,
-            offset=offset,
-        )
 
 
 def audit_head(ground: Ground) -> AuditHead:

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, Given, Paging
+from ground_service.http.times import GivenTime, UtcTime
 
 DAYS_LIMIT = 36_500.0
 
@@ -17,6 +17,10 @@ Days = Annotated[
     float | None,
     Field(default=None, gt=0.0, le=DAYS_LIMIT, allow_inf_nan=False, description="null: unlimited validity"),
 ]
+
+
+Words = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+"""Text of a filter."""
 
 
 class User(Entity):
@@ -177,3 +181,13 @@ class AuditHead(Entity):
 
     number: int = Field(examples=[1], description="0: no entry yet")
     sha256: str
+
+
+class AuditFilter(Paging):
+    """Entries of the audit log to list."""
+
+    actor: Words | None = None
+    action: Words | None = Field(default=None, description="Part of the action")
+    target: Words | None = None
+    since: GivenTime | None = None
+    until: GivenTime | None = Field(default=None, description="UTC, RFC 3339; exclusive")

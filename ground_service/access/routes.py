@@ -6,11 +6,12 @@ from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
 
-from ground_service.access import audit_log
+from ground_service.access import audit_log, store
 from ground_service.access import service as users
 from ground_service.access.model import (
     USER_NAME,
     AuditEntry,
+    AuditFilter,
     AuditHead,
     NewSession,
     NewToken,
@@ -20,18 +21,17 @@ from ground_service.access.model import (
     User,
     UserChange,
     UserWithToken,
+    Words,
 )
 from ground_service.access.security import SESSION_COOKIE, Admin, Operator, Viewer
 from ground_service.errors import InvalidInput
-from ground_service.http.common import GroundOf, PagingOf, RowId
+from ground_service.http.common import GroundOf, RowId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime
 
 access = operations("access")
 
 UserName = Annotated[str, Path(pattern=USER_NAME)]
-Words = Annotated[str | None, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
 @access.post("/session", responses=problems(401))
@@ -103,7 +103,7 @@ def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken) 
 
 
 @access.get("/tokens", responses=problems(404))
-def list_tokens(ground: GroundOf, _: Admin, user: Words = None) -> PageOf[Token]:
+def list_tokens(ground: GroundOf, _: Admin, user: Words | None = None) -> PageOf[Token]:
     """List tokens without their secrets, newest first."""
     return PageOf.all_of(users.list_tokens(ground, user))
 
@@ -116,29 +116,12 @@ def revoke_token(ground: GroundOf, caller: Admin, token_id: RowId) -> None:
 
 @access.get("/audit")
 def list_audit(
-    ground: GroundOf,
-    _: Operator,
-    paging: PagingOf,
-    actor: Words = None,
-    action: Words = None,
-    target: Words = None,
-    since: GivenTime | None = None,
-    until: Annotated[GivenTime | None, Query(description="UTC, RFC 3339; exclusive")] = None,
+    ground: GroundOf, _: Operator, request: Request, asked: Annotated[AuditFilter, Query()]
 ) -> PageOf[AuditEntry]:
     """List the audit entries, newest first: actor, time, action and target."""
-    if since is not None and until is not None and since.utc_ns > until.utc_ns:
-        raise InvalidInput("audit", "until", f"a time after {since}", str(until))
-    found, total = audit_log.list_entries(
-        ground,
-        actor=actor,
-        action=action,
-        target=target,
-        since_utc_ns=None if since is None else since.utc_ns,
-        until_utc_ns=None if until is None else until.utc_ns,
-        limit=paging.limit,
-        offset=paging.offset,
-    )
-    return paging.page(found, total)
+    if asked.since is not None and asked.until is not None and asked.since.utc_ns > asked.until.utc_ns:
+        raise InvalidInput("audit", "until", f"a time after {asked.since}", str(asked.until))
+    return linked(request, ground.read(store.list_audit, asked))
 
 
 @access.get("/audit/head")

@@ -8,9 +8,11 @@ from typing import Any
 from sqlalchemy import Connection, delete, func, or_, select, update
 from sqlalchemy.sql import Select
 
-from ground_service.access.model import AuditEntry, StoredAnswer, TokenRecord, User, UserRecord
+from ground_service.access.model import AuditEntry, AuditFilter, StoredAnswer, TokenRecord, User, UserRecord
 from ground_service.errors import Conflict, NotFound
+from ground_service.http.model import PageOf
 from ground_service.store import repository
+from ground_service.store.repository import page
 from ground_service.store.states import change_if
 
 USERS, TOKENS = repository.USERS, repository.TOKENS
@@ -218,34 +220,22 @@ def delete_answers(connection: Connection, before_utc_ns: int) -> int:
     return int(connection.execute(query).rowcount)
 
 
-def list_entries(
-    connection: Connection,
-    *,
-    actor: str | None,
-    action: str | None,
-    target: str | None,
-    since_utc_ns: int | None,
-    until_utc_ns: int | None,
-    limit: int,
-    offset: int,
-) -> tuple[list[AuditEntry], int]:
-    """Return a page of the audit entries that match, newest first, and the total number."""
+def list_audit(connection: Connection, asked: AuditFilter) -> PageOf[AuditEntry]:
+    """Return a page of the audit entries, newest first."""
     table = AUDIT.c
-    conditions: list[Any] = []
-    if actor is not None:
-        conditions.append(table.actor == actor)
-    if action is not None:
-        conditions.append(table.action.contains(action, autoescape=True))
-    if target is not None:
-        conditions.append(table.target == target)
-    if since_utc_ns is not None:
-        conditions.append(table.utc_ns >= since_utc_ns)
-    if until_utc_ns is not None:
-        conditions.append(table.utc_ns < until_utc_ns)
-    total = connection.execute(select(func.count()).select_from(AUDIT).where(*conditions)).scalar_one()
-    query = select(AUDIT).where(*conditions).order_by(table.id.desc()).limit(limit).offset(offset)
-    rows = connection.execute(query).mappings()
-    return [AuditEntry.of(row, number=row["id"], time=row["utc_ns"]) for row in rows], int(total)
+    query = select(AUDIT)
+    if asked.actor is not None:
+        query = query.where(table.actor == asked.actor)
+    if asked.action is not None:
+        query = query.where(table.action.contains(asked.action, autoescape=True))
+    if asked.target is not None:
+        query = query.where(table.target == asked.target)
+    if asked.since is not None:
+        query = query.where(table.utc_ns >= asked.since.utc_ns)
+    if asked.until is not None:
+        query = query.where(table.utc_ns < asked.until.utc_ns)
+    rows, total = page(connection, query, asked, table.id.desc())
+    return asked.page((AuditEntry.of(row, number=row["id"], time=row["utc_ns"]) for row in rows), total)
 
 
 def _tokens() -> Select[Any]:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import GivenTime, UtcTime
 
 AlarmState = Literal["raised", "acknowledged", "cleared", "shelved"]
@@ -66,3 +66,12 @@ class Shelving(Given):
 
     until: GivenTime
     comment: str = Field(default="", max_length=500)
+
+
+class AlarmFilter(Paging):
+    """Alarms to list."""
+
+    state: list[AlarmState] | None = Field(default=None, description="Default: any state")
+    severity: Severity | None = None
+    spacecraft_id: SpacecraftNumber | None = None
+    instance: InstanceName | None = None

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query
+from fastapi import Query, Request
 
 from ground_service.access.security import Operator, Viewer
 from ground_service.alarms import service
-from ground_service.alarms.model import Acknowledgement, Alarm, AlarmDetail, AlarmState, Severity, Shelving
-from ground_service.http.common import GroundOf, Instance, PagingOf, RowId
+from ground_service.alarms.model import Acknowledgement, Alarm, AlarmDetail, AlarmFilter, Shelving
+from ground_service.http.common import GroundOf, RowId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 
@@ -18,31 +18,16 @@ alarms = operations("alarms")
 
 @alarms.get("/alarms")
 def list_alarms(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    state: Annotated[list[AlarmState] | None, Query(description="Default: any state")] = None,
-    severity: Severity | None = None,
-    spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
-    instance: Instance | None = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[AlarmFilter, Query()]
 ) -> PageOf[Alarm]:
     """List the alarms of all spacecraft, open ones first and the latest first."""
-    items, total = service.list_alarms(
-        ground,
-        states=list(state or []),
-        severity=severity,
-        spacecraft_id=spacecraft_id,
-        instance=instance,
-        limit=paging.limit,
-        offset=paging.offset,
-    )
-    return paging.page(items, total)
+    return linked(request, ground.read(service.list_alarms, asked))
 
 
 @alarms.get("/alarms/{alarm_id}")
 def get_alarm(ground: GroundOf, _: Viewer, alarm_id: RowId) -> AlarmDetail:
     """Show an alarm with its history."""
-    return service.get_alarm(ground, alarm_id)
+    return ground.read(service.get_alarm, alarm_id)
 
 
 @alarms.post("/alarms/{alarm_id}/acknowledge")

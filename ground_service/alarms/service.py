@@ -15,12 +15,13 @@ from sqlalchemy import Connection
 from ground_service.access.service import audit
 from ground_service.alarms import core, store
 from ground_service.alarms.core import Condition
-from ground_service.alarms.model import SHELVED_DAYS_LIMIT, Alarm, AlarmDetail
+from ground_service.alarms.model import SHELVED_DAYS_LIMIT, Alarm, AlarmDetail, AlarmFilter
 from ground_service.alarms.store import AlarmRow
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import AlarmChanged, publish
 from ground_service.ground import Ground
+from ground_service.http.model import PageOf
 from ground_service.store import parameters, telemetry
 from ground_service.store.vehicles import lock_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
@@ -65,42 +66,11 @@ def examine_packets(ground: Ground, vehicle: int) -> int:
         examined += len(packets.ids)
 
 
-def list_alarms(
-    ground: Ground,
-    *,
-    states: list[str],
-    severity: str | None = None,
-    spacecraft_id: int | None = None,
-    instance: str | None = None,
-    limit: int = 100,
-    offset: int = 0,
-) -> tuple[list[Alarm], int]:
-    """Return a page of the alarms, open ones first, and their number; no states: alarms in any state."""
+def list_alarms(connection: Connection, asked: AlarmFilter) -> PageOf[Alarm]:
+    """Return a page of the alarms, open ones first."""
     now = utc_now_ns()
-    with ground.database.reading() as connection:
-        rows, total = store.page(
-            connection,
-            chosen=states,
-            severity=severity,
-            spacecraft_id=spacecraft_id,
-            instance=instance,
-            now_utc_ns=now,
-            limit=limit,
-            offset=offset,
-        )
-        return [_alarm(connection, row, now) for row in rows], total
-
-
-def get_alarm(ground: Ground, alarm_id: int) -> AlarmDetail:
-    """Return an alarm with its history.
-
-    Raises
-    ------
-    NotFound
-        There is no such alarm.
-    """
-    with ground.database.reading() as connection:
-        return _detail(connection, alarm_id)
+    rows, total = store.list_alarms(connection, asked, now)
+    return asked.page([_alarm(connection, row, now) for row in rows], total)
 
 
 def acknowledge_alarm(ground: Ground, alarm_id: int, comment: str, *, actor: str) -> AlarmDetail:
@@ -133,7 +103,7 @@ def acknowledge_alarm(ground: Ground, alarm_id: int, comment: str, *, actor: str
             f"alarm {alarm_id}",
             {"name": row.name, "comment": comment},
         )
-        return _detail(connection, alarm_id)
+        return get_alarm(connection, alarm_id)
 
 
 def shelve_alarm(
@@ -166,7 +136,7 @@ def shelve_alarm(
             connection, actor, "shelve alarm" if not ends else "unshelve alarm", f"alarm {alarm_id}", detail
         )
         _publish(connection, row, change)
-        return _detail(connection, alarm_id)
+        return get_alarm(connection, alarm_id)
 
 
 def _update(connection: Connection, vehicle: int, found: tuple[Condition, ...]) -> None:
@@ -229,7 +199,14 @@ def _condition(row: AlarmRow) -> Condition:
     return Condition(source, row.name, row.severity, row.first_ticks, row.last_ticks, row.count, row.value)
 
 
-def _detail(connection: Connection, alarm_id: int) -> AlarmDetail:
+def get_alarm(connection: Connection, alarm_id: int) -> AlarmDetail:
+    """Return an alarm with its history.
+
+    Raises
+    ------
+    NotFound
+        There is no such alarm.
+    """
     alarm = _alarm(connection, store.get(connection, alarm_id), utc_now_ns())
     return AlarmDetail(**alarm.model_dump(), history=store.history(connection, alarm_id))
 

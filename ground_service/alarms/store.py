@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +9,11 @@ from sqlalchemy import Connection, and_, func, insert, or_, select, update
 from sqlalchemy.engine import RowMapping
 
 from ground_service.alarms.core import Condition
-from ground_service.alarms.model import AlarmChange
+from ground_service.alarms.model import AlarmChange, AlarmFilter
 from ground_service.errors import NotFound
 from ground_service.http.times import UtcTime
 from ground_service.store import models, states
-from ground_service.store.repository import VEHICLES, add_new
+from ground_service.store.repository import VEHICLES, Row, add_new, page
 from ground_service.store.states import StateMachine
 
 _ALARMS = models.ALARMS
@@ -185,37 +184,25 @@ def history(connection: Connection, alarm_id: int) -> list[AlarmChange]:
     ]
 
 
-def page(
-    connection: Connection,
-    *,
-    chosen: Sequence[str],
-    severity: str | None,
-    spacecraft_id: int | None,
-    instance: str | None,
-    now_utc_ns: int,
-    limit: int,
-    offset: int,
-) -> tuple[list[AlarmRow], int]:
+def list_alarms(connection: Connection, asked: AlarmFilter, now_utc_ns: int) -> tuple[list[AlarmRow], int]:
     """Return a page of the alarms, open ones first and the latest first, and their number."""
-    shelved = func.coalesce(_ALARMS.c.shelved_until_utc_ns, 0) > now_utc_ns
-    conditions = []
-    if chosen:
-        plain = [state for state in chosen if state != "shelved"]
+    query = _select()
+    if asked.state:
+        shelved = func.coalesce(_ALARMS.c.shelved_until_utc_ns, 0) > now_utc_ns
+        plain = [state for state in asked.state if state != "shelved"]
         among = [and_(_ALARMS.c.state.in_(plain), or_(~shelved, _ALARMS.c.open.is_(None)))]
-        if "shelved" in chosen:
+        if "shelved" in asked.state:
             among.append(and_(shelved, _ALARMS.c.open == OPEN))
-        conditions.append(or_(*among))
-    if severity is not None:
-        conditions.append(_ALARMS.c.severity == SEVERITY_CODES[severity])
-    if spacecraft_id is not None:
-        conditions.append(VEHICLES.c.ccsds_id == spacecraft_id)
-    if instance is not None:
-        conditions.append(VEHICLES.c.instance == instance)
-    query = _select().where(*conditions)
-    total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
+        query = query.where(or_(*among))
+    if asked.severity is not None:
+        query = query.where(_ALARMS.c.severity == SEVERITY_CODES[asked.severity])
+    if asked.spacecraft_id is not None:
+        query = query.where(VEHICLES.c.ccsds_id == asked.spacecraft_id)
+    if asked.instance is not None:
+        query = query.where(VEHICLES.c.instance == asked.instance)
     order = (_ALARMS.c.open.is_(None), _ALARMS.c.last_ticks.desc(), _ALARMS.c.id.desc())
-    rows = connection.execute(query.order_by(*order).limit(limit).offset(offset)).mappings()
-    return [_row(row) for row in rows], int(total)
+    rows, total = page(connection, query, asked, *order)
+    return [_row(row) for row in rows], total
 
 
 def _select() -> Any:
@@ -225,7 +212,7 @@ def _select() -> Any:
     )
 
 
-def _row(row: RowMapping) -> AlarmRow:
+def _row(row: Row | RowMapping) -> AlarmRow:
     return AlarmRow(**{**row, "active": bool(row["active"])})
 
 

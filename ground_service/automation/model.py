@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity
+from ground_service.http.model import Entity, Paging
 from ground_service.http.times import UtcTime
 
 ActionState = Literal["waiting", "queued", "done", "failed", "refused", "skipped"]
@@ -55,3 +55,10 @@ class AutomationAction(Entity):
     decided_by: str | None = Field(description="Person who approved or refused it")
     created: UtcTime
     changed: UtcTime
+
+
+class ActionFilter(Paging):
+    """Actions to list."""
+
+    state: ActionState | None = None
+    pass_id: int | None = Field(default=None, ge=1, le=2**31 - 1)

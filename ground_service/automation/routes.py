@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query
+from fastapi import Query, Request
 
 from ground_service.access.security import Operator, Viewer
-from ground_service.automation import service
-from ground_service.automation.model import ActionState, AutomationAction, RuleInForce
-from ground_service.http.common import GroundOf, PagingOf, RowId
+from ground_service.automation import service, store
+from ground_service.automation.model import ActionFilter, AutomationAction, RuleInForce
+from ground_service.http.common import GroundOf, RowId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
 
@@ -24,17 +24,10 @@ def list_automation_rules(ground: GroundOf, _: Viewer) -> PageOf[RuleInForce]:
 
 @automation.get("/automation/actions")
 def list_automation_actions(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    state: Annotated[ActionState | None, Query()] = None,
-    pass_id: Annotated[int | None, Query(ge=1, le=2**31 - 1)] = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[ActionFilter, Query()]
 ) -> PageOf[AutomationAction]:
     """List the actions of rules with their causes and results, newest first."""
-    items, total = service.list_actions(
-        ground, state=state, pass_id=pass_id, limit=paging.limit, offset=paging.offset
-    )
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_actions, asked))
 
 
 @automation.post("/automation/actions/{action_id}/approve", responses=problems(404, 409))

@@ -198,20 +198,6 @@ def _in_force(rule: Rule, spacecraft: int | None, mission: Mission | None) -> Ru
     )
 
 
-def list_actions(
-    ground: Ground, *, state: str | None = None, pass_id: int | None = None, limit: int = 100, offset: int = 0
-) -> tuple[list[AutomationAction], int]:
-    """Return a page of the recorded actions, newest first, and the total number."""
-    equal = {"state": state, "pass_id": pass_id}
-    with ground.database.reading() as connection:
-        return store.list_actions(
-            connection,
-            limit=limit,
-            offset=offset,
-            **{name: value for name, value in equal.items() if value is not None},
-        )
-
-
 def decide(ground: Ground, action_id: int, *, approve: bool, actor: str) -> AutomationAction:
     """Approve or refuse an action that waits for it, and the actions after it in the same rule.
 

@@ -8,8 +8,9 @@ from typing import Any
 from sqlalchemy import Connection, func, select, update
 
 from ground_service.automation.core import Occurrence, PlannedAction
-from ground_service.automation.model import AutomationAction
+from ground_service.automation.model import ActionFilter, AutomationAction
 from ground_service.events import AutomationChanged, publish
+from ground_service.http.model import PageOf
 from ground_service.missions.model import Mission
 from ground_service.missions.rules import Channel, Rule
 from ground_service.missions.store import ARCHIVE_ACTOR, get_mission, newest_of_spacecraft
@@ -163,12 +164,10 @@ def actions_of_event(connection: Connection, event: int) -> list[AutomationActio
     return [_action(dict(row)) for row in connection.execute(query).mappings()]
 
 
-def list_actions(
-    connection: Connection, *, limit: int, offset: int, **equal: Any
-) -> tuple[list[AutomationAction], int]:
-    """Return a page of the actions, newest first, and the total number."""
-    page = repository.page(connection, ACTIONS, limit=limit, offset=offset, **equal)
-    return [_action(row) for row in page.rows], page.total
+def list_actions(connection: Connection, asked: ActionFilter) -> PageOf[AutomationAction]:
+    """Return a page of the actions, newest first."""
+    rows, total = repository.newest(connection, ACTIONS, asked, state=asked.state, pass_id=asked.pass_id)
+    return asked.page(map(_action, rows), total)
 
 
 def rules_of_revision(connection: Connection, mission_id: int | None) -> tuple[Rule, ...]:

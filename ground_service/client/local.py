@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import sys
+import threading
+import weakref
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import ExitStack
 from typing import Any
 
 import httpx
-from anyio.from_thread import start_blocking_portal
 from fastapi import FastAPI
 from starlette.routing import Match
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -120,27 +122,35 @@ class FollowUpOnDemand:
 
 
 class LocalTransport(httpx.BaseTransport):
-    """HTTPX transport to an in-process application, with streamed request bodies and response bodies in memory."""
+    """HTTPX transport to an in-process application, with streamed request bodies and response bodies in memory.
+
+    The application runs in a daemon thread, so that a transport that is not closed does not keep Python from ending;
+    it is closed then.
+    """
 
     def __init__(self, ground: Ground, actor: str, *, background: bool = False) -> None:
         self._ground = ground
         dispatcher = _background_dispatcher(ground) if background else LocalDispatcher(ground)
         ground.database.listeners.add(FollowUpOnDemand(ground))
         self._asgi = httpx.ASGITransport(local_app(ground, actor, dispatcher))
-        self._opened = ExitStack()
-        self._opened.callback(ground.close)
-        self._opened.callback(dispatcher.close)
-        self._portal = self._opened.enter_context(start_blocking_portal())
+        self._loop = asyncio.new_event_loop()
+        thread = threading.Thread(target=self._loop.run_forever, name="in-process service", daemon=True)
+        thread.start()
+        opened = ExitStack()
+        for close in (self._loop.close, ground.close, dispatcher.close, thread.join):
+            opened.callback(close)
+        opened.callback(self._loop.call_soon_threadsafe, self._loop.stop)
+        self._end = weakref.finalize(self, opened.close)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         try:
-            return self._portal.call(self._exchange, request)
+            return asyncio.run_coroutine_threadsafe(self._exchange(request), self._loop).result()
         except KeyboardInterrupt:
             self._ground.stopping.set()  # a job stops between two transactions
             raise
 
     def close(self) -> None:
-        self._opened.close()
+        self._end()
 
     async def _exchange(self, request: httpx.Request) -> httpx.Response:
         assert isinstance(request.stream, httpx.SyncByteStream)

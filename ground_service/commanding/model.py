@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
 from ground_service.commanding.core import DUPLICATE, STAGES, CommandFate
-from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
 from ground_service.text import LINE_PATTERN_JSON
 from lunar.timescales import utc_ns_from_ticks
@@ -202,3 +202,11 @@ class UplinkState(Entity):
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])
     channels: list[UplinkChannel]
+
+
+class TelecommandFilter(Paging):
+    """Telecommands to list."""
+
+    state: Literal["queued", "carried", "released", "rejected", "sent"] | None = Field(
+        default=None, description="Stored state"
+    )

@@ -5,19 +5,27 @@ from __future__ import annotations
 import base64
 from typing import Annotated, Any, Literal
 
-from fastapi import Query, Response
+from fastapi import Query, Request, Response
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, Viewer
+from ground_service.clock import utc_now_ns
 from ground_service.commanding import service as commanding
-from ground_service.commanding.model import CommandEntry, Rejection, Telecommand, UplinkState
+from ground_service.commanding import store
+from ground_service.commanding.model import (
+    CommandEntry,
+    Rejection,
+    Telecommand,
+    TelecommandFilter,
+    UplinkState,
+)
 from ground_service.http.common import (
     GroundOf,
     Instance,
     OnceKey,
-    PagingOf,
     RowId,
     SpacecraftId,
+    linked,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
@@ -28,16 +36,10 @@ telecommands = operations("telecommands")
 
 @telecommands.get("/telecommands")
 def list_telecommands(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    state: Annotated[
-        Literal["queued", "carried", "released", "rejected", "sent"] | None, Query(description="Stored state")
-    ] = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[TelecommandFilter, Query()]
 ) -> PageOf[Telecommand]:
     """List the telecommands with their verification, newest first."""
-    views, total = commanding.list_commands(ground, state=state, limit=paging.limit, offset=paging.offset)
-    return paging.page([view.telecommand for view in views], total)
+    return linked(request, ground.read(store.list_telecommands, asked, utc_now_ns()))
 
 
 @telecommands.post("/telecommands", status_code=201)

@@ -232,14 +232,6 @@ def get_command(ground: Ground, command_id: int) -> CommandView:
         return store.get_view(connection, command_id, utc_now_ns())
 
 
-def list_commands(
-    ground: Ground, *, state: str | None = None, limit: int = 100, offset: int = 0
-) -> tuple[list[CommandView], int]:
-    """Return a page of the telecommands, newest first, and the total number; `state` is the stored state."""
-    with ground.database.reading() as connection:
-        return store.list_views(connection, utc_now_ns(), state=state, limit=limit, offset=offset)
-
-
 def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> UplinkState:
     """Return the telecommand channels of a spacecraft as the ingest that was entered last shows them.
 

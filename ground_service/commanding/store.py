@@ -9,7 +9,15 @@ from sqlalchemy import BigInteger, Connection, and_, cast, func, or_, select, up
 from sqlalchemy.sql import Select
 
 from ground_service.commanding.core import SentCommand, VerificationReport, fate_of
-from ground_service.commanding.model import CommandOctets, CommandRecord, CommandView, UplinkChannel
+from ground_service.commanding.model import (
+    CommandOctets,
+    CommandRecord,
+    CommandView,
+    Telecommand,
+    TelecommandFilter,
+    UplinkChannel,
+)
+from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version
 from ground_service.store import repository
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
@@ -151,13 +159,13 @@ def get_view(connection: Connection, command_id: int, now_utc_ns: int) -> Comman
     return _view(connection, get_record(connection, command_id), now_utc_ns)
 
 
-def list_views(
-    connection: Connection, now_utc_ns: int, *, state: str | None, limit: int, offset: int
-) -> tuple[list[CommandView], int]:
-    """Return a page of the telecommands, newest first, and the total number; `state` is the stored state."""
-    equal: dict[str, Any] = {} if state is None else {"state": state}
-    page = repository.page(connection, TELECOMMANDS, limit=limit, offset=offset, **equal)
-    return [_view(connection, CommandRecord.of(row), now_utc_ns) for row in page.rows], page.total
+def list_telecommands(
+    connection: Connection, asked: TelecommandFilter, now_utc_ns: int
+) -> PageOf[Telecommand]:
+    """Return a page of the telecommands, newest first."""
+    rows, total = repository.newest(connection, TELECOMMANDS, asked, state=asked.state)
+    views = (_view(connection, CommandRecord.of(row), now_utc_ns) for row in rows)
+    return asked.page((view.telecommand for view in views), total)
 
 
 def views_of_window(connection: Connection, window_id: int, now_utc_ns: int) -> list[CommandView]:

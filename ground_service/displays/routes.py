@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Path, Response
+from fastapi import Path, Request, Response
 
 from ground_service.access.security import Operator, Viewer
-from ground_service.displays import service
+from ground_service.displays import service, store
 from ground_service.displays.model import KEY_PATTERN, Display, DisplayIn, DisplaySummary
-from ground_service.http.common import GroundOf, PagingOf
+from ground_service.http.common import GroundOf, PagingOf, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
 
@@ -19,16 +19,15 @@ displays = operations("displays")
 
 
 @displays.get("/displays")
-def list_displays(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[DisplaySummary]:
+def list_displays(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[DisplaySummary]:
     """List the stored objects of the telemetry displays, the one that changed last first."""
-    items, total = service.list_displays(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_displays, asked))
 
 
 @displays.get("/displays/{key}")
 def get_display(ground: GroundOf, _: Viewer, key: DisplayKey) -> Display:
     """Show a stored object of the telemetry displays."""
-    return service.get_display(ground, key)
+    return ground.read(store.get, key)
 
 
 @displays.put("/displays/{key}", responses=problems(409))

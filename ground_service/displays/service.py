@@ -6,28 +6,10 @@ from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.displays import store
 from ground_service.displays.core import signed
-from ground_service.displays.model import OBJECTS_LIMIT, Display, DisplayIn, DisplaySummary
+from ground_service.displays.model import OBJECTS_LIMIT, Display, DisplayIn
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import DisplayChanged, publish
 from ground_service.ground import Ground
-
-
-def list_displays(ground: Ground, *, limit: int, offset: int) -> tuple[list[DisplaySummary], int]:
-    """Return a page of the stored objects, the one that changed last first, and their number."""
-    with ground.database.reading() as connection:
-        return store.page(connection, limit=limit, offset=offset)
-
-
-def get_display(ground: Ground, key: str) -> Display:
-    """Return a stored object.
-
-    Raises
-    ------
-    NotFound
-        There is no such object.
-    """
-    with ground.database.reading() as connection:
-        return store.get(connection, key)
 
 
 def keep_display(ground: Ground, key: str, given: DisplayIn, *, actor: str) -> Display:

@@ -9,7 +9,8 @@ from sqlalchemy import Connection, delete, func, select, update
 
 from ground_service.displays.model import Display, DisplayIn, DisplaySummary, packed
 from ground_service.errors import NotFound
-from ground_service.store import models
+from ground_service.http.model import PageOf, Paging
+from ground_service.store import models, repository
 from ground_service.store.repository import add_new
 
 _OBJECTS = models.DISPLAY_OBJECTS
@@ -21,11 +22,11 @@ def count(connection: Connection) -> int:
     return int(connection.execute(select(func.count()).select_from(_OBJECTS)).scalar_one())
 
 
-def page(connection: Connection, *, limit: int, offset: int) -> tuple[list[DisplaySummary], int]:
-    """Return a page of the stored objects, the one that changed last first, and their number."""
+def list_displays(connection: Connection, asked: Paging) -> PageOf[DisplaySummary]:
+    """Return a page of the stored objects, the one that changed last first."""
     order = (_OBJECTS.c.changed_utc_ns.desc(), _OBJECTS.c.key)
-    rows = connection.execute(select(*_LISTED).order_by(*order).limit(limit).offset(offset)).mappings()
-    return [DisplaySummary.of(row) for row in rows], count(connection)
+    rows, total = repository.page(connection, select(*_LISTED), asked, *order)
+    return asked.page(map(DisplaySummary.of, rows), total)
 
 
 def get(connection: Connection, key: str) -> Display:

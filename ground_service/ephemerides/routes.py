@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query
+from fastapi import Query, Request
 
 from ground_service.access.security import Operator, UploadOf, Viewer
-from ground_service.ephemerides import service
+from ground_service.ephemerides import service, store
 from ground_service.ephemerides.model import Ephemeris
-from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, upload_body
+from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, linked, upload_body
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 
@@ -41,7 +41,6 @@ async def add_ephemeris(
 
 
 @ephemerides.get("/ephemerides")
-def list_ephemerides(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Ephemeris]:
+def list_ephemerides(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[Ephemeris]:
     """List the reference ephemerides, newest first."""
-    items, total = service.list_ephemerides(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_ephemerides, asked))

@@ -69,9 +69,3 @@ def open_ephemeris(ground: Ground, reference: Ephemeris) -> States:
 @functools.lru_cache(maxsize=8)
 def _loaded(path: str) -> States:
     return load_ephemeris(Path(path))
-
-
-def list_ephemerides(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[Ephemeris], int]:
-    """Return a page of the reference ephemerides, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_ephemerides(connection, limit=limit, offset=offset)

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import Connection, select
 
 from ground_service.ephemerides.model import Ephemeris
+from ground_service.http.model import PageOf, Paging
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 from lunar import ephemeris
@@ -58,10 +59,10 @@ def get_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
     return _ephemeris(repository.get(connection, EPHEMERIDES, ephemeris_id, "ephemeris"))
 
 
-def list_ephemerides(connection: Connection, *, limit: int, offset: int) -> tuple[list[Ephemeris], int]:
-    """Return a page of the ephemerides, newest first, and the total number."""
-    page = repository.page(connection, EPHEMERIDES, limit=limit, offset=offset)
-    return [_ephemeris(row) for row in page.rows], page.total
+def list_ephemerides(connection: Connection, asked: Paging) -> PageOf[Ephemeris]:
+    """Return a page of the ephemerides, newest first."""
+    rows, total = repository.newest(connection, EPHEMERIDES, asked)
+    return asked.page(map(_ephemeris, rows), total)
 
 
 def covering_ephemerides(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[Ephemeris]:

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from ground_service.evaluation import store
-from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary, StoredReport
+from ground_service.evaluation.model import PassFigures, ReportOverview, ReportSummary, StoredReport
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.passes.core import downsample
-from ground_service.passes.store import get_pass
 from ground_service.store.files import FileArchive
 
 PREFERRED_ESTIMATORS = ("anchored", "spherical", "paper")
@@ -34,14 +33,8 @@ def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOv
     NotFound
         If the report does not exist.
     """
-    sha256 = get_report(ground, report_id).json_sha256
+    sha256 = ground.read(store.get_report, report_id).json_sha256
     return ReportOverview(report_id=report_id, **_overview(ground.files, sha256, max_points))
-
-
-def get_report(ground: Ground, report_id: str) -> StoredReport:
-    """Return a report."""
-    with ground.database.reading() as connection:
-        return store.get_report(connection, report_id)
 
 
 def newest_reports(ground: Ground, pass_ids: Sequence[int]) -> list[ReportSummary]:
@@ -66,19 +59,6 @@ def _summary(report: StoredReport) -> ReportSummary:
         recall=figures.detector.recall,
         frames=figures.frames,
     )
-
-
-def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Report], int]:
-    """Return a page of the reports of a pass, newest first, and their number.
-
-    Raises
-    ------
-    NotFound
-        If the pass does not exist.
-    """
-    with ground.database.reading() as connection:
-        get_pass(connection, pass_id)
-        return store.list_reports(connection, pass_id, limit=limit, offset=offset)
 
 
 @lru_cache(maxsize=64)

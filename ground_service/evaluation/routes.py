@@ -8,7 +8,7 @@ from fastapi import Query, Request, Response
 
 from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
-from ground_service.evaluation import report_overview, service
+from ground_service.evaluation import report_overview, service, store
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
 from ground_service.http.common import (
     API_PREFIX,
@@ -17,6 +17,7 @@ from ground_service.http.common import (
     Key,
     PagingOf,
     PassId,
+    linked,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
@@ -69,7 +70,7 @@ def get_report(
     ] = None,
 ) -> Response:
     """Return a report as HTML, PDF or JSON."""
-    report = report_overview.get_report(ground, report_id)
+    report = ground.read(store.get_report, report_id)
     kind = format or preferred_kind(request.headers.get("accept", ""))
     sha256: str | None = getattr(report, f"{kind}_sha256")
     if sha256 is None:
@@ -105,16 +106,17 @@ def list_newest_reports(
 
 
 @evaluation.get("/passes/{pass_id}/reports")
-def list_reports(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Report]:
+def list_reports(
+    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
+) -> PageOf[Report]:
     """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
-    items, total = report_overview.list_reports(ground, pass_id, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_reports, pass_id, asked))
 
 
 @evaluation.get("/reports/{report_id}/summary")
 def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> PassFigures:
     """Return the figures of a report."""
-    return PassFigures.model_validate(report_overview.get_report(ground, report_id).summary)
+    return PassFigures.model_validate(ground.read(store.get_report, report_id).summary)
 
 
 @evaluation.get("/reports/{report_id}/overview")

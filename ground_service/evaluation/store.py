@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, func, select
 
 from ground_service.evaluation.model import Report, StoredReport
+from ground_service.http.model import PageOf, Paging
+from ground_service.passes.store import get_pass
 from ground_service.store import repository
 
 _REPORTS = repository.REPORTS
@@ -48,11 +50,15 @@ def newest_reports(connection: Connection, pass_ids: Sequence[int]) -> list[Stor
     return [StoredReport.of(row) for row in connection.execute(query).mappings()]
 
 
-def list_reports(
-    connection: Connection, pass_id: int, *, limit: int, offset: int
-) -> tuple[list[Report], int]:
-    """Return a page of the reports of a pass, newest first, and their number."""
-    mine = _REPORTS.c.pass_id == pass_id
+def list_reports(connection: Connection, pass_id: int, asked: Paging) -> PageOf[Report]:
+    """Return a page of the reports of a pass, newest first.
+
+    Raises
+    ------
+    NotFound
+        If the pass does not exist.
+    """
+    get_pass(connection, pass_id)
     query = (
         select(
             _REPORTS.c.id,
@@ -64,13 +70,10 @@ def list_reports(
             _REPORTS.c.changes,
         )
         .outerjoin(_MISSIONS, _MISSIONS.c.id == _REPORTS.c.mission_id)
-        .where(mine)
-        .order_by(_REPORTS.c.created_utc_ns.desc(), _REPORTS.c.id)
-        .limit(limit)
-        .offset(offset)
+        .where(_REPORTS.c.pass_id == pass_id)
     )
-    total = connection.execute(select(func.count()).select_from(_REPORTS).where(mine)).scalar_one()
-    return [Report.of(row) for row in connection.execute(query).mappings()], total
+    rows, total = repository.page(connection, query, asked, _REPORTS.c.created_utc_ns.desc(), _REPORTS.c.id)
+    return asked.page(map(Report.of, rows), total)
 
 
 def add_report(connection: Connection, report: StoredReport) -> bool:

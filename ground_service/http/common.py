@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Header, Path, Query, Request
-from starlette.datastructures import URL
 
 from ground_service.ground import Ground
-from ground_service.http.model import PageOf
+from ground_service.http.model import PageOf, Paging
 from ground_service.text import LINE_PATTERN_JSON
 
 Item = TypeVar("Item")
@@ -52,41 +49,23 @@ async def ground_of(request: Request) -> Ground:
 GroundOf = Annotated[Ground, Depends(ground_of)]
 
 
-@dataclass(frozen=True, slots=True)
-class Paging:
-    """The requested page of a list."""
+PagingOf = Annotated[Paging, Query()]
 
-    limit: int
-    offset: int
-    url: URL
 
-    def page(self, items: Sequence[Item], total: int) -> PageOf[Item]:
-        """Return the page with links to its neighbours."""
-        after, before = self.offset + self.limit, max(self.offset - self.limit, 0)
-        return PageOf(
-            items=list(items),
-            total=total,
-            limit=self.limit,
-            offset=self.offset,
-            next=self._link(after) if after < total else None,
-            previous=self._link(before) if self.offset > 0 else None,
-        )
+def linked(request: Request, page: PageOf[Item]) -> PageOf[Item]:
+    """Return a page of a list with links to its neighbours."""
 
-    def _link(self, offset: int) -> str:
-        url = self.url.include_query_params(limit=self.limit, offset=offset)
+    def link(offset: int) -> str:
+        url = request.url.include_query_params(limit=page.limit, offset=offset)
         return f"{url.path}?{url.query}"
 
-
-async def paging(
-    request: Request,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Items in a page")] = 100,
-    offset: Annotated[int, Query(ge=0, le=2**31 - 1, description="Items before the page")] = 0,
-) -> Paging:
-    """Return the page that a request asks for."""
-    return Paging(limit, offset, request.url)
-
-
-PagingOf = Annotated[Paging, Depends(paging)]
+    after = page.offset + page.limit
+    return page.model_copy(
+        update={
+            "next": link(after) if after < page.total else None,
+            "previous": link(max(page.offset - page.limit, 0)) if page.offset > 0 else None,
+        }
+    )
 
 
 def upload_body(content: str) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Generic, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -41,6 +41,19 @@ class Given(BaseModel):
     """Base class of requests; values are not converted between types, such as true to 1."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Paging(BaseModel):
+    """Query of a list: the page; capabilities add the filters of their entities."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    limit: int = Field(default=100, ge=1, le=1000, description="Items in a page")
+    offset: int = Field(default=0, ge=0, le=2**31 - 1, description="Items before the page")
+
+    def page(self, items: Iterable[Item], total: int) -> PageOf[Item]:
+        """Return the page with these items."""
+        return PageOf(items=list(items), total=total, limit=self.limit, offset=self.offset)
 
 
 class PageOf(Entity, Generic[Item]):

@@ -21,6 +21,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from ground_service.http.common import API_PREFIX, IDEMPOTENCY_HEADER, IF_MATCH_HEADER
+from ground_service.http.model import Paging
 from ground_service.http.origins import refuse
 from ground_service.http.problems import problem
 
@@ -142,12 +143,18 @@ def operations(tag: str) -> APIRouter:
 
 def query_keys(dependant: Any) -> QueryKeys:
     """Return the query keys of an operation and its dependencies."""
-    known = {field.alias for field in dependant.query_params}
-    lists = {field.alias for field in dependant.query_params if _is_list(field.field_info.annotation)}
-    for inner in map(query_keys, dependant.dependencies):
-        known |= inner.known
-        lists |= inner.lists
-    return QueryKeys(frozenset(known), frozenset(lists))
+    fields: dict[str, Any] = {}
+    for field in dependant.query_params:
+        annotation = field.field_info.annotation
+        if isinstance(annotation, type) and issubclass(annotation, Paging):
+            fields |= {name: one.annotation for name, one in annotation.model_fields.items()}
+        else:
+            fields[field.alias] = annotation
+    inner = [query_keys(one) for one in dependant.dependencies]
+    return QueryKeys(
+        frozenset(fields).union(*(one.known for one in inner)),
+        frozenset(name for name, one in fields.items() if _is_list(one)).union(*(one.lists for one in inner)),
+    )
 
 
 def header_names(dependant: Any) -> frozenset[str]:

@@ -72,6 +72,11 @@ def time_of(value: object, where: str) -> int:
         raise InvalidInput(where, "", expected, found) from None
 
 
+def ns_of(time: UtcTime | None) -> int | None:
+    """Return the nanoseconds of a time; None without one."""
+    return None if time is None else time.utc_ns
+
+
 def _given(value: object) -> UtcTime:
     if isinstance(value, UtcTime):
         return value

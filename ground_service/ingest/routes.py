@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query, Response
+from fastapi import Query, Request, Response
 
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
 from ground_service.errors import InvalidInput
@@ -16,11 +16,12 @@ from ground_service.http.common import (
     Name,
     PagingOf,
     RowId,
+    linked,
     upload_body,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.ingest import listing
+from ground_service.ingest import store
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.ingest.service import Place, enter_ingest
 from ground_service.jobs.dispatcher import DispatcherOf
@@ -104,13 +105,12 @@ async def upload_telemetry(
 
 
 @ingests.get("/ingests")
-def list_ingests(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Ingest]:
+def list_ingests(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[Ingest]:
     """List the ingests, newest first."""
-    items, total = listing.list_ingests(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_ingests, asked))
 
 
 @ingests.get("/ingests/{ingest_id}")
 def get_ingest(ground: GroundOf, _: Viewer, ingest_id: RowId) -> Ingest:
     """Show an ingest: its state and the accounting of the file."""
-    return listing.get_ingest(ground, ingest_id)
+    return ground.read(store.get_ingest, ingest_id)

@@ -13,6 +13,7 @@ from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, selec
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
+from ground_service.http.model import PageOf, Paging
 from ground_service.ingest.model import Ingest, IngestResult
 from ground_service.store import repository
 from ground_service.store.bulk import insert_columns
@@ -328,10 +329,10 @@ def get_ingest(connection: Connection, ingest_id: int) -> Ingest:
     return _ingest(repository.get(connection, _INGESTS, ingest_id, "ingest"))
 
 
-def list_ingests(connection: Connection, *, limit: int, offset: int) -> tuple[list[Ingest], int]:
-    """Return a page of the ingests, newest first, and the total number."""
-    page = repository.page(connection, _INGESTS, limit=limit, offset=offset)
-    return [_ingest(row) for row in page.rows], page.total
+def list_ingests(connection: Connection, asked: Paging) -> PageOf[Ingest]:
+    """Return a page of the ingests, newest first."""
+    rows, total = repository.newest(connection, _INGESTS, asked)
+    return asked.page(map(_ingest, rows), total)
 
 
 def start_ingest(connection: Connection, ingest_id: int) -> None:

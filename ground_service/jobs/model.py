@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
-from ground_service.http.model import Entity
+from ground_service.http.model import Entity, Paging
 from ground_service.http.times import UtcTime
 
 
@@ -25,3 +25,9 @@ class Job(Entity):
     created: UtcTime
     started: UtcTime | None
     finished: UtcTime | None
+
+
+class JobFilter(Paging):
+    """Jobs to list."""
+
+    kind: str | None = Field(default=None, max_length=40, examples=["regression"])

@@ -137,11 +137,3 @@ def get_job(ground: Ground, job_id: str) -> Job:
     """
     with ground.database.reading() as connection:
         return store.get_job(connection, job_id)
-
-
-def list_jobs(
-    ground: Ground, *, kind: str | None = None, limit: int = 100, offset: int = 0
-) -> tuple[list[Job], int]:
-    """Return a page of the jobs, newest first, and the total number; `kind` selects jobs of one kind."""
-    with ground.database.reading() as connection:
-        return store.list_jobs(connection, kind=kind, limit=limit, offset=offset)

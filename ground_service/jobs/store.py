@@ -7,7 +7,8 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select
 
-from ground_service.jobs.model import Job
+from ground_service.http.model import PageOf
+from ground_service.jobs.model import Job, JobFilter
 from ground_service.store import repository
 from ground_service.store.states import JOB, change_if, move
 
@@ -57,11 +58,10 @@ def get_job(connection: Connection, job_id: str) -> Job:
     return Job.of(repository.get(connection, JOBS, job_id, "job"))
 
 
-def list_jobs(connection: Connection, *, kind: str | None, limit: int, offset: int) -> tuple[list[Job], int]:
-    """Return a page of the jobs, newest first, and the total number; `kind` selects jobs of one kind."""
-    equal: dict[str, Any] = {} if kind is None else {"kind": kind}
-    page = repository.page(connection, JOBS, limit=limit, offset=offset, **equal)
-    return [Job.of(row) for row in page.rows], page.total
+def list_jobs(connection: Connection, asked: JobFilter) -> PageOf[Job]:
+    """Return a page of the jobs, newest first."""
+    rows, total = repository.newest(connection, JOBS, asked, kind=asked.kind)
+    return asked.page(map(Job.of, rows), total)
 
 
 def unfinished_jobs(connection: Connection) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given
+from ground_service.http.model import Entity, Given, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
 from ground_service.text import LINE_PATTERN_JSON
 
@@ -102,3 +102,10 @@ class LandmarkUpdate(Entity):
     offset_north_m: float | None
     added: int
     proposed: int = Field(description="Landmarks that wait for a decision now")
+
+
+class LandmarkFilter(Paging):
+    """Landmarks to list."""
+
+    spacecraft_id: SpacecraftNumber | None = None
+    state: LandmarkState | None = None

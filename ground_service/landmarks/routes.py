@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query
+from fastapi import Query, Request
 
 from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, PagingOf, PassId, RowId
+from ground_service.http.common import GroundOf, PassId, RowId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.landmarks import service
+from ground_service.landmarks import service, store
 from ground_service.landmarks.model import (
     Landmark,
     LandmarkDecision,
     LandmarkDetail,
-    LandmarkState,
+    LandmarkFilter,
     LandmarkUpdate,
 )
 
@@ -24,17 +24,10 @@ landmarks = operations("landmarks")
 
 @landmarks.get("/landmarks")
 def list_landmarks(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
-    state: Annotated[LandmarkState | None, Query()] = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[LandmarkFilter, Query()]
 ) -> PageOf[Landmark]:
     """List the landmarks learned from flight, most passes first."""
-    items, total = service.list_landmarks(
-        ground, spacecraft_id=spacecraft_id, state=state, limit=paging.limit, offset=paging.offset
-    )
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_landmarks, asked))
 
 
 @landmarks.get("/landmarks/{landmark_id}", responses=problems(404))

@@ -32,7 +32,6 @@ from ground_service.landmarks.core import (
 from ground_service.landmarks.model import (
     Landmark,
     LandmarkDetail,
-    LandmarkState,
     LandmarkUpdate,
     PassSightings,
     Sighting,
@@ -74,19 +73,6 @@ def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
         added=added,
         proposed=proposed,
     )
-
-
-def list_landmarks(
-    ground: Ground,
-    *,
-    spacecraft_id: int | None = None,
-    state: LandmarkState | None = None,
-    limit: int = 100,
-    offset: int = 0,
-) -> tuple[list[Landmark], int]:
-    """Return a page of the landmarks, most passes first, and their number."""
-    with ground.database.reading() as connection:
-        return store.list_landmarks(connection, spacecraft_id, state, limit=limit, offset=offset)
 
 
 def get_landmark(ground: Ground, landmark_id: int) -> LandmarkDetail:

@@ -7,7 +7,8 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, select
 
-from ground_service.landmarks.model import Landmark, LandmarkDetail, LandmarkState, PassSightings
+from ground_service.http.model import PageOf
+from ground_service.landmarks.model import Landmark, LandmarkDetail, LandmarkFilter, PassSightings
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.states import LANDMARK, change_if, move
@@ -38,24 +39,16 @@ def get_landmark(connection: Connection, landmark_id: int) -> LandmarkDetail:
     return LandmarkDetail.of(repository.get(connection, _LANDMARKS, landmark_id, "landmark"))
 
 
-def list_landmarks(
-    connection: Connection,
-    spacecraft_id: int | None,
-    state: LandmarkState | None,
-    *,
-    limit: int,
-    offset: int,
-) -> tuple[list[Landmark], int]:
-    """Return a page of the landmarks, most sightings first, and their number."""
+def list_landmarks(connection: Connection, asked: LandmarkFilter) -> PageOf[Landmark]:
+    """Return a page of the landmarks, most passes first."""
     query = select(*(one for one in _LANDMARKS.c if one.name != "evidence"))
-    if spacecraft_id is not None:
-        query = query.where(_LANDMARKS.c.spacecraft_id == spacecraft_id)
-    if state is not None:
-        query = query.where(_LANDMARKS.c.state == state)
-    total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
-    query = query.order_by(_LANDMARKS.c.passes.desc(), _LANDMARKS.c.sightings.desc(), _LANDMARKS.c.id)
-    rows = connection.execute(query.limit(limit).offset(offset)).mappings()
-    return [Landmark.of(row) for row in rows], int(total)
+    if asked.spacecraft_id is not None:
+        query = query.where(_LANDMARKS.c.spacecraft_id == asked.spacecraft_id)
+    if asked.state is not None:
+        query = query.where(_LANDMARKS.c.state == asked.state)
+    order = (_LANDMARKS.c.passes.desc(), _LANDMARKS.c.sightings.desc(), _LANDMARKS.c.id)
+    rows, total = repository.page(connection, query, asked, *order)
+    return asked.page(map(Landmark.of, rows), total)
 
 
 def add_landmark(

@@ -69,12 +69,6 @@ def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
     return found
 
 
-def list_catalogues(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[HeldCatalogue], int]:
-    """Return a page of the held catalogues, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_catalogues(connection, limit=limit, offset=offset)
-
-
 def _public(data: DataFolder, source: str) -> CraterCatalogue | None:
     for path in (data.catalogue_composite, data.catalogue_lu, data.catalogue_robbins):
         if path is not None:

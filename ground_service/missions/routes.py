@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Body, Path, Query
+from fastapi import Body, Path, Query, Request
 
 from ground_service.access.security import Operator, UploadOf, Viewer
-from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, upload_body
+from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, linked, upload_body
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.missions import catalogues, service
+from ground_service.missions import catalogues, service, store
 from ground_service.missions.model import HeldCatalogue, MissionDetail, MissionRevision
 
 UPLOAD_PATHS = (f"{API_PREFIX}/catalogues",)
@@ -22,10 +22,9 @@ Revision = Annotated[str, Path(pattern=r"^[0-9a-f]{8,64}$", description="Hash or
 
 
 @missions.get("/missions")
-def list_missions(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[MissionRevision]:
+def list_missions(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[MissionRevision]:
     """List the revisions of mission descriptions, newest first."""
-    items, total = service.list_missions(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_revisions, asked))
 
 
 @missions.post("/missions", status_code=201)
@@ -47,14 +46,13 @@ def add_mission(
 @missions.get("/missions/{revision}")
 def get_mission(ground: GroundOf, _: Viewer, revision: Revision) -> MissionDetail:
     """Show a revision with its document."""
-    return service.get_mission(ground, revision)
+    return ground.read(store.find_revision, revision)
 
 
 @missions.get("/catalogues")
-def list_catalogues(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[HeldCatalogue]:
+def list_catalogues(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[HeldCatalogue]:
     """List the crater catalogues that the ground holds, newest first."""
-    items, total = catalogues.list_catalogues(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_catalogues, asked))
 
 
 @missions.post(

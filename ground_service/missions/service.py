@@ -21,7 +21,6 @@ from ground_service.missions.model import (
     Approval,
     Mission,
     MissionDetail,
-    MissionRevision,
     format_mission,
     mission_faults,
     parse_mission,
@@ -140,18 +139,6 @@ def enter(connection: Connection, mission: Mission, text: str | None = None, *, 
         added = MissionAdded(id=key, mission=mission.name, spacecraft_id=mission.spacecraft.id)
         publish(connection, added)
     return key
-
-
-def list_missions(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[MissionRevision], int]:
-    """Return a page of the revisions, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_revisions(connection, limit=limit, offset=offset)
-
-
-def get_mission(ground: Ground, revision: str) -> MissionDetail:
-    """Return the revision whose hash begins with `revision`."""
-    with ground.database.reading() as connection:
-        return store.find_revision(connection, revision)
 
 
 def mission_of_pass(connection: Connection, mission_id: int | None, manifest: Mapping[str, Any]) -> Mission:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Connection, func, select, update
+from sqlalchemy import Connection, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import NotFound
+from ground_service.http.model import PageOf, Paging
 from ground_service.missions.model import (
     Approval,
     HeldCatalogue,
@@ -96,10 +97,10 @@ def detail(connection: Connection, mission_id: int) -> MissionDetail:
     return _detail(repository.get(connection, MISSIONS, mission_id, "mission revision"))
 
 
-def list_revisions(connection: Connection, *, limit: int, offset: int) -> tuple[list[MissionRevision], int]:
-    """Return a page of the revisions, newest first, and the total number."""
-    page = repository.page(connection, MISSIONS, limit=limit, offset=offset)
-    return [_revision(row, _document(row)) for row in page.rows], page.total
+def list_revisions(connection: Connection, asked: Paging) -> PageOf[MissionRevision]:
+    """Return a page of the revisions, newest first."""
+    rows, total = repository.newest(connection, MISSIONS, asked)
+    return asked.page((_revision(row, _document(row)) for row in rows), total)
 
 
 def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) -> dict[int, Link]:
@@ -211,14 +212,12 @@ def get_catalogue(connection: Connection, sha256: str) -> HeldCatalogue:
     return HeldCatalogue.of(repository.get(connection, repository.FILES, sha256, "catalogue"))
 
 
-def list_catalogues(connection: Connection, *, limit: int, offset: int) -> tuple[list[HeldCatalogue], int]:
-    """Return a page of the held crater catalogues, newest first, and the total number."""
+def list_catalogues(connection: Connection, asked: Paging) -> PageOf[HeldCatalogue]:
+    """Return a page of the held crater catalogues, newest first."""
     files = repository.FILES
-    mine = files.c.kind == CATALOGUE_KIND
-    query = select(files).where(mine).order_by(files.c.received_utc_ns.desc(), files.c.sha256)
-    total = connection.execute(select(func.count()).select_from(files).where(mine)).scalar_one()
-    rows = connection.execute(query.limit(limit).offset(offset)).mappings()
-    return [HeldCatalogue.of(dict(row)) for row in rows], int(total)
+    query = select(files).where(files.c.kind == CATALOGUE_KIND)
+    rows, total = repository.page(connection, query, asked, files.c.received_utc_ns.desc(), files.c.sha256)
+    return asked.page(map(HeldCatalogue.of, rows), total)
 
 
 def _document(row: repository.Row) -> Mission:

@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import GivenTime, UtcTime
+from ground_service.store.vehicles import FLOWN
 from ground_service.text import LINE_PATTERN_JSON
 from reports.values import PacketAccounting
 
@@ -18,6 +19,9 @@ CorrelationId = Annotated[int, Field(description="Time correlation used; 0 is an
 
 def _known(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
+
+
+EventSeverity = Literal["info", "low", "medium", "high"]
 
 
 class PassRecord(Entity):
@@ -305,3 +309,29 @@ class PassParameters(Entity):
     outcomes: dict[str, dict[str, int]] = Field(
         description="Packets of the spacecraft by APID and outcome of decoding with the mission description"
     )
+
+
+class PassFilter(Paging):
+    """Passes to list."""
+
+    search: str | None = Field(
+        default=None, min_length=1, max_length=200, description="Part of the name, in any case"
+    )
+    spacecraft_id: SpacecraftNumber | None = None
+    instance: InstanceName | None = None
+    verdict: Literal["met", "not met", "unknown", "none"] | None = Field(
+        default=None, description="Verdict of the newest report; none: without a report"
+    )
+
+
+class EventFilter(Paging):
+    """Event reports of a spacecraft to list."""
+
+    spacecraft_id: SpacecraftNumber
+    instance: InstanceName = FLOWN
+    severity: list[EventSeverity] | None = Field(default=None, description="Default: any severity")
+    name: str | None = Field(
+        default=None, min_length=1, max_length=100, description="Part of the name of the event"
+    )
+    start: GivenTime | None = None
+    stop: GivenTime | None = None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from fastapi import Path, Query, Response
+from fastapi import Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from ground_service.access.idempotency import once
@@ -20,21 +20,23 @@ from ground_service.http.common import (
     PagingOf,
     PassId,
     SpacecraftId,
+    linked,
     upload_body,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime
+from ground_service.http.times import GivenTime, ns_of
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import get_job
-from ground_service.passes import images, parameters, service
+from ground_service.passes import images, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.model import (
     Completeness,
     Crater,
     Detection,
     Event,
+    EventFilter,
     ExportFormat,
     Image,
     LiveParameter,
@@ -42,6 +44,7 @@ from ground_service.passes.model import (
     ParameterSeries,
     PassDefinition,
     PassDetail,
+    PassFilter,
     PassParameters,
     PassSummary,
     SpacecraftEvent,
@@ -59,7 +62,6 @@ EXPORT_MEDIA: dict[ExportFormat, str] = {
 }
 UPLOAD_PATHS = (f"{API_PREFIX}/archives",)
 
-EventSeverity = Literal["info", "low", "medium", "high"]
 MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="Most intervals of a series")]
 Parameter = Annotated[str, Path(max_length=200, examples=["temperature_c"])]
 
@@ -92,30 +94,10 @@ async def upload_archive(
 
 @passes.get("/passes")
 def list_passes(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    search: Annotated[
-        str | None, Query(min_length=1, max_length=200, description="Part of the name, in any case")
-    ] = None,
-    spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
-    instance: Instance | None = None,
-    verdict: Annotated[
-        Literal["met", "not met", "unknown", "none"] | None,
-        Query(description="Verdict of the newest report; none: without a report"),
-    ] = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[PassFilter, Query()]
 ) -> PageOf[PassSummary]:
     """List the passes, newest first."""
-    items, total = service.list_passes(
-        ground,
-        search=search,
-        spacecraft_id=spacecraft_id,
-        instance=instance,
-        verdict=verdict,
-        limit=paging.limit,
-        offset=paging.offset,
-    )
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_passes, asked))
 
 
 @passes.post("/passes", status_code=201)
@@ -159,10 +141,11 @@ def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Response:
 
 
 @passes.get("/passes/{pass_id}/detections")
-def list_detections(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Detection]:
+def list_detections(
+    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
+) -> PageOf[Detection]:
     """List the detections of a pass, in time order."""
-    items, total = service.detections(ground, pass_id, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, service.detections(ground, pass_id, asked))
 
 
 @passes.get("/passes/{pass_id}/states", response_model=States)
@@ -181,46 +164,27 @@ def get_states(
 
 
 @passes.get("/passes/{pass_id}/events")
-def list_events(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Event]:
+def list_events(
+    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
+) -> PageOf[Event]:
     """List the event reports of a pass, in time order."""
-    items, total = service.list_events(ground, pass_id, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, service.list_events(ground, pass_id, asked))
 
 
 @passes.get("/passes/{pass_id}/craters")
-def list_craters(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Crater]:
+def list_craters(
+    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
+) -> PageOf[Crater]:
     """List the craters of the catalogue of a pass, the largest first."""
-    items, total = service.craters(ground, pass_id, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, service.craters(ground, pass_id, asked))
 
 
 @passes.get("/events", responses=problems(404))
 def list_spacecraft_events(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
-    instance: Instance = FLOWN,
-    severity: Annotated[list[EventSeverity] | None, Query(description="Default: any severity")] = None,
-    name: Annotated[
-        str | None, Query(min_length=1, max_length=100, description="Part of the name of the event")
-    ] = None,
-    start: GivenTime | None = None,
-    stop: GivenTime | None = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[EventFilter, Query()]
 ) -> PageOf[SpacecraftEvent]:
     """List the event reports of all passes of a spacecraft, newest first."""
-    items, total = service.spacecraft_events(
-        ground,
-        spacecraft_id,
-        instance,
-        severities=severity or [],
-        name=name,
-        start_utc_ns=None if start is None else start.utc_ns,
-        stop_utc_ns=None if stop is None else stop.utc_ns,
-        limit=paging.limit,
-        offset=paging.offset,
-    )
-    return paging.page(items, total)
+    return linked(request, service.spacecraft_events(ground, asked))
 
 
 @passes.get("/passes/{pass_id}/parameters")
@@ -273,8 +237,8 @@ def get_trend(
         instance,
         parameter,
         max_points,
-        start_utc_ns=None if start is None else start.utc_ns,
-        stop_utc_ns=None if stop is None else stop.utc_ns,
+        start_utc_ns=ns_of(start),
+        stop_utc_ns=ns_of(stop),
     )
     return JSONResponse(series_document(found))
 

@@ -15,7 +15,8 @@ from sqlalchemy import Connection
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import PageOf, Paging
+from ground_service.http.times import UtcTime, ns_of
 from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
@@ -26,9 +27,9 @@ from ground_service.passes.model import (
     Crater,
     Detection,
     Event,
+    EventFilter,
     PassDetail,
     PassRecord,
-    PassSummary,
     SpacecraftEvent,
     Trend,
 )
@@ -63,32 +64,6 @@ from tmtc.dictionary import DICTIONARY
 
 TREND_DAYS = 30
 TREND_POINTS = 60
-
-
-def list_passes(
-    ground: Ground,
-    *,
-    search: str | None = None,
-    spacecraft_id: int | None = None,
-    instance: str | None = None,
-    verdict: str | None = None,
-    limit: int = 100,
-    offset: int = 0,
-) -> tuple[list[PassSummary], int]:
-    """Return a page of the passes that match, newest first, and their number.
-
-    `search` is a part of the name; `verdict` the level of the newest report, "none" for passes without one.
-    """
-    with ground.database.reading() as connection:
-        return store.list_passes(
-            connection,
-            search=search,
-            spacecraft_id=spacecraft_id,
-            instance=instance,
-            verdict=verdict,
-            limit=limit,
-            offset=offset,
-        )
 
 
 def get_pass(ground: Ground, pass_id: int) -> PassDetail:
@@ -175,27 +150,16 @@ def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassR
     return record, span, cache
 
 
-def list_events(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Event], int]:
-    """Return a page of the event reports of a pass, in time order, and the total number."""
+def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Event]:
+    """Return a page of the event reports of a pass, in time order."""
     with ground.database.reading() as connection:
         _, span, _ = _opened(ground, connection, pass_id)
-        found, total = store.event_page(connection, span, newest_first=False, limit=limit, offset=offset)
-    return [Event.of(asdict(one), time=one.utc_ns) for one in found], total
+        found, total = store.event_page(connection, span, asked, newest_first=False)
+    return asked.page((Event.of(asdict(one), time=one.utc_ns) for one in found), total)
 
 
-def spacecraft_events(
-    ground: Ground,
-    spacecraft_id: int,
-    instance: str,
-    *,
-    severities: Sequence[str] = (),
-    name: str | None = None,
-    start_utc_ns: int | None = None,
-    stop_utc_ns: int | None = None,
-    limit: int,
-    offset: int,
-) -> tuple[list[SpacecraftEvent], int]:
-    """Return a page of the event reports of a spacecraft that match, newest first, and their number.
+def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEvent]:
+    """Return a page of the event reports of a spacecraft that match, newest first.
 
     Raises
     ------
@@ -203,16 +167,17 @@ def spacecraft_events(
         There is no such spacecraft.
     """
     with ground.database.reading() as connection:
-        vehicle = find_vehicle(connection, spacecraft_id, instance).id
-        span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns)
-        found, total = store.event_page(
-            connection, span, severities=severities, name=name, limit=limit, offset=offset
-        )
+        vehicle = find_vehicle(connection, asked.spacecraft_id, asked.instance).id
+        span = vehicle_span(connection, vehicle, ns_of(asked.start), ns_of(asked.stop))
+        found, total = store.event_page(connection, span, asked, severities=asked.severity, name=asked.name)
         passes = store.passes_of_vehicle(connection, vehicle, reported=False)
-    return [
-        SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=_pass_at(passes, one.utc_ns))
-        for one in found
-    ], total
+    return asked.page(
+        (
+            SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=_pass_at(passes, one.utc_ns))
+            for one in found
+        ),
+        total,
+    )
 
 
 def _pass_at(passes: Sequence[PassRecord], utc_ns: int) -> int | None:
@@ -227,8 +192,8 @@ def _pass_at(passes: Sequence[PassRecord], utc_ns: int) -> int | None:
     )
 
 
-def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:
-    """Return a page of the detections of a pass, in time order, and the total number."""
+def detections(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Detection]:
+    """Return a page of the detections of a pass, in time order."""
     with ground.database.reading() as connection:
         _, span, cache = _opened(ground, connection, pass_id)
         ticks, offsets = cache.answer(
@@ -238,14 +203,14 @@ def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tupl
             stop_ticks=span.stop_ticks,
         )
         total = int(offsets[-1])
-        rows = np.arange(min(offset, total), min(offset + limit, total))
+        rows = np.arange(min(asked.offset, total), min(asked.offset + asked.limit, total))
         if len(rows) == 0:
-            return [], total
+            return asked.page([], total)
         first, last = ticks[np.searchsorted(offsets, rows[[0, -1]], side="right") - 1].tolist()
         samples = detection_samples(connection, replace(span, start_ticks=first, stop_ticks=last))
     rows -= offsets[np.searchsorted(ticks, first)]
     frames = np.searchsorted(samples.offsets, rows, side="right") - 1
-    return [
+    found = [
         Detection(
             frame_number=int(samples.frame_number[frame]),
             time=UtcTime(samples.utc_ns[frame]),
@@ -257,20 +222,22 @@ def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tupl
             correlation_id=0 if samples.correlation_id is None else int(samples.correlation_id[frame]),
         )
         for row, frame in zip(rows.tolist(), frames.tolist(), strict=True)
-    ], total
+    ]
+    return asked.page(found, total)
 
 
-def craters(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Crater], int]:
-    """Return a page of the catalogue of a pass, the largest craters first, and their number; 0 without a catalogue.
+def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Crater]:
+    """Return a page of the catalogue of a pass, the largest craters first; nothing without a catalogue.
 
     An imported pass has the craters of the terrain near its ground track.
     """
     with ground.database.reading() as connection:
         sha256 = store.get_pass(connection, pass_id).catalogue_sha256
     if sha256 is None:
-        return [], 0
+        return asked.page([], 0)
     catalogue = _loaded_catalogue(ground.files.path(sha256))
-    chosen = np.lexsort((catalogue.ids, -catalogue.diameter_m))[offset : offset + limit]
+    order = np.lexsort((catalogue.ids, -catalogue.diameter_m))
+    chosen = order[asked.offset : asked.offset + asked.limit]
     east = (np.degrees(catalogue.longitude_rad[chosen]) + 180.0) % 360.0 - 180.0
     columns = (
         catalogue.ids[chosen],
@@ -280,7 +247,7 @@ def craters(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[l
     )
     names = ("id", "latitude_deg", "longitude_deg", "diameter_m")
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    return [Crater(**dict(zip(names, row, strict=True))) for row in rows], len(catalogue)
+    return asked.page((Crater(**dict(zip(names, row, strict=True))) for row in rows), len(catalogue))
 
 
 @lru_cache(maxsize=4)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
 
-from ground_service.passes.model import PassDetail, PassRecord, PassSummary
+from ground_service.http.model import PageOf, Paging
+from ground_service.passes.model import PassDetail, PassFilter, PassRecord, PassSummary
 from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
 from ground_service.store import repository, telemetry
@@ -67,37 +68,25 @@ def pass_detail(connection: Connection, pass_id: int) -> PassDetail:
     )
 
 
-def list_passes(
-    connection: Connection,
-    *,
-    search: str | None,
-    spacecraft_id: int | None,
-    instance: str | None,
-    verdict: str | None,
-    limit: int,
-    offset: int,
-) -> tuple[list[PassSummary], int]:
-    """Return a page of the passes that match, newest first, and their number.
-
-    `search` is a part of the name; `verdict` the level of the newest report, "none" for passes without one.
-    """
+def list_passes(connection: Connection, asked: PassFilter) -> PageOf[PassSummary]:
+    """Return a page of the passes, newest first."""
     vehicles = repository.VEHICLES
     query = select(_PASSES, vehicles.c.ccsds_id.label("spacecraft_id"), vehicles.c.instance).join(
         vehicles, vehicles.c.id == _PASSES.c.vehicle_id
     )
-    if search is not None:
-        query = query.where(func.lower(_PASSES.c.name).contains(search.lower(), autoescape=True))
-    if spacecraft_id is not None:
-        query = query.where(vehicles.c.ccsds_id == spacecraft_id)
-    if instance is not None:
-        query = query.where(vehicles.c.instance == instance)
-    if verdict == "none":
+    if asked.search is not None:
+        query = query.where(func.lower(_PASSES.c.name).contains(asked.search.lower(), autoescape=True))
+    if asked.spacecraft_id is not None:
+        query = query.where(vehicles.c.ccsds_id == asked.spacecraft_id)
+    if asked.instance is not None:
+        query = query.where(vehicles.c.instance == asked.instance)
+    if asked.verdict == "none":
         query = query.where(_PASSES.c.id.not_in(select(repository.REPORTS.c.pass_id)))
-    elif verdict is not None:
-        query = query.where(_newest_verdict() == verdict)
-    total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
-    query = query.order_by(_PASSES.c.created_utc_ns.desc(), _PASSES.c.id.desc()).limit(limit).offset(offset)
-    return [PassSummary.of(row) for row in connection.execute(query).mappings()], int(total)
+    elif asked.verdict is not None:
+        query = query.where(_newest_verdict() == asked.verdict)
+    order = (_PASSES.c.created_utc_ns.desc(), _PASSES.c.id.desc())
+    rows, total = repository.page(connection, query, asked, *order)
+    return asked.page(map(PassSummary.of, rows), total)
 
 
 def _newest_verdict() -> ScalarSelect[str]:
@@ -339,12 +328,11 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
 def event_page(
     connection: Connection,
     span: PassSpan,
+    asked: Paging,
     *,
-    severities: Sequence[str] = (),
+    severities: Sequence[str] | None = None,
     name: str | None = None,
     newest_first: bool = True,
-    limit: int,
-    offset: int,
 ) -> tuple[list[PassEvent], int]:
     """Return a page of the event reports of a span that match, in time order, and their number.
 
@@ -352,29 +340,25 @@ def event_page(
     content, whatever the order in which they came.
     """
     table = repository.SAMPLES["events"]
-    where = [
+    query = select(*(table.c[column] for column in _EVENT_COLUMNS)).where(
         table.c.vehicle_id == span.vehicle,
         table.c.dictionary_version == span.dictionary_version,
         table.c.ticks.between(span.start_ticks, span.stop_ticks),
-    ]
+    )
     if severities:
-        where.append(table.c.severity.in_([code for code, one in _SEVERITIES.items() if one in severities]))
+        codes = [code for code, one in _SEVERITIES.items() if one in severities]
+        query = query.where(table.c.severity.in_(codes))
     if name is not None:
         part = name.strip().lower().replace(" ", "_")
         labels = DICTIONARY.labels("event_info", "event_id")
-        where.append(table.c.event_id.in_([code for code, label in labels.items() if part in label]))
-    total = connection.execute(select(func.count()).select_from(table).where(*where)).scalar_one()
+        query = query.where(table.c.event_id.in_([code for code, label in labels.items() if part in label]))
     order = [
         table.c[column] for column in ("ticks", "event_id", "frame_number", "value_1", "value_2", "packet_id")
     ]
-    query = (
-        select(*(table.c[column] for column in _EVENT_COLUMNS))
-        .where(*where)
-        .order_by(*(column.desc() if newest_first else column for column in order))
-        .limit(limit)
-        .offset(offset)
+    rows, total = repository.page(
+        connection, query, asked, *(column.desc() if newest_first else column for column in order)
     )
-    return _pass_events([tuple(row) for row in connection.execute(query)], span), int(total)
+    return _pass_events([tuple(row.values()) for row in rows], span), total
 
 
 def _pass_events(rows: Sequence[tuple[Any, ...]], span: PassSpan) -> list[PassEvent]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ground_service.http.model import Entity
+from ground_service.http.model import Entity, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
 
 
@@ -105,3 +105,9 @@ class StoredMonthlyReport(MonthlyReport):
     html_sha256: str
     pdf_sha256: str
     json_sha256: str
+
+
+class MonthlyReportFilter(Paging):
+    """Monthly reports to list."""
+
+    spacecraft_id: SpacecraftNumber | None = None

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import Path, Query, Response
+from fastapi import Path, Query, Request, Response
 
 from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, Key, PagingOf
-from ground_service.http.model import InstanceName, PageOf, SpacecraftNumber
+from ground_service.http.common import GroundOf, Key, linked
+from ground_service.http.model import InstanceName, PageOf
 from ground_service.http.requests import operations
-from ground_service.http.times import GivenTime
-from ground_service.performance import service
-from ground_service.performance.model import MonthlyReport, Performance
+from ground_service.http.times import GivenTime, ns_of
+from ground_service.performance import service, store
+from ground_service.performance.model import MonthlyReport, MonthlyReportFilter, Performance
 from ground_service.store.vehicles import FLOWN
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
@@ -43,8 +43,8 @@ def get_performance(
         ground,
         spacecraft_id,
         instance=instance,
-        start_utc_ns=None if start is None else start.utc_ns,
-        stop_utc_ns=None if stop is None else stop.utc_ns,
+        start_utc_ns=ns_of(start),
+        stop_utc_ns=ns_of(stop),
         window_days=window_days,
     )
 
@@ -59,13 +59,10 @@ def add_monthly_report(
 
 @reports.get("/monthly-reports")
 def list_monthly_reports(
-    ground: GroundOf, _: Viewer, paging: PagingOf, spacecraft_id: SpacecraftNumber | None = None
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[MonthlyReportFilter, Query()]
 ) -> PageOf[MonthlyReport]:
     """List the monthly reports, newest month first."""
-    items, total = service.list_monthly_reports(
-        ground, spacecraft_id=spacecraft_id, limit=paging.limit, offset=paging.offset
-    )
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_monthly_reports, asked))
 
 
 @reports.get(
@@ -77,6 +74,6 @@ def get_monthly_report(
     ground: GroundOf, _: Viewer, report_id: Key, format: Literal["html", "pdf", "json"] = "html"
 ) -> Response:
     """Return a monthly report as HTML, PDF or JSON."""
-    sha256 = str(getattr(service.get_monthly_report(ground, report_id), f"{format}_sha256"))
+    sha256 = str(getattr(ground.read(store.get_monthly_report, report_id), f"{format}_sha256"))
     media = REPORT_MEDIA[format] + ("; charset=utf-8" if format == "html" else "")
     return Response(ground.files.get(sha256), media_type=media)

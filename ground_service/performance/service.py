@@ -351,26 +351,6 @@ def last_month(utc_ns: int) -> str:
     return format_utc(first - DAY_NS)[:7]
 
 
-def get_monthly_report(ground: Ground, report_id: str) -> StoredMonthlyReport:
-    """Return a monthly report.
-
-    Raises
-    ------
-    NotFound
-        There is no such report.
-    """
-    with ground.database.reading() as connection:
-        return store.get_monthly_report(connection, report_id)
-
-
-def list_monthly_reports(
-    ground: Ground, *, spacecraft_id: int | None = None, limit: int = 100, offset: int = 0
-) -> tuple[list[MonthlyReport], int]:
-    """Return a page of the monthly reports, newest month first, and their number."""
-    with ground.database.reading() as connection:
-        return store.list_monthly_reports(connection, spacecraft_id, limit=limit, offset=offset)
-
-
 def _entity(report: StoredMonthlyReport) -> MonthlyReport:
     return MonthlyReport.model_validate({name: getattr(report, name) for name in MonthlyReport.model_fields})
 

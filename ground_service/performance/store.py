@@ -7,8 +7,9 @@ from sqlalchemy import Connection, func, select
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.store import newest_reports
+from ground_service.http.model import PageOf
 from ground_service.passes.model import PassRecord
-from ground_service.performance.model import MonthlyReport, StoredMonthlyReport
+from ground_service.performance.model import MonthlyReport, MonthlyReportFilter, StoredMonthlyReport
 from ground_service.store import repository
 
 _PASSES, _VEHICLES = repository.PASSES, repository.VEHICLES
@@ -83,17 +84,14 @@ def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyR
     return StoredMonthlyReport.of(repository.get(connection, _MONTHLY, report_id, "monthly report"))
 
 
-def list_monthly_reports(
-    connection: Connection, spacecraft_id: int | None, *, limit: int, offset: int
-) -> tuple[list[MonthlyReport], int]:
-    """Return a page of the monthly reports, newest month first, and their number."""
+def list_monthly_reports(connection: Connection, asked: MonthlyReportFilter) -> PageOf[MonthlyReport]:
+    """Return a page of the monthly reports, newest month first."""
     query = select(_MONTHLY)
-    if spacecraft_id is not None:
-        query = query.where(_MONTHLY.c.spacecraft_id == spacecraft_id)
-    total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
-    query = query.order_by(_MONTHLY.c.month.desc(), _MONTHLY.c.created_utc_ns.desc(), _MONTHLY.c.id)
-    rows = connection.execute(query.limit(limit).offset(offset)).mappings()
-    return [_shown(StoredMonthlyReport.of(row)) for row in rows], int(total)
+    if asked.spacecraft_id is not None:
+        query = query.where(_MONTHLY.c.spacecraft_id == asked.spacecraft_id)
+    order = (_MONTHLY.c.month.desc(), _MONTHLY.c.created_utc_ns.desc(), _MONTHLY.c.id)
+    rows, total = repository.page(connection, query, asked, *order)
+    return asked.page((_shown(StoredMonthlyReport.of(row)) for row in rows), total)
 
 
 def _shown(report: StoredMonthlyReport) -> MonthlyReport:

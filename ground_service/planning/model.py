@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import GivenTime, UtcTime
 from ground_service.missions.stations import STATIONS
 from ground_service.planning import core
@@ -483,3 +483,9 @@ class Imported(Entity):
     """Ids of the windows of an imported plan, by their keys."""
 
     windows: dict[str, int]
+
+
+class WindowFilter(Paging):
+    """Windows to list."""
+
+    state: WindowState | None = None

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import Response
+from fastapi import Request, Response
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PagingOf, PassId
+from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PagingOf, PassId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.planning import standing
+from ground_service.planning import request_store, standing
 from ground_service.planning.request_model import (
     RequestPlan,
     StandingRequest,
@@ -23,10 +23,9 @@ requests = operations("requests")
 
 
 @requests.get("/requests")
-def list_requests(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[StandingRequest]:
+def list_requests(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[StandingRequest]:
     """List the standing requests, newest first."""
-    items, total = standing.list_requests(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(request_store.list_requests, asked))
 
 
 @requests.post("/requests", status_code=201)
@@ -58,7 +57,7 @@ def add_request(
 @requests.get("/requests/{request_id}")
 def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> StandingRequest:
     """Show a standing request with the numbers of its windows."""
-    return standing.get_request(ground, request_id)
+    return ground.read(request_store.get_request, request_id)
 
 
 @requests.patch("/requests/{request_id}", responses=problems(409))
@@ -79,4 +78,4 @@ def delete_request(ground: GroundOf, caller: Operator, request_id: PassId) -> Re
 @requests.get("/requests/{request_id}/plan")
 def get_request_plan(ground: GroundOf, _: Viewer, request_id: PassId) -> RequestPlan:
     """Show the last plan: every candidate window, planned or rejected with the reason."""
-    return standing.get_plan(ground, request_id)
+    return ground.read(request_store.get_plan, request_id)

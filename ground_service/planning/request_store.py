@@ -10,6 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, func, select, update
 
 from ground_service.errors import NotFound
+from ground_service.http.model import PageOf, Paging
 from ground_service.http.times import UtcTime
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.request_model import RequestPlan, RequestTerms, StandingRequest
@@ -82,10 +83,10 @@ def get_request_record(connection: Connection, request_id: int) -> RequestRecord
     return _record(connection, repository.get(connection, _REQUESTS, request_id, "request"))
 
 
-def list_requests(connection: Connection, *, limit: int, offset: int) -> tuple[list[StandingRequest], int]:
-    """Return a page of the requests, newest first, and the total number."""
-    page = repository.page(connection, _REQUESTS, limit=limit, offset=offset)
-    return [_request(connection, row) for row in page.rows], page.total
+def list_requests(connection: Connection, asked: Paging) -> PageOf[StandingRequest]:
+    """Return a page of the requests, newest first."""
+    rows, total = repository.newest(connection, _REQUESTS, asked)
+    return asked.page((_request(connection, row) for row in rows), total)
 
 
 def active_requests(connection: Connection) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import Header, Query, Response
+from fastapi import Header, Query, Request, Response
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, Viewer
@@ -16,14 +16,14 @@ from ground_service.http.common import (
     GroundOf,
     Instance,
     OnceKey,
-    PagingOf,
     PassId,
+    linked,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime
-from ground_service.planning import exchange, forecast, service
+from ground_service.planning import exchange, forecast, service, store
 from ground_service.planning.model import (
     CraterDensity,
     Imported,
@@ -32,9 +32,9 @@ from ground_service.planning.model import (
     SearchResult,
     Window,
     WindowChange,
+    WindowFilter,
     WindowIn,
     WindowSearch,
-    WindowState,
 )
 
 planning = operations("planning")
@@ -52,14 +52,10 @@ def search_windows(ground: GroundOf, _: Viewer, given: WindowSearch) -> SearchRe
 
 @planning.get("/windows")
 def list_windows(
-    ground: GroundOf,
-    _: Viewer,
-    paging: PagingOf,
-    state: Annotated[WindowState | None, Query()] = None,
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[WindowFilter, Query()]
 ) -> PageOf[Window]:
     """List the planned windows, newest first."""
-    items, total = service.list_windows(ground, state=state, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_windows, asked))
 
 
 @planning.post("/windows", status_code=201, responses=problems(404))
@@ -91,7 +87,7 @@ def add_window(
 @planning.get("/windows/{window_id}")
 def get_window(response: Response, ground: GroundOf, _: Viewer, window_id: PassId) -> Window:
     """Show a planned window."""
-    return _tagged(response, service.get_window(ground, window_id))
+    return _tagged(response, ground.read(store.get_window, window_id))
 
 
 @planning.patch("/windows/{window_id}", responses=problems(409))

@@ -21,6 +21,7 @@ from ground_service.ephemerides.service import open_ephemeris
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
+from ground_service.http.model import Paging
 from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.frames import camera_of, declared_frames
@@ -377,26 +378,6 @@ def _preparation(
     return activities
 
 
-def get_window(ground: Ground, window_id: int) -> Window:
-    """Return a window.
-
-    Raises
-    ------
-    NotFound
-        There is no such window.
-    """
-    with ground.database.reading() as connection:
-        return store.get_window(connection, window_id)
-
-
-def list_windows(
-    ground: Ground, *, state: str | None = None, limit: int = 100, offset: int = 0
-) -> tuple[list[Window], int]:
-    """Return a page of the windows, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_windows(connection, state=state, limit=limit, offset=offset)
-
-
 def _assessed(
     ground: Ground, connection: Connection, vehicle: int, window_id: int, entry: WindowEntry, decision: str
 ) -> AssessedWindow:
@@ -523,8 +504,8 @@ def _coverage_conflict(connection: Connection, entry: WindowEntry) -> PlanConfli
     mission = missions.mission_in_force(connection, entry.spacecraft_id)
     if entry.ephemeris_id is None and (mission is None or mission.uploads is None):
         return None
-    known, total = ephemerides.list_ephemerides(connection, limit=1, offset=0)
-    if not total:
+    known = ephemerides.list_ephemerides(connection, Paging(limit=1)).items
+    if not known:
         return None
     newest = (
         known[0] if entry.ephemeris_id is None else ephemerides.get_ephemeris(connection, entry.ephemeris_id)

@@ -125,24 +125,6 @@ def delete_request(ground: Ground, request_id: int, *, actor: str) -> None:
         _note(connection, actor, "delete", request_id, "deleted")
 
 
-def get_request(ground: Ground, request_id: int) -> StandingRequest:
-    """Return a standing request."""
-    with ground.database.reading() as connection:
-        return store.get_request(connection, request_id)
-
-
-def get_plan(ground: Ground, request_id: int) -> RequestPlan:
-    """Return the last plan of a standing request."""
-    with ground.database.reading() as connection:
-        return store.get_plan(connection, request_id)
-
-
-def list_requests(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[StandingRequest], int]:
-    """Return a page of the standing requests, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_requests(connection, limit=limit, offset=offset)
-
-
 def plan_tick(ground: Ground, now_utc_ns: int | None = None) -> dict[str, int]:
     """Bring the plan up to date: fail windows that can no longer begin, fill the coming days, approve and release.
 

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, func, or_, select
+from sqlalchemy.engine import RowMapping
 from sqlalchemy.sql import Select
 
 from ground_service.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
+from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version
 from ground_service.planning.core import Commitment
-from ground_service.planning.model import AssessedWindow, Window, WindowEntry, WindowRecord, WindowUploads
+from ground_service.planning.model import (
+    AssessedWindow,
+    Window,
+    WindowEntry,
+    WindowFilter,
+    WindowRecord,
+    WindowUploads,
+)
 from ground_service.planning.window_states import COMMITTED, PlannedSpan
 from ground_service.store import repository, telemetry
 from ground_service.store.counters import lock_spacecraft
+from ground_service.store.repository import page
 from ground_service.store.states import change_if
 
 WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
@@ -117,21 +128,17 @@ def get_record(connection: Connection, window_id: int) -> WindowRecord:
     return _one(connection, window_id, WindowRecord)
 
 
-def list_windows(
-    connection: Connection, *, state: str | None, limit: int, offset: int
-) -> tuple[list[Window], int]:
-    """Return a page of the windows, newest first, and the total number."""
-    matching = [] if state is None else [WINDOWS.c.state == state]
-    total = connection.execute(select(func.count()).select_from(WINDOWS).where(*matching)).scalar_one()
-    order = (WINDOWS.c.created_utc_ns.desc(), WINDOWS.c.id.desc())
-    query = _joined().where(*matching).order_by(*order).limit(limit).offset(offset)
-    return _windows(connection, query, Window), int(total)
+def list_windows(connection: Connection, asked: WindowFilter) -> PageOf[Window]:
+    """Return a page of the windows, newest first."""
+    query = _joined() if asked.state is None else _joined().where(WINDOWS.c.state == asked.state)
+    rows, total = page(connection, query, asked, WINDOWS.c.created_utc_ns.desc(), WINDOWS.c.id.desc())
+    return asked.page(_windows(connection, rows, Window), total)
 
 
 def planned_windows(connection: Connection) -> list[Window]:
     """Return all windows that have not failed, in order of time."""
     query = _joined().where(WINDOWS.c.state != "failed").order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
-    return _windows(connection, query, Window)
+    return _windows(connection, _rows(connection, query), Window)
 
 
 def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
@@ -139,7 +146,7 @@ def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
     query = _joined().where(
         WINDOWS.c.vehicle_id == vehicle, WINDOWS.c.decision == "approved", WINDOWS.c.state != "processed"
     )
-    return _windows(connection, query.order_by(WINDOWS.c.start_utc_ns), WindowRecord)
+    return _windows(connection, _rows(connection, query.order_by(WINDOWS.c.start_utc_ns)), WindowRecord)
 
 
 def is_replaced(connection: Connection, window: WindowRecord) -> bool:
@@ -158,7 +165,7 @@ def is_replaced(connection: Connection, window: WindowRecord) -> bool:
 def records_where(connection: Connection, *conditions: Any) -> list[WindowRecord]:
     """Return the windows that fulfil conditions on their columns, in order of time."""
     query = _joined().where(*conditions).order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
-    return _windows(connection, query, WindowRecord)
+    return _windows(connection, connection.execute(query).mappings().all(), WindowRecord)
 
 
 def find_same(connection: Connection, vehicle: int, entry: WindowEntry) -> int | None:
@@ -226,7 +233,7 @@ def windows_between(
         )
         .order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
     )
-    return _windows(connection, query, Window)
+    return _windows(connection, _rows(connection, query), Window)
 
 
 def add_pass(connection: Connection, window: WindowRecord, mission_id: int | None, now_utc_ns: int) -> int:
@@ -316,13 +323,18 @@ def _joined() -> Select[Any]:
 
 
 def _one(connection: Connection, window_id: int, kind: type[AnyWindow]) -> AnyWindow:
-    found = _windows(connection, _joined().where(WINDOWS.c.id == window_id), kind)
+    found = _windows(connection, _rows(connection, _joined().where(WINDOWS.c.id == window_id)), kind)
     if not found:
         raise NotFound("window", window_id)
     return found[0]
 
 
-def _windows(connection: Connection, query: Select[Any], kind: type[AnyWindow]) -> list[AnyWindow]:
-    rows = connection.execute(query).mappings().all()
+def _rows(connection: Connection, query: Select[Any]) -> Sequence[RowMapping]:
+    return connection.execute(query).mappings().all()
+
+
+def _windows(
+    connection: Connection, rows: Sequence[Mapping[Any, Any]], kind: type[AnyWindow]
+) -> list[AnyWindow]:
     telecommands = ids_of_windows(connection, [row["id"] for row in rows])
     return [kind.of(row, telecommands=telecommands[row["id"]]) for row in rows]

@@ -397,24 +397,6 @@ def build_of(ground: Ground, given: str) -> Build:
     return registered_build(ground, given)
 
 
-def registered_builds(ground: Ground, *, limit: int = 1000, offset: int = 0) -> tuple[list[model.Build], int]:
-    """Return a page of the registered builds, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_builds(connection, limit=limit, offset=offset)
-
-
-def registered_entry(ground: Ground, digest: str) -> model.Build:
-    """Return the entry of a registered build.
-
-    Raises
-    ------
-    NotFound
-        There is no such build.
-    """
-    with ground.database.reading() as connection:
-        return store.get_build(connection, digest)
-
-
 def flight_code_hash() -> str:
     """Return the SHA-256 of the sources of the installed flight code, which is never imported here."""
     digest = hashlib.sha256()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 from typing import Annotated
 
-from fastapi import Path, Query, Response
+from fastapi import Path, Query, Request, Response
 
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
 from ground_service.access.service import Caller
@@ -18,6 +18,7 @@ from ground_service.http.common import (
     Key,
     PagingOf,
     PassId,
+    linked,
     upload_body,
 )
 from ground_service.http.model import PageOf
@@ -26,13 +27,11 @@ from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_jobs, get_job
 from ground_service.regression import archives as archive_service
-from ground_service.regression import service
+from ground_service.regression import service, store
 from ground_service.regression.builds import (
     CURRENT,
     load_build,
     register_build,
-    registered_builds,
-    registered_entry,
 )
 from ground_service.regression.gates.policy import read_policy
 from ground_service.regression.jobs import compared, missing_replays
@@ -57,10 +56,9 @@ regressions = operations("regression")
 
 
 @regressions.get("/builds")
-def list_builds(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Build]:
+def list_builds(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[Build]:
     """List the registered builds, newest first."""
-    items, total = registered_builds(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_builds, asked))
 
 
 @regressions.post("/builds", status_code=201, openapi_extra=upload_body("Zip file of a build"))
@@ -77,7 +75,7 @@ async def add_build(upload: UploadOf, ground: GroundOf, caller: Operator) -> Bui
 def add_current_build(ground: GroundOf, caller: Operator) -> Build:
     """Register the installed flight code with its own network and parameters."""
     digest = register_build(ground, load_build(CURRENT), actor=caller.name).digest
-    return registered_entry(ground, digest)
+    return ground.read(store.get_build, digest)
 
 
 @regressions.get("/regression-archives")
@@ -176,16 +174,17 @@ def start_analysis(
 
 
 @regressions.get("/regressions")
-def list_regressions(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[RegressionSummary]:
+def list_regressions(
+    ground: GroundOf, _: Viewer, request: Request, asked: PagingOf
+) -> PageOf[RegressionSummary]:
     """List the verdicts, newest first."""
-    items, total = service.list_regressions(ground, limit=paging.limit, offset=paging.offset)
-    return paging.page(items, total)
+    return linked(request, ground.read(store.list_regressions, asked))
 
 
 @regressions.get("/regressions/{regression_id}")
 def get_regression(ground: GroundOf, _: Viewer, regression_id: Key) -> Regression:
     """Show the verdict of a regression."""
-    return service.get_regression(ground, regression_id)
+    return ground.read(store.get_regression, regression_id)
 
 
 @regressions.get(
@@ -206,4 +205,4 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> Build:
                 f"{caller.name}: expected the role admin to register a program, found {caller.role}"
             )
         register_build(ground, build, actor=caller.name)
-    return registered_entry(ground, build.digest)
+    return ground.read(store.get_build, build.digest)

@@ -53,7 +53,6 @@ from ground_service.regression.model import (
     KeptArchive,
     KeptReplay,
     Regression,
-    RegressionSummary,
 )
 from ground_service.regression.outcome import (
     JUDGED,
@@ -281,26 +280,6 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
         if added:
             publish(connection, RegressionJudged(id=identity, verdict=outcome.verdict))
     return identity
-
-
-def list_regressions(
-    ground: Ground, *, limit: int = 100, offset: int = 0
-) -> tuple[list[RegressionSummary], int]:
-    """Return a page of the regressions, newest first, and the total number."""
-    with ground.database.reading() as connection:
-        return store.list_regressions(connection, limit=limit, offset=offset)
-
-
-def get_regression(ground: Ground, regression_id: str) -> Regression:
-    """Return a regression.
-
-    Raises
-    ------
-    NotFound
-        There is no such regression.
-    """
-    with ground.database.reading() as connection:
-        return store.get_regression(connection, regression_id)
 
 
 def report_of(ground: Ground, regression_id: str) -> bytes:

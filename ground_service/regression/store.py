@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, delete, func, select, update
 
 from ground_service.errors import NotFound
+from ground_service.http.model import PageOf, Paging
 from ground_service.regression.model import (
     OK,
     ArchiveRecord,
@@ -62,10 +63,10 @@ def find_build(connection: Connection, beginning: str) -> str | None:
     return str(found[0]) if len(found) == 1 else None
 
 
-def list_builds(connection: Connection, *, limit: int, offset: int) -> tuple[list[Build], int]:
-    """Return a page of the builds, newest first, and the total number."""
-    page = repository.page(connection, BUILDS, limit=limit, offset=offset)
-    return [_build(row) for row in page.rows], page.total
+def list_builds(connection: Connection, asked: Paging) -> PageOf[Build]:
+    """Return a page of the builds, newest first."""
+    rows, total = repository.newest(connection, BUILDS, asked)
+    return asked.page(map(_build, rows), total)
 
 
 def keep_archive(connection: Connection, archive: ArchiveRecord) -> None:
@@ -278,12 +279,10 @@ def get_report(connection: Connection, regression_id: str) -> str:
     return str(repository.get(connection, REGRESSIONS, regression_id, "regression")["html_sha256"])
 
 
-def list_regressions(
-    connection: Connection, *, limit: int, offset: int
-) -> tuple[list[RegressionSummary], int]:
-    """Return a page of the regressions, newest first, and the total number."""
-    page = repository.page(connection, REGRESSIONS, limit=limit, offset=offset)
-    return [Regression.of(row).summary() for row in page.rows], page.total
+def list_regressions(connection: Connection, asked: Paging) -> PageOf[RegressionSummary]:
+    """Return a page of the regressions, newest first."""
+    rows, total = repository.newest(connection, REGRESSIONS, asked)
+    return asked.page((Regression.of(row).summary() for row in rows), total)
 
 
 def _build(row: Mapping[Any, Any]) -> Build:

@@ -6,11 +6,9 @@ turns into the entities of its capability.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
-from sqlalchemy import Connection, Table, and_, func, insert, select, update
+from sqlalchemy import Connection, Table, func, insert, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.errors import NotFound
@@ -19,12 +17,13 @@ from ground_service.store import models
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Page:
-    """One page of a list: its rows, and the number of rows in all."""
+class Span(Protocol):
+    """The rows of a list that are asked for."""
 
-    rows: list[Row]
-    total: int
+    @property
+    def limit(self) -> int: ...
+    @property
+    def offset(self) -> int: ...
 
 
 FILES = models.FILES
@@ -115,29 +114,22 @@ def find(connection: Connection, table: Table, **equal: Any) -> Row | None:
     return dict(row) if row is not None else None
 
 
-def page(
-    connection: Connection,
-    table: Table,
-    *,
-    limit: int = 100,
-    offset: int = 0,
-    newest_first: bool = True,
-    conditions: Sequence[Any] = (),
-    **equal: Any,
-) -> Page:
-    """Rows of a table by primary key, a page of them, with the number of all."""
-    query = _where(table, equal)
-    if conditions:
-        query = query.where(and_(*conditions))
+def page(connection: Connection, query: Select[Any], span: Span, *order: Any) -> tuple[list[Row], int]:
+    """Return a page of the rows of a query in an order, and the number of all rows."""
     total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
+    rows = connection.execute(query.order_by(*order).limit(span.limit).offset(span.offset)).mappings()
+    return [dict(row) for row in rows], int(total)
+
+
+def newest(connection: Connection, table: Table, span: Span, **equal: Any) -> tuple[list[Row], int]:
+    """Return a page of the rows of a table, newest first, and the number of all rows.
+
+    `equal` are values of columns; None selects rows with any value.
+    """
+    stated = {name: value for name, value in equal.items() if value is not None}
     key = next(iter(table.primary_key.columns))
-    if "created_utc_ns" in table.c:
-        order = [table.c.created_utc_ns, key]
-    else:
-        order = [key]
-    query = query.order_by(*(column.desc() if newest_first else column for column in order))
-    rows = connection.execute(query.limit(limit).offset(offset)).mappings()
-    return Page([dict(row) for row in rows], int(total))
+    order = [table.c.created_utc_ns, key] if "created_utc_ns" in table.c else [key]
+    return page(connection, _where(table, stated), span, *(column.desc() for column in order))
 
 
 def _insert_of(connection: Connection) -> Any:

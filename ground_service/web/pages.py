@@ -20,11 +20,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from ground_service.access.security import caller_of
 from ground_service.commanding.approval import DEFAULT_POLICY
 from ground_service.errors import NotAuthorised, NotFound
-from ground_service.evaluation.report_overview import get_report
+from ground_service.evaluation.store import get_report
 from ground_service.ground import Ground
 from ground_service.http.common import Key
 from ground_service.passes.series import PARAMETERS, STATE_VALUES
-from ground_service.performance.service import get_monthly_report
+from ground_service.performance.store import get_monthly_report
 from ground_service.regression.service import report_of
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY
@@ -145,12 +145,12 @@ def regression_page(request: Request, regression_id: Key) -> Response:
 def monthly_report_page(request: Request, report_id: Key) -> Response:
     """A monthly report as a page with an address of its own."""
     return _document(
-        request, lambda ground: ground.files.get(get_monthly_report(ground, report_id).html_sha256)
+        request, lambda ground: ground.files.get(ground.read(get_monthly_report, report_id).html_sha256)
     )
 
 
 def _html_file(ground: Ground, report_id: str) -> str:
-    sha256 = get_report(ground, report_id).html_sha256
+    sha256 = ground.read(get_report, report_id).html_sha256
     if sha256 is None:
         raise NotFound(f"report {report_id} as", "html")
     return sha256

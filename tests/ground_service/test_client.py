@@ -3,6 +3,8 @@
 import inspect
 import json
 import re
+import subprocess
+import sys
 import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -400,6 +402,14 @@ def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_
         returned = str(inspect.signature(method).return_annotation)
         assert (found is None) == (returned in ("None", "Uplink", "dict[str, Any]")), path
         assert found is None or re.search(rf"\b{found[1]}\b", returned), path
+
+
+def test_a_client_that_is_not_closed_lets_python_end(tmp_path: Path) -> None:
+    script = "import linna; passes = linna.open({!r}); print(len(passes))"
+    open_ground(tmp_path / "home").close()
+    command = [sys.executable, "-c", script.format(str(tmp_path / "home"))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "0\n", "")
 
 
 def test_the_example_of_the_documentation_runs(

@@ -15,8 +15,9 @@ from joserfc import jwk
 
 from ground_service.access import provider as oidc
 from ground_service.access import service as users
-from ground_service.access.audit_log import list_entries
+from ground_service.access.model import AuditFilter
 from ground_service.access.security import SESSION_COOKIE
+from ground_service.access.store import list_audit
 from ground_service.app import create_app
 from ground_service.errors import Conflict, SettingsError
 from ground_service.settings import Settings, load_settings
@@ -98,7 +99,10 @@ def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client
     ground = client.app.state.ground
     (user,), (token,) = users.list_users(ground), users.list_tokens(ground)
     assert user.provider == provider.issuer and token.kind == "provider session"
-    assert [one.action for one in list_entries(ground)[0]] == ["start session", "add user"]
+    assert [one.action for one in ground.read(list_audit, AuditFilter()).items] == [
+        "start session",
+        "add user",
+    ]
 
 
 def test_the_request_to_the_provider_has_fresh_secrets(client, provider):
@@ -211,7 +215,7 @@ def test_the_highest_role_counts_and_each_sign_in_brings_the_present_one(client,
     provider.claims["roles"] = "linna-viewers"
     answered(client, provider)
     assert session_of(client)["role"] == "viewer"
-    assert list_entries(client.app.state.ground, action="change role")[1] == 1
+    assert client.app.state.ground.read(list_audit, AuditFilter(action="change role")).total == 1
 
 
 def test_a_user_who_lost_the_role_loses_the_sessions_and_tokens(client, provider):
@@ -221,7 +225,7 @@ def test_a_user_who_lost_the_role_loses_the_sessions_and_tokens(client, provider
     refused(answered(client, provider), "role")
     assert client.get("/api/v1/session").status_code == 401
     assert not users.token_valid(client.app.state.ground, token)
-    assert list_entries(client.app.state.ground, action="refuse sign-in")[1] == 1
+    assert client.app.state.ground.read(list_audit, AuditFilter(action="refuse sign-in")).total == 1
 
 
 def test_roles_inside_an_object_are_found(tmp_path, provider):
@@ -413,7 +417,7 @@ def test_the_provider_ends_the_session(client, provider, change):
     assert sign_out(client, logout_token(provider, **change)) == 200
     assert not users.token_valid(client.app.state.ground, secret)
     assert users.token_valid(client.app.state.ground, bearer)  # made by an administrator, not by a sign-in
-    assert list_entries(client.app.state.ground, action="end sessions by provider")[1] == 1
+    assert client.app.state.ground.read(list_audit, AuditFilter(action="end sessions by provider")).total == 1
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import update
 
-from ground_service.access.audit_log import list_entries
+from ground_service.access.model import AuditFilter
 from ground_service.access.service import (
     _note_use,
     add_token,
@@ -24,6 +24,7 @@ from ground_service.access.service import (
     token_sha256,
     token_valid,
 )
+from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
 from ground_service.ground import Ground, open_ground
 from ground_service.store import repository
@@ -32,7 +33,7 @@ SECRET = "a-token-of-a-deployment-0123456789"
 
 
 def actions(ground: Ground) -> list[tuple[str, str, str]]:
-    return [(one.actor, one.action, one.target) for one in list_entries(ground)[0]][::-1]
+    return [(one.actor, one.action, one.target) for one in ground.read(list_audit, AuditFilter()).items][::-1]
 
 
 def test_a_disabled_user_is_refused_at_once_in_every_process(either: Ground, tmp_path: Path) -> None:
@@ -203,7 +204,10 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 
 def details(ground: Ground) -> list[tuple[str, str, str, object]]:
-    return [(one.actor, one.action, one.target, one.detail) for one in list_entries(ground)[0]][::-1]
+    return [
+        (one.actor, one.action, one.target, one.detail)
+        for one in ground.read(list_audit, AuditFilter()).items
+    ][::-1]
 
 
 def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -> None:

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ground_service.access.audit_log import list_entries
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
 from ground_service.alarms import core
-from ground_service.alarms.model import Alarm
+from ground_service.alarms.model import Alarm, AlarmFilter
 from ground_service.alarms.service import (
     acknowledge_alarm,
     examine_packets,
@@ -54,7 +55,7 @@ def receive(ground: Ground, folder: Path, packets: list[bytes]) -> None:
 
 
 def alarms(ground: Ground, *states: str) -> list[Alarm]:
-    return list_alarms(ground, states=list(states))[0]
+    return ground.read(list_alarms, AlarmFilter(state=list(states))).items
 
 
 def facts(alarm: Alarm) -> tuple[object, ...]:
@@ -82,7 +83,7 @@ def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(
     assert (done.state, done.acknowledged_by) == ("cleared", "eva")
     assert [one.change for one in done.history] == ["raised", "acknowledged", "cleared"]
     assert done.history[1].comment == "camera restarted"
-    assert list_entries(either)[0][0].action == "acknowledge alarm"
+    assert either.read(list_audit, AuditFilter()).items[0].action == "acknowledge alarm"
 
 
 def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(
@@ -94,7 +95,7 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(
     assert (alarm.active, alarm.limits, alarm.unit) == (True, "-20 to 60", "degC")
     assert acknowledge_alarm(either, alarm.id, "", actor="eva").state == "acknowledged"
     receive(either, tmp_path / "in", [housekeeping(10, 20.0)])
-    assert get_alarm(either, alarm.id).state == "cleared"
+    assert either.read(get_alarm, alarm.id).state == "cleared"
     receive(either, tmp_path / "in", [housekeeping(20, 65.0)])
     assert [(one.state, one.count) for one in alarms(either)] == [("raised", 1), ("cleared", 5)]
 
@@ -104,9 +105,9 @@ def test_a_worse_condition_must_be_acknowledged_again(ground: Ground, tmp_path: 
     (alarm,) = alarms(ground)
     acknowledge_alarm(ground, alarm.id, "", actor="eva")
     receive(ground, tmp_path / "in", [housekeeping(1, 75.0)])
-    assert get_alarm(ground, alarm.id).state == "acknowledged"
+    assert ground.read(get_alarm, alarm.id).state == "acknowledged"
     receive(ground, tmp_path / "in", [housekeeping(2, 90.0)])
-    found = get_alarm(ground, alarm.id)
+    found = ground.read(get_alarm, alarm.id)
     assert (found.state, found.severity) == ("raised", "alarm")
 
 

@@ -9,28 +9,32 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import select, update
 
+from ground_service.clock import utc_now_ns
 from ground_service.commanding import service as commanding
 from ground_service.commanding.core import SentCommand, VerificationReport, fate_of
+from ground_service.commanding.model import TelecommandFilter
 from ground_service.commanding.service import (
     enter_command,
     get_command,
-    list_commands,
     note_timeouts,
     reject_command,
     release_command,
     take_uplink,
 )
+from ground_service.commanding.store import list_telecommands
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import read_events
 from ground_service.ground import Ground
+from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
+from ground_service.planning.model import WindowFilter
 from ground_service.planning.service import (
     WindowEntry,
     add_window,
     change_window,
-    list_windows,
     uplink_window,
 )
+from ground_service.planning.store import list_windows
 from ground_service.store import repository
 from lunar.timescales import parse_utc
 from tmtc.dictionary import DICTIONARY
@@ -145,7 +149,7 @@ def test_what_the_dictionary_refuses_is_not_queued(
 ) -> None:
     with pytest.raises(InvalidInput, match=message):
         enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
-    assert list_commands(ground)[1] == 0
+    assert ground.read(list_telecommands, TelecommandFilter(), utc_now_ns()).total == 0
 
 
 @pytest.mark.parametrize("function", ["reboot", 7])
@@ -243,7 +247,7 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(
     downlink(ground, tmp_path, ("verification_completed", 9000, late))
     assert (get_command(ground, silent).state, noted(due + 3 * 10**9)) == ("completed", [])
     with ground.database.reading() as connection:
-        record = repository.page(connection, repository.AUDIT, action="time out telecommand").rows
+        record = repository.newest(connection, repository.AUDIT, Paging(), action="time out telecommand")[0]
     assert [(row["actor"], row["target"], row["detail"]["state"]) for row in record] == [
         ("service", str(silent), "sent")
     ]
@@ -348,8 +352,8 @@ def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_t
     raise_rule(monkeypatch)
     with pytest.raises(Conflict, match="expected a window that a second person has approved"):
         uplink_window(ground, planned(ground, "ann", "ann"), actor="bob")
-    assert list_commands(ground)[1] == 0
-    [window] = [row.id for row in list_windows(ground)[0]]
+    assert ground.read(list_telecommands, TelecommandFilter(), utc_now_ns()).total == 0
+    [window] = [row.id for row in ground.read(list_windows, WindowFilter()).items]
     change_window(ground, window, actor="bob", changes={}, decision="draft")
     change_window(ground, window, actor="bob", changes={}, decision="approved")
     assert len(uplink_window(ground, window, actor="ann")) == 3
@@ -382,7 +386,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 def notes(ground: Ground, command: int) -> list[tuple[str, str, Any]]:
     """Who did what to a command, and the details, in order."""
     with ground.database.reading() as connection:
-        rows = repository.page(connection, repository.AUDIT, target=str(command)).rows
+        rows = repository.newest(connection, repository.AUDIT, Paging(), target=str(command))[0]
     return [(row["actor"], row["action"], row["detail"]) for row in sorted(rows, key=lambda row: row["id"])]
 
 
@@ -525,8 +529,9 @@ def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) 
     release_command(ground, ids[1], actor="ann")
 
     def listed(**which: Any) -> tuple[list[int], int]:
-        views, total = list_commands(ground, **which)
-        return [int(view.record.id) for view in views], total
+        page = ground.read(list_telecommands, TelecommandFilter(**which), utc_now_ns())
+        views, total = page.items, page.total
+        return [int(view.id) for view in views], total
 
     assert listed() == (ids[::-1], 4)
     assert listed(limit=2, offset=1) == ([ids[2], ids[1]], 4)
@@ -645,7 +650,7 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
         for work in (lambda: add("perform_function", REBOOT), schedule):
             with pytest.raises(Conflict, match=r"telecommand perform_function: .*critical"):
                 work()
-        assert list_commands(ground)[1] == 1
+        assert ground.read(list_telecommands, TelecommandFilter(), utc_now_ns()).total == 1
     # A routine command needs nobody.
     row = get_command(ground, add("test_connection", {})).record
     assert (row.state, row.critical) == ("released", 0)

@@ -5,12 +5,15 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from pydantic import ValidationError
 
-from ground_service.access.audit_log import list_entries
-from ground_service.displays import service
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
+from ground_service.displays import service, store
 from ground_service.displays.model import DEPTH_LIMIT, DOCUMENT_LIMIT_OCTETS, DisplayIn
+from ground_service.displays.store import list_displays
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import read_events
 from ground_service.ground import Ground
+from ground_service.http.model import Paging
 
 
 def layout(version: int = 0, **document: object) -> DisplayIn:
@@ -25,15 +28,18 @@ def test_an_object_is_kept_with_its_versions_actors_audit_and_events(either: Gro
     ground = either
     assert keep(ground, layout(items=[1, "Sägezahn"])) == 1
     assert keep(ground, layout(1, items=[2]), actor="ida") == 2
-    found = service.get_display(ground, "mine")
+    found = ground.read(store.get, "mine")
     assert found.document == {"items": [2]}
     assert (found.created_by, found.changed_by, found.octets) == ("eva", "ida", len('{"items":[2]}'))
-    listed, total = service.list_displays(ground, limit=10, offset=0)
+    page = ground.read(list_displays, Paging(limit=10, offset=0))
+    listed, total = page.items, page.total
     assert total == 1 and [(one.key, one.name, one.version) for one in listed] == [("mine", "Pass shift", 2)]
     service.delete_display(ground, "mine", actor="ida")
     with pytest.raises(NotFound):
-        service.get_display(ground, "mine")
-    entries = [(one.actor, one.action) for one in list_entries(ground, target="display mine")[0]]
+        ground.read(store.get, "mine")
+    entries = [
+        (one.actor, one.action) for one in ground.read(list_audit, AuditFilter(target="display mine")).items
+    ]
     assert entries == [("ida", "delete display"), ("ida", "keep display"), ("eva", "keep display")]
     events = [one.payload for one in read_events(ground.database, 0) if one.kind == "display"]
     assert events == [{"key": "mine", "version": 1}, {"key": "mine", "version": 2}, {"key": "mine"}]
@@ -45,7 +51,7 @@ def test_a_version_that_is_not_the_current_one_changes_nothing(either: Ground, v
     keep(either, layout(1, items=[2]))
     with pytest.raises(Conflict, match=f"expected version {version}, found 2 of eva"):
         keep(either, layout(version, items=[3]), actor="ida")
-    assert service.get_display(either, "mine").document == {"items": [2]}
+    assert either.read(store.get, "mine").document == {"items": [2]}
 
 
 def test_an_object_that_was_deleted_is_not_replaced(either: Ground) -> None:
@@ -102,7 +108,7 @@ def entry(number: int, text: str, **authors: str) -> dict[str, object]:
 
 
 def authors(ground: Ground) -> list[tuple[object, ...]]:
-    found = service.get_display(ground, "mine").document["configuration"]["entries"]["section"]["page"]
+    found = ground.read(store.get, "mine").document["configuration"]["entries"]["section"]["page"]
     return [tuple(one.get(name) for name in ("createdBy", "modifiedBy", "createdByRole")) for one in found]
 
 
@@ -112,7 +118,7 @@ def test_authors_of_entries_are_those_who_stored_them(either: Ground) -> None:
     given = (entry(1, "one", modifiedBy="ada"), entry(2, "two", modifiedBy="ada"))
     keep(either, notebook(1, given, createdBy="ada", modifiedBy="ada"), "ida")
     assert authors(either) == [("eva", None, None), ("ida", "ida", None)]
-    document = service.get_display(either, "mine").document
+    document = either.read(store.get, "mine").document
     assert (document["createdBy"], document["modifiedBy"]) == ("eva", "ida")
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
+from ground_service.http.model import Paging
 from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest
 from ground_service.settings import Settings
@@ -93,7 +94,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
     assert client.get(f"{V1}/jobs/{job}").json()["state"] == "done"
     with ground.database.reading() as connection:
         found = archive_hash(connection, 1)
-        packets = repository.page(connection, repository.PACKETS, limit=1).total
+        packets = repository.newest(connection, repository.PACKETS, Paging(limit=1))[1]
     assert packets == len(synthetic_pass.packets)
     client.post(f"{V1}/telemetry", content=(synthetic_pass.folder / "downlink.cadu").read_bytes())
     with ground.database.reading() as connection:

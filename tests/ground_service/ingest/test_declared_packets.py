@@ -15,6 +15,7 @@ import pytest
 from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest import parameters as decoding
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import store as missions
@@ -248,11 +249,11 @@ def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
     assert parameter_series(either, define(either), "VOLTAGE", 1000).samples == 100
     assert undecoded_vehicles(either, 76) == []
     with either.database.reading() as connection:
-        (job,) = repository.page(connection, repository.JOBS, kind="redecode").rows
+        (job,) = repository.newest(connection, repository.JOBS, Paging(), kind="redecode")[0]
     assert job["state"] == "done"
     enter(either, tmp_path / "m", DEFINED + "[evidence]\nseed = 1\n")  # the same packets
     with either.database.reading() as connection:
-        assert repository.page(connection, repository.JOBS, kind="redecode").total == 1
+        assert repository.newest(connection, repository.JOBS, Paging(), kind="redecode")[1] == 1
 
 
 @pytest.mark.parametrize("deep", [False, True])

@@ -16,6 +16,7 @@ from sqlalchemy import event, func, select
 
 from ground_service.errors import DatabaseBusy, InvalidInput
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest import edge_store as edges
 from ground_service.ingest.edges import MIDDLE
 from ground_service.ingest.service import Place, ingest_file
@@ -133,8 +134,8 @@ def test_two_spacecraft_in_one_file_have_archives_of_their_own(
     assert archive(ground) == expected
     with ground.database.reading() as connection:
         other = vehicle_id(connection, 33, "flight")
-        stored = repository.page(connection, repository.PACKETS, vehicle_id=other)
-    assert stored.total == 20
+        stored = repository.newest(connection, repository.PACKETS, Paging(), vehicle_id=other)
+    assert stored[1] == 20
 
 
 def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(
@@ -160,7 +161,7 @@ def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: P
     ):
         ingest(ground, np.random.default_rng(3).bytes(70_000), tmp_path, "noise.bin")
     with ground.database.reading() as connection:
-        record = repository.page(connection, repository.INGESTS).rows[0]
+        record = repository.newest(connection, repository.INGESTS, Paging())[0][0]
     assert record["state"] == "failed"
     assert "noise.bin" in record["error"]
 
@@ -279,7 +280,7 @@ def test_octets_that_wait_are_counted_and_are_no_error(
     first = ingest(ground, stream[300:900], tmp_path)
     assert (first.packets, first.packets_new, first.octets_pending) == (0, 0, 600)
     with ground.database.reading() as connection:
-        record = repository.page(connection, repository.INGESTS).rows[0]
+        record = repository.newest(connection, repository.INGESTS, Paging())[0][0]
     assert (record["state"], record["error"]) == ("done", None)
     assert record["accounting"]["octets_pending"] == 600
     last = ingest(ground, stream[900:2000], tmp_path)

@@ -22,7 +22,8 @@ from benchmarks.downlink import (
     with_bit_errors,
     without_error_control,
 )
-from ground_service.access.audit_log import list_entries
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.model import IngestResult
@@ -124,7 +125,7 @@ def test_good_settings_are_remembered_once_by_station_and_audited(ground: Ground
         kept = connection.execute(select(repository.GOOD_LINKS).order_by(repository.GOOD_LINKS.c.id)).all()
     assert [row.station for row in kept] == ["", "madrid"]
     assert {row.settings["frame_length"] for row in kept} == {1115}
-    entries, _ = list_entries(ground, limit=10, offset=0)
+    entries = ground.read(list_audit, AuditFilter(limit=10, offset=0)).items
     assert [one.action for one in entries].count("remember link settings") == 2
 
 

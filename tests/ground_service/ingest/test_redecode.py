@@ -11,6 +11,7 @@ from sqlalchemy import select
 
 from ground_service.app import create_app
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest import redecode as redecoding
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
@@ -59,7 +60,7 @@ def old(tmp_path: Path, synthetic_pass: Any) -> Iterator[Ground]:
 
 def looked_at(ground: Ground) -> tuple[int, int, int]:
     return (
-        list_events(ground, 1, limit=1, offset=0)[1],
+        list_events(ground, 1, Paging(limit=1)).total,
         parameter_series(ground, 1, "power_w", 1000).samples,
         state_series(ground, 1, "spherical", ("altitude_m",), 100)[0].samples,
     )

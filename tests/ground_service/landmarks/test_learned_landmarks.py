@@ -20,13 +20,13 @@ from ground_service.landmarks.documents import (
     format_labels,
     upload_entries,
 )
-from ground_service.landmarks.model import Landmark
+from ground_service.landmarks.model import Landmark, LandmarkFilter
 from ground_service.landmarks.service import (
     decide_landmark,
     get_landmark,
-    list_landmarks,
     update_landmarks,
 )
+from ground_service.landmarks.store import list_landmarks
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -81,13 +81,14 @@ def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinn
     update = update_landmarks(either, first)
     assert update.unmatched > update.places > 30 and update.controls > 30
     assert update.proposed == 0 and update.added == update.places  # one pass is not enough
-    assert {one.state for one in list_landmarks(either, limit=1000)[0]} == {"seen"}
+    assert {one.state for one in either.read(list_landmarks, LandmarkFilter(limit=1000)).items} == {"seen"}
     # the detections of these passes are all half a pixel right and 1.25 pixels up of the craters
     assert update.offset_east_m is not None and update.offset_north_m is not None
     assert 60.0 < update.offset_east_m < 140.0 and 170.0 < update.offset_north_m < 340.0
     update = update_landmarks(either, second)
     assert update.added == 0 and update.proposed > 30
-    proposed, total = list_landmarks(either, state="proposed", limit=1000)
+    page = either.read(list_landmarks, LandmarkFilter(state="proposed", limit=1000))
+    proposed, total = page.items, page.total
     assert total == len(proposed) == update.proposed
     errors = np.array([distances_m(withheld, one).min() for one in proposed])
     sigma = np.array([np.hypot(one.sigma_east_m, one.sigma_north_m) for one in proposed])
@@ -105,14 +106,15 @@ def test_a_pass_that_is_searched_again_counts_once(ground: Ground, thinned) -> N
     for one in (first, second, first, second, second):
         update_landmarks(ground, one)
     again = [
-        one.model_dump(exclude={"id", "changed", "created"}) for one in list_landmarks(ground, limit=1000)[0]
+        one.model_dump(exclude={"id", "changed", "created"})
+        for one in ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
     ]
     with open_ground(ground.home.parent / "other") as other:
         for one in both_passes(other, folder):
             update_landmarks(other, one)
         once = [
             one.model_dump(exclude={"id", "changed", "created"})
-            for one in list_landmarks(other, limit=1000)[0]
+            for one in other.read(list_landmarks, LandmarkFilter(limit=1000)).items
         ]
     assert again == once and len(once) > 30
 
@@ -134,7 +136,8 @@ def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground
     for thread in threads:
         thread.join()
     assert faults == []
-    found, total = list_landmarks(either, limit=1000)
+    page = either.read(list_landmarks, LandmarkFilter(limit=1000))
+    found, total = page.items, page.total
     assert total == update_landmarks(either, first).places
     assert {one.passes for one in found} == {1}
 
@@ -143,7 +146,7 @@ def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground
     folder, _, _ = thinned
     first, second = both_passes(ground, folder)
     update_landmarks(ground, first)
-    seen = list_landmarks(ground)[0][0]
+    seen = ground.read(list_landmarks, LandmarkFilter()).items[0]
     with pytest.raises(StateConflict, match="proposed or rejected"):
         decide_landmark(ground, seen.id, accept=True, reason="", actor="ann")
     update_landmarks(ground, second)
@@ -166,10 +169,10 @@ def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(
     rewrite(folder, "first pass")
     first = import_archive(ground, folder)
     update_landmarks(ground, first)
-    before = {one.id: one.looks for one in list_landmarks(ground, limit=1000)[0]}
+    before = {one.id: one.looks for one in ground.read(list_landmarks, LandmarkFilter(limit=1000)).items}
     complete = make_pass(frames=FRAMES, seed=4)
     update_landmarks(ground, import_archive(ground, complete.folder))
-    after = list_landmarks(ground, limit=1000)[0]
+    after = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
     assert {one.state for one in after} == {"seen"} and {one.passes for one in after} == {1}
     assert all(one.looks > before[one.id] for one in after)
     blind = get_landmark(ground, after[0].id).evidence[1]

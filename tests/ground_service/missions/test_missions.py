@@ -11,6 +11,7 @@ from ground_service.app import create_app
 from ground_service.commanding.service import enter_command, release_command
 from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
 from ground_service.ground import open_ground
+from ground_service.http.model import Paging
 from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.model import (
     Evidence,
@@ -23,12 +24,15 @@ from ground_service.missions.model import (
 from ground_service.missions.service import (
     add_mission,
     enter,
-    get_mission,
-    list_missions,
     mission_of_pass,
     read_mission,
 )
-from ground_service.missions.store import approval_in_force, newest_of_spacecraft
+from ground_service.missions.store import (
+    approval_in_force,
+    find_revision,
+    list_revisions,
+    newest_of_spacecraft,
+)
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
@@ -141,16 +145,17 @@ def test_entering_the_same_content_again_gives_the_same_revision(ground) -> None
     again = add_mission(ground, (TEXT + "# a remark\n").encode(), actor="bob")
     assert again == first and first.entered_by == "ada" and first.text == TEXT
     other = add_mission(ground, TEXT.replace('"DE421"', '"IAU WGCCRE 2009"').encode())
-    listed, total = list_missions(ground)
+    page = ground.read(list_revisions, Paging())
+    listed, total = page.items, page.total
     assert [one.revision for one in listed] == [other.revision, first.revision] and total == 2
-    assert get_mission(ground, first.revision[:8]) == first
+    assert ground.read(find_revision, first.revision[:8]) == first
 
 
 @pytest.mark.parametrize("name", ["", "xyz", "0000000", "00000000", "%" * 8, "a" * 65])
 def test_a_revision_that_is_not_entered_is_not_found(ground, name: str) -> None:
     add_mission(ground, TEXT.encode())
     with pytest.raises(NotFound):
-        get_mission(ground, name)
+        ground.read(find_revision, name)
 
 
 def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> None:
@@ -233,7 +238,7 @@ def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(gr
     _manifest_again(folder)
     with pytest.raises(InvalidInput, match=r"mission\.toml, spacecraft\.id: expected 76 .*, found 5"):
         import_archive(ground, folder)
-    assert list_missions(ground) == ([], 0)
+    assert ground.read(list_revisions, Paging()).items == []
 
 
 @pytest.mark.parametrize(
@@ -367,7 +372,7 @@ def test_several_that_enter_one_description_at_once_get_one_revision(
     with open_ground(tmp_path / "home", database_url=url) as ground, ThreadPoolExecutor(4) as pool:
         entered = list(pool.map(lambda _: add_mission(ground, TEXT.encode()), range(8)))
         assert len({one.id for one in entered}) == 1
-        assert list_missions(ground)[1] == 1
+        assert ground.read(list_revisions, Paging()).total == 1
 
 
 def test_a_description_names_a_mission() -> None:

@@ -7,9 +7,12 @@ import pytest
 
 from ground_service.errors import NotFound
 from ground_service.ground import Ground
+from ground_service.http.model import Paging
+from ground_service.http.times import UtcTime
 from ground_service.ingest.service import ingest_file
 from ground_service.passes import service
 from ground_service.passes.archive_import import import_archive
+from ground_service.passes.model import EventFilter
 from lunar.catalogue import load_catalogue
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.dictionary import DICTIONARY
@@ -53,14 +56,14 @@ def passed(either: Ground, tmp_path: Path) -> Ground:
 
 
 def names(ground: Ground, **filters: Any) -> list[str]:
-    filters = {"limit": 10, "offset": 0} | filters
-    found, total = service.spacecraft_events(ground, 76, "flight", **filters)
-    assert total >= len(found)
-    return [one.name for one in found]
+    page = service.spacecraft_events(ground, EventFilter(spacecraft_id=76, **filters))
+    assert page.total >= len(page.items)
+    return [one.name for one in page.items]
 
 
 def test_events_of_all_passes_are_listed_newest_first_with_their_pass(passed: Ground) -> None:
-    found, total = service.spacecraft_events(passed, 76, "flight", limit=10, offset=0)
+    page = service.spacecraft_events(passed, EventFilter(spacecraft_id=76))
+    found, total = page.items, page.total
     assert total == 4
     assert [(one.name, one.severity, one.pass_id) for one in found] == [
         ("image_dark", "medium", 2),
@@ -69,37 +72,38 @@ def test_events_of_all_passes_are_listed_newest_first_with_their_pass(passed: Gr
         ("mode_changed", "info", 1),
     ]
     assert found[0].time.utc_ns == utc_ns(5 * HOUR_S)
-    assert found[0].detail == service.list_events(passed, 2, limit=1, offset=0)[0][0].detail != ""
+    assert found[0].detail == service.list_events(passed, 2, Paging(limit=1)).items[0].detail != ""
 
 
 def test_events_are_filtered_by_severity_name_and_time(passed: Ground) -> None:
-    assert names(passed, severities=["medium", "high"]) == ["image_dark", "camera_fault"]
+    assert names(passed, severity=["medium", "high"]) == ["image_dark", "camera_fault"]
     assert names(passed, name="Mode chan") == ["mode_changed", "mode_changed"]
     assert names(passed, name="nothing of the kind") == []
-    assert names(passed, start_utc_ns=utc_ns(10), stop_utc_ns=utc_ns(2 * HOUR_S)) == [
+    assert names(passed, start=UtcTime(utc_ns(10)), stop=UtcTime(utc_ns(2 * HOUR_S))) == [
         "mode_changed",
         "camera_fault",
     ]
-    assert names(passed, start_utc_ns=utc_ns(10) + 1_000_000) == ["image_dark", "mode_changed"]
+    assert names(passed, start=UtcTime(utc_ns(10) + 1_000_000)) == ["image_dark", "mode_changed"]
     assert names(passed, limit=1, offset=1) == ["mode_changed"]
-    assert service.spacecraft_events(passed, 76, "flight", severities=["info"], limit=1, offset=0)[1] == 1
+    assert names(passed, severity=["info"], limit=1) == ["mode_changed"]
 
 
 def test_events_of_an_unknown_spacecraft_are_not_found(ground: Ground) -> None:
     with pytest.raises(NotFound, match="spacecraft 5"):
-        service.spacecraft_events(ground, 5, "flight", limit=1, offset=0)
+        service.spacecraft_events(ground, EventFilter(spacecraft_id=5))
 
 
 def test_the_craters_of_a_pass_are_listed_the_largest_first(ground: Ground, synthetic_pass: Any) -> None:
     pass_id = import_archive(ground, synthetic_pass.folder)
     catalogue = load_catalogue(synthetic_pass.folder / "catalogue.csv")
-    found, total = service.craters(ground, pass_id, limit=1000, offset=0)
+    page = service.craters(ground, pass_id, Paging(limit=1000))
+    found, total = page.items, page.total
     assert total == len(catalogue) == len(found)
     sizes = [one.diameter_m for one in found]
     assert sizes == sorted(catalogue.diameter_m.tolist(), reverse=True)
     assert all(-180.0 <= one.longitude_deg < 180.0 for one in found)
-    assert service.craters(ground, pass_id, limit=2, offset=1)[0] == found[1:3]
+    assert service.craters(ground, pass_id, Paging(limit=2, offset=1)).items == found[1:3]
 
 
 def test_a_pass_without_a_catalogue_has_no_craters(passed: Ground) -> None:
-    assert service.craters(passed, 1, limit=10, offset=0) == ([], 0)
+    assert service.craters(passed, 1, Paging(limit=10)).total == 0

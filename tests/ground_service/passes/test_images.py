@@ -10,6 +10,7 @@ import pytest
 
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
+from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.passes import images, store
@@ -98,7 +99,7 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
     assert found.address == f"/api/v1/passes/{pass_id}/images/3"
     assert found.overlay == f"{found.address}?detections=true"
     assert images.archived_image(ground, pass_id, 3) == png.tobytes()
-    items, _ = detections(ground, pass_id, limit=1000, offset=0)
+    items = detections(ground, pass_id, Paging(limit=1000)).items
     own = [one for one in items if one.frame_number == 3]
     drawn = images.archived_image(ground, pass_id, 3, detections=True)
     picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)

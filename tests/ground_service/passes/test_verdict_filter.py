@@ -5,7 +5,9 @@ from typing import Any
 from ground_service.evaluation import store
 from ground_service.evaluation.model import StoredReport
 from ground_service.ground import Ground
-from ground_service.passes.service import define_pass, list_passes
+from ground_service.passes.model import PassFilter
+from ground_service.passes.service import define_pass
+from ground_service.passes.store import list_passes
 from ground_service.store.stored_files import register_file
 
 NS = 1_000_000_000
@@ -34,7 +36,8 @@ def add_report(ground: Ground, pass_id: int, level: str, created_utc_ns: int) ->
 
 
 def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:
-    found, total = list_passes(ground, **terms)
+    page = ground.read(list_passes, PassFilter(**terms))
+    found, total = page.items, page.total
     return sorted(one.id for one in found), total
 
 

@@ -10,7 +10,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ground_service.automation.service import list_actions
+from ground_service.automation.model import ActionFilter
+from ground_service.automation.store import list_actions
 from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock
 from ground_service.errors import InvalidInput
@@ -24,14 +25,15 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.performance import service
 from ground_service.performance.documents import monthly_value
+from ground_service.performance.model import MonthlyReportFilter
 from ground_service.performance.service import (
     last_month,
-    list_monthly_reports,
     make_due_report,
     make_monthly_report,
     month_span,
     performance,
 )
+from ground_service.performance.store import list_monthly_reports
 from ground_service.store import repository
 from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, vehicle_id
@@ -187,7 +189,10 @@ def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: G
     add_pass(either, 5, status="not met")
     second = make_monthly_report(either, SPACECRAFT, "2029-08")
     assert second.id != first.id and second.verdict == "requirements not met in every pass: 1 of 1 judged"
-    assert {one.id for one in list_monthly_reports(either)[0]} == {first.id, second.id}
+    assert {one.id for one in either.read(list_monthly_reports, MonthlyReportFilter()).items} == {
+        first.id,
+        second.id,
+    }
     with pytest.raises(InvalidInput, match="2029-09: expected passes with a report, found none"):
         make_monthly_report(either, SPACECRAFT, "2029-09")
 
@@ -344,14 +349,14 @@ def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Grou
         }
         window = repository.add(connection, repository.WINDOWS, **values)
         publish(connection, WindowChanged(id=int(window), state="processed"))
-    [made] = list_monthly_reports(ground)[0]
+    [made] = ground.read(list_monthly_reports, MonthlyReportFilter()).items
     assert (made.month, made.passes, made.spacecraft_id) == ("2029-08", 1, SPACECRAFT)
-    found = {one.action: one for one in list_actions(ground)[0]}
+    found = {one.action: one for one in ground.read(list_actions, ActionFilter()).items}
     assert found["monthly_report"].result == {"report": made.id, "month": "2029-08", "passes": 1}
     assert nightly(ground, {})["monthly_reports"] == [
         {"spacecraft_id": SPACECRAFT, "month": "2029-08", "report": made.id}
     ]
-    assert len(list_monthly_reports(ground)[0]) == 1
+    assert len(ground.read(list_monthly_reports, MonthlyReportFilter()).items) == 1
 
 
 def test_operations_and_commands_give_the_same_report(

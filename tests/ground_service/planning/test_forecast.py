@@ -17,6 +17,7 @@ from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
 from ground_service.planning.filling import NS, Option, ResourceGrid, curves
 from ground_service.planning.model import WindowEntry
+from ground_service.planning.store import get_window
 from lunar.catalogue import CraterCatalogue, save_catalogue
 from lunar.timescales import parse_utc
 
@@ -117,7 +118,7 @@ def test_conflicts_of_drafts_are_explained(planned: Ground) -> None:
 
 def test_windows_lower_the_battery_and_fill_the_storage(planned: Ground) -> None:
     before = shown(planned)
-    octets = service.get_window(planned, enter(planned, 60, 180)).data_octets
+    octets = planned.read(get_window, enter(planned, 60, 180)).data_octets
     after = shown(planned)
     drop = np.array(before.battery_share) - np.array(after.battery_share)
     assert drop.tolist() == pytest.approx([0.0, 0.05] + [0.1] * 8, abs=2e-3)  # 60 W for two minutes of 20 Wh

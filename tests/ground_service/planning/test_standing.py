@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from ground_service.client.local import local_client
-from ground_service.clock import set_mission_clock
-from ground_service.commanding.service import list_commands
+from ground_service.clock import set_mission_clock, utc_now_ns
+from ground_service.commanding.model import TelecommandFilter
+from ground_service.commanding.service import get_command
+from ground_service.commanding.store import list_telecommands
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.events import read_events
@@ -21,10 +23,13 @@ from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
+from ground_service.planning.model import WindowFilter
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
+from ground_service.planning.request_store import get_plan, get_request
+from ground_service.planning.store import get_window, list_windows
+from ground_service.store.database import prepare_database
 from ground_service.worker.follow_up import follow_in_process
-from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
 
@@ -123,20 +128,22 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     key = request(either)
     done = standing.plan_tick(either, now.utc_ns)
     assert done == {"failed": 0, "added": 4, "approved": 4, "released": 4}
-    windows, _ = planning.list_windows(either)
+    windows = either.read(list_windows, WindowFilter()).items
     assert {one.request_id for one in windows} == {key}
     for one in windows:
         assert one.state == "approved" and one.start.utc_ns >= now.utc_ns + standing.LEAD_NS
         assert one.predicted.sun_elevation_deg is not None and one.predicted.sun_elevation_deg.min >= -0.1
-    plan = standing.get_plan(either, key)
+    plan = either.read(get_plan, key)
     assert [one.window_id for one in plan.candidates if one.outcome == "planned"] == sorted(
         one.id for one in windows
     )
     left = [one.reason for one in plan.candidates if one.outcome == "rejected"]
     assert left and all(left) and "the number of windows of its period is planned" in left
-    assert standing.get_request(either, key).windows == {"approved": 4}
-    commands, _ = list_commands(either, state="released")
-    assert len(commands) == 12 and all(one.record.send_before_utc_ns for one in commands)
+    assert either.read(get_request, key).windows == {"approved": 4}
+    commands = either.read(list_telecommands, TelecommandFilter(state="released"), utc_now_ns()).items
+    assert len(commands) == 12 and all(
+        get_command(either, one.id).record.send_before_utc_ns for one in commands
+    )
     assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [
         key
     ]
@@ -146,10 +153,10 @@ def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Now) -> 
     prepare(either, oem)
     request(either)
     standing.plan_tick(either, now.utc_ns)
-    first = planning.list_windows(either)
+    first = either.read(list_windows, WindowFilter())
     for later in (0, 600, 1200):
         assert sum(standing.plan_tick(either, now.utc_ns + later * NS).values()) == 0
-    assert planning.list_windows(either) == first
+    assert either.read(list_windows, WindowFilter()) == first
 
 
 def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Now) -> None:
@@ -157,7 +164,7 @@ def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, 
         follow_in_process(ground)
         prepare(ground, oem)
         key = request(ground, windows=2)
-        assert standing.get_request(ground, key).windows == {"approved": 2}
+        assert ground.read(get_request, key).windows == {"approved": 2}
         assert sum(standing.plan_tick(ground, now.utc_ns).values()) == 0
 
 
@@ -165,16 +172,20 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
     prepare(either, oem)
     key = request(either)
     standing.plan_tick(either, now.utc_ns)
-    windows, _ = planning.list_windows(either)
+    windows = either.read(list_windows, WindowFilter()).items
     first = min(windows, key=lambda one: one.start.utc_ns)
     now.utc_ns = first.start.utc_ns
     done = standing.plan_tick(either, now.utc_ns)
     assert (done["failed"], done["added"]) == (1, 1)
-    failed = planning.get_window(either, first.id)
+    failed = either.read(get_window, first.id)
     assert (failed.state, failed.reason) == ("failed", standing.NO_CONTACT)
-    assert {get.state for get in list_commands(either)[0] if get.record.window_id == first.id} == {"rejected"}
-    assert standing.get_plan(either, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]
-    assert standing.get_request(either, key).windows == {"approved": 4, "failed": 1}
+    assert {
+        get.state
+        for get in either.read(list_telecommands, TelecommandFilter(), utc_now_ns()).items
+        if get.window_id == first.id
+    } == {"rejected"}
+    assert either.read(get_plan, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]
+    assert either.read(get_request, key).windows == {"approved": 4, "failed": 1}
 
 
 def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
@@ -183,16 +194,16 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     prepare(either, oem)
     request(either)
     standing.plan_tick(either, now.utc_ns)
-    first = min(planning.list_windows(either)[0], key=lambda one: one.start.utc_ns)
+    first = min(either.read(list_windows, WindowFilter()).items, key=lambda one: one.start.utc_ns)
     with either.database.writing() as connection:
         window = store.get_record(connection, first.id)
         assert store.change_window(connection, window, state="failed", reason="a telecommand of it failed")
     assert standing.plan_tick(either, now.utc_ns)["added"] == 1
-    second = max(planning.list_windows(either)[0], key=lambda one: one.id)
+    second = max(either.read(list_windows, WindowFilter()).items, key=lambda one: one.id)
     assert (second.start, second.stop) == (first.start, first.stop)
     monkeypatch.setattr(store, "received_frames", lambda *_: 5)
     advance_windows(either, 1)
-    found = [planning.get_window(either, one.id) for one in (first, second)]
+    found = [either.read(get_window, one.id) for one in (first, second)]
     assert [one.state for one in found] == ["failed", "executing"]
     assert found[0].pass_id is None and found[1].pass_id is not None
     assert found[0].reason == "a telecommand of it failed"
@@ -222,14 +233,14 @@ def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_relea
     prepare(ground, oem, LINKS)
     request(ground, windows=2)
     assert standing.plan_tick(ground, now.utc_ns) == {"failed": 0, "added": 2, "approved": 0, "released": 0}
-    windows, _ = planning.list_windows(ground)
+    windows = ground.read(list_windows, WindowFilter()).items
     assert {one.state for one in windows} == {"draft"}
     last = max(windows, key=lambda one: one.start.utc_ns)
     planning.change_window(ground, last.id, actor="bob", changes={}, decision="approved")
     assert standing.plan_tick(ground, now.utc_ns)["released"] == 1
     first = min(windows, key=lambda one: one.start.utc_ns)
     assert standing.plan_tick(ground, first.start.utc_ns)["failed"] == 1
-    assert planning.get_window(ground, first.id).reason == standing.NOT_APPROVED
+    assert ground.read(get_window, first.id).reason == standing.NOT_APPROVED
 
 
 def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Now) -> None:
@@ -239,7 +250,7 @@ def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Now)
     add_ephemeris(ground, ground.files.put_file(oem), name="reference", precedence=0, actor="ann")
     key = request(ground)
     standing.plan_tick(ground, now.utc_ns)
-    plan = standing.get_plan(ground, key)
+    plan = ground.read(get_plan, key)
     reasons = {one.reason for one in plan.candidates if one.start.utc_ns < START + 12 * HOUR}
     assert reasons == {"no contact before it to send its telecommands"}
     planned = [one for one in plan.candidates if one.outcome == "planned"]
@@ -250,7 +261,7 @@ def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: 
     prepare(ground, oem, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
     key = request(ground, windows=20, maximum_duration_s=900.0, minimum_duration_s=800.0)
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 2
-    reasons = {one.reason for one in standing.get_plan(ground, key).candidates}
+    reasons = {one.reason for one in ground.read(get_plan, key).candidates}
     assert "more than 0.5 h of observation within 24 h" in reasons
 
 
@@ -259,9 +270,9 @@ def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem
     region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
     key = request(ground, windows=50, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
     standing.plan_tick(ground, now.utc_ns)
-    plan = standing.get_plan(ground, key)
+    plan = ground.read(get_plan, key)
     assert plan.reason is not None and plan.reason.startswith("the reference ephemeris ends at 2029-08-10")
-    windows, _ = planning.list_windows(ground)
+    windows = ground.read(list_windows, WindowFilter()).items
     assert windows
     for one in windows:
         assert one.predicted.latitude_deg is not None
@@ -272,7 +283,7 @@ def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Now) -> None
     add_mission(ground, MISSION.format(extra=AUTOMATIC).encode(), actor="ann")
     key = request(ground)
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 0
-    assert standing.get_plan(ground, key).reason == "no reference ephemeris covers the coming days"
+    assert ground.read(get_plan, key).reason == "no reference ephemeris covers the coming days"
 
 
 def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, now: Now) -> None:
@@ -284,9 +295,9 @@ def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, 
     standing.change_request(ground, key, StandingRequestChange(state="active", terms=terms), actor="ann")
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
     standing.delete_request(ground, key, actor="ann")
-    assert [one.request_id for one in planning.list_windows(ground)[0]] == [None]
+    assert [one.request_id for one in ground.read(list_windows, WindowFilter()).items] == [None]
     with pytest.raises(NotFound):
-        standing.get_request(ground, key)
+        ground.read(get_request, key)
 
 
 def test_the_posts_of_the_documentation_give_released_windows(
@@ -333,7 +344,7 @@ def test_processes_that_plan_at_the_same_time_make_one_plan(
     for thread in threads:
         thread.join(120)
     assert sorted(added) == [0, 0, 0, 4]
-    assert planning.list_windows(grounds[0])[1] == 4
+    assert grounds[0].read(list_windows, WindowFilter()).total == 4
     with grounds[0].database.reading() as connection:
         assert request_store.get_request_record(connection, key).plans == 1
     for one in grounds:

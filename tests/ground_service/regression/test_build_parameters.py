@@ -10,8 +10,10 @@ import pytest
 
 from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.regression import builds
-from ground_service.regression.builds import build_of, registered_builds
+from ground_service.regression.builds import build_of
+from ground_service.regression.store import list_builds
 from ground_service.sandbox.host import SandboxRefused
 from linna.cli import run as run_command
 
@@ -51,7 +53,7 @@ def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(
     with pytest.raises(InvalidInput) as error:
         build_of(home, write(text))
     assert str(error.value) == told
-    assert registered_builds(home) == ([], 0)
+    assert home.read(list_builds, Paging()).items == []
     assert not list((home.home / "regression" / "builds").glob("*"))
 
 
@@ -60,7 +62,7 @@ def test_right_parameters_are_registered_and_checked_once(
 ) -> None:
     file = write("flight.anchored.gravity_degree = 60")
     first = build_of(home, file)
-    assert [one.digest for one in registered_builds(home)[0]] == [first.digest]
+    assert [one.digest for one in home.read(list_builds, Paging()).items] == [first.digest]
     monkeypatch.setattr(builds, "run_in_sandbox", None)
     assert build_of(home, file).digest == first.digest
 
@@ -97,7 +99,7 @@ def test_a_build_that_cannot_be_checked_is_not_registered(
     monkeypatch.setattr(builds, "run_in_sandbox", run)
     with pytest.raises(BuildNotChecked, match=told):
         build_of(home, write("flight.anchored.gravity_degree = 60"))
-    assert registered_builds(home) == ([], 0)
+    assert home.read(list_builds, Paging()).items == []
 
 
 def test_the_command_checks_a_build_file(

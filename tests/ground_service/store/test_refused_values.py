@@ -9,6 +9,7 @@ import pytest
 
 from ground_service.errors import DatabaseBusy, InvalidInput, public_text
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.store import repository
 from ground_service.store.database import database_error
 
@@ -37,7 +38,7 @@ def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: di
         repository.add(connection, repository.JOBS, **row)
     assert "://" not in public_text(refused.value)
     with either.database.reading() as connection:
-        assert repository.page(connection, repository.JOBS).total == 0
+        assert repository.newest(connection, repository.JOBS, Paging())[1] == 0
 
 
 def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres: Any, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
+from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.service import define_pass, list_events
 from ground_service.timekeeping import recorrelation
@@ -126,7 +127,7 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
         stop_utc_ns=START + REPORTS * 60 * NS,
         spacecraft_id=SPACECRAFT,
     )
-    found, _ = list_events(ground, key, limit=1000, offset=0)
+    found = list_events(ground, key, Paging(limit=1000)).items
     np.testing.assert_allclose([event.time.utc_ns for event in found], spacecraft.sent, atol=20_000)
     assert [event.correlation_id for event in found] == [rows[0].id] * 15 + [rows[1].id] * 15
     left = residuals(ground, vehicle)

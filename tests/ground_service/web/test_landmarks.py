@@ -9,7 +9,9 @@ from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
-from ground_service.landmarks.service import list_landmarks, update_landmarks
+from ground_service.landmarks.model import LandmarkFilter
+from ground_service.landmarks.service import update_landmarks
+from ground_service.landmarks.store import list_landmarks
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue
 from tests.ground_service.conftest import write_manifest
@@ -33,7 +35,7 @@ def searched(tmp_path_factory, make_flyable, console, serve):
             manifest.pop("files", None)
             write_manifest(folder, manifest | {"pass_name": name})
             update_landmarks(ground, import_archive(ground, folder))
-        assert list_landmarks(ground, state="proposed")[1] > 25  # more than a page
+        assert ground.read(list_landmarks, LandmarkFilter(state="proposed")).total > 25  # more than a page
         tokens = {role: add_user(ground, f"ann-{role}", role) for role in ("viewer", "operator")}
     running = serve(home, home / "serve.log", console.port)
     yield running.url, tokens

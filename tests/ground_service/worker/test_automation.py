@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from ground_service import events
-from ground_service.automation.service import decide, list_actions, list_rules, record_actions, repeat
+from ground_service.automation.model import ActionFilter
+from ground_service.automation.service import decide, list_rules, record_actions, repeat
+from ground_service.automation.store import list_actions
 from ground_service.client.local import local_client
 from ground_service.clock import utc_now_ns
 from ground_service.ephemerides.service import add_ephemeris
@@ -21,16 +23,20 @@ from ground_service.evaluation import service as evaluation
 from ground_service.evaluation.store import newest_report
 from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, WindowChanged, publish
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
-from ground_service.landmarks.service import list_landmarks
-from ground_service.missions.catalogues import add_catalogue, catalogue_of, list_catalogues
+from ground_service.landmarks.model import LandmarkFilter
+from ground_service.landmarks.store import list_landmarks
+from ground_service.missions.catalogues import add_catalogue, catalogue_of
 from ground_service.missions.model import parse_mission
 from ground_service.missions.service import add_mission
+from ground_service.missions.store import list_catalogues
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning import store as windows
 from ground_service.planning.model import UploadedState, WindowUploads
-from ground_service.planning.service import WindowEntry, add_window, change_window, get_window
+from ground_service.planning.service import WindowEntry, add_window, change_window
+from ground_service.planning.store import get_window
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.pass_archives import LIVE
 from ground_service.worker import actions
@@ -121,7 +127,7 @@ def receive(ground: Ground, packets: list[bytes], folder: Path) -> None:
 
 
 def recorded(ground: Ground, **equal: Any) -> list[tuple[str, str, str]]:
-    found, _ = list_actions(ground, **equal)
+    found = ground.read(list_actions, ActionFilter(**equal)).items
     return [(one.rule, one.action, one.state) for one in reversed(found)]
 
 
@@ -151,7 +157,7 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(
 ) -> None:
     window_id = prepared(either, flown)
     receive(either, flown.packets, tmp_path)
-    window = get_window(either, window_id)
+    window = either.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
     assert recorded(either) == [
         ("report of a complete window", "align", "done"),
@@ -160,7 +166,7 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(
         ("trends", "monthly_report", "done"),
         ("regression archive of a window", "keep_archive", "done"),
     ]
-    found, _ = list_actions(either, pass_id=window.pass_id)
+    found = either.read(list_actions, ActionFilter(pass_id=window.pass_id)).items
     log = {one.number: one for one in events.read_events(either.database, 0, 1000)}
     kept = found[0].result
     assert kept is not None and (kept["state"], kept["reason"]) == ("telemetry only", LIVE)
@@ -184,13 +190,13 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
     window_id = prepared(either, flown)
     lost = slice(20, 26)
     receive(either, flown.packets[: lost.start] + flown.packets[lost.stop :], tmp_path)
-    assert get_window(either, window_id).state == "executed" and recorded(either) == []
+    assert either.read(get_window, window_id).state == "executed" and recorded(either) == []
     with either.database.reading() as connection:
         vehicle = windows.get_record(connection, window_id).vehicle_id
     end_contact(either, vehicle, START)  # before the end of the window
     assert recorded(either) == []
     end_contact(either, vehicle, STOP + NS)
-    window = get_window(either, window_id)
+    window = either.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
     assert [one[1:] for one in recorded(either)] == [
         ("align", "done"),
@@ -207,7 +213,7 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
     assert replaced.pass_id == kept.pass_id == window.pass_id and replaced.octets > kept.octets
     again = report_of(either, window.pass_id)
     assert again["packets"]["lost"] < first["packets"]["lost"]
-    assert get_window(either, window_id).state == "processed"
+    assert either.read(get_window, window_id).state == "processed"
     end_contact(either, vehicle, STOP + 2 * NS)
     assert len(recorded(either)) == 7
 
@@ -217,7 +223,7 @@ def test_a_reference_that_arrives_after_the_report_completes_it(
 ) -> None:
     window_id = prepared(either, flown, reference=False)
     receive(either, flown.packets, tmp_path)
-    window = get_window(either, window_id)
+    window = either.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
     reasons = report_of(either, window.pass_id)["not_available"]
     assert reasons["error"] == "no reference ephemeris covers this pass" and "detector" in reasons
@@ -225,7 +231,7 @@ def test_a_reference_that_arrives_after_the_report_completes_it(
     report = report_of(either, window.pass_id)
     assert 0.6 < report["detector"]["micro"]["recall"] < 0.8
     assert not {"detector", "reference", "error", "baselines"} & set(report["not_available"])
-    assert get_window(either, window_id).state == "processed"
+    assert either.read(get_window, window_id).state == "processed"
     with either.database.reading() as connection:
         newest = newest_report(connection, window.pass_id, other_than="")
     assert newest is not None and newest.previous_id is not None and newest.event_number is not None
@@ -238,7 +244,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
     before, _, rest = MISSION.partition("[camera]")
     window_id = prepared(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
     receive(ground, flown.packets, tmp_path)
-    window = get_window(ground, window_id)
+    window = ground.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
     assert {one[2] for one in recorded(ground)} == {"done"}
     report = report_of(ground, window.pass_id)
@@ -246,7 +252,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
         "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
     )
     assert [one for one in report["remarks"] if one.startswith(said)]
-    aligned = list_actions(ground)[0][-1]
+    aligned = ground.read(list_actions, ActionFilter()).items[-1]
     assert aligned.result is not None and aligned.result["missing"]["camera"].startswith(said)
 
 
@@ -259,7 +265,7 @@ def test_an_event_that_is_handled_again_acts_once(
     for event in events.read_events(ground.database, 0, 1000):
         if event.kind == WindowChanged.event_kind:
             record_actions(ground, event)
-    assert recorded(ground) == before and get_window(ground, window_id).state == "processed"
+    assert recorded(ground) == before and ground.read(get_window, window_id).state == "processed"
     made = [
         one for one in events.read_events(ground.database, 0, 1000) if one.kind == PassEvaluated.event_kind
     ]
@@ -279,11 +285,11 @@ def test_actions_that_a_process_left_are_done_by_the_next(
             patched.setattr(actions, "make_report", full)
             receive(ground, flown.packets, tmp_path)
         assert [one[1:] for one in recorded(ground)] == [("align", "done"), ("report", "queued")]
-        assert get_window(ground, window_id).state == "downlinked"
+        assert ground.read(get_window, window_id).state == "downlinked"
     with open_ground(tmp_path / "home") as ground:
         follow_in_process(ground)
         InlineDispatcher(ground).resume()
-        assert get_window(ground, window_id).state == "processed"
+        assert ground.read(get_window, window_id).state == "processed"
         assert {one[2] for one in recorded(ground)} == {"done"} and unfinished_jobs(ground) == []
 
 
@@ -297,13 +303,13 @@ def test_a_failed_action_skips_those_after_it_and_states_why(
     monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
-    found, _ = list_actions(ground)
+    found = ground.read(list_actions, ActionFilter()).items
     why = "pass: expected a pass, found none (attempt 3 of 3)"
     assert [(one.action, one.state, one.error) for one in reversed(found)] == [
         ("align", "failed", why),
         ("report", "skipped", "align before it was not done"),
     ]
-    window = get_window(ground, window_id)
+    window = ground.read(get_window, window_id)
     assert (window.state, window.reason) == ("downlinked", f"align failed: {why}")
     assert not has_repetitions(ground)
 
@@ -322,8 +328,8 @@ def test_a_failed_action_is_repeated_by_an_operator(
         window_id = prepared(either, flown)
         receive(either, flown.packets, tmp_path)
     assert [one[1:] for one in recorded(either)] == [("align", "failed"), ("report", "skipped")]
-    align = next(one for one in list_actions(either)[0] if one.action == "align")
-    report = next(one for one in list_actions(either)[0] if one.action == "report")
+    align = next(one for one in either.read(list_actions, ActionFilter()).items if one.action == "align")
+    report = next(one for one in either.read(list_actions, ActionFilter()).items if one.action == "report")
     with pytest.raises(StateConflict, match="expected state failed, found skipped"):
         repeat(either, report.id, actor="ann")
     with pytest.raises(StateConflict, match="expected state waiting, found failed"):
@@ -339,7 +345,7 @@ def test_a_failed_action_is_repeated_by_an_operator(
     assert [(one.actor, one.target) for one in entries] == [("ann", str(align.id))]
     actions.run_actions(either, align.event, "job")
     assert {one[2] for one in recorded(either)} == {"done"}
-    assert get_window(either, window_id).state == "processed"
+    assert either.read(get_window, window_id).state == "processed"
     with pytest.raises(StateConflict, match="expected state failed, found done"):
         repeat(either, align.id, actor="ann")
 
@@ -358,16 +364,16 @@ def test_a_report_that_failed_is_made_later(
         patched.setattr(actions, "make_report", broken)
         window_id = prepared(either, flown)
         receive(either, flown.packets, tmp_path)
-    report, align = list_actions(either)[0]
+    report, align = either.read(list_actions, ActionFilter()).items
     assert (align.state, report.state, report.attempts, len(attempts)) == ("done", "queued", 2, 2)
     assert report.error == "report: expected a renderer, found none" and report.next_attempt is not None
-    assert get_window(either, window_id).state == "downlinked"
+    assert either.read(get_window, window_id).state == "downlinked"
     assert has_repetitions(either) and repeat_due(either) == []  # not before its time
     monkeypatch.setattr(actions, "utc_now_ns", lambda: utc_now_ns() + 61 * NS)
     [job_id] = repeat_due(either)
     assert repeat_due(either) == [job_id]  # of several processes one does it
     run_job(either, job_id)
-    assert get_window(either, window_id).state == "processed"
+    assert either.read(get_window, window_id).state == "processed"
     assert {one[2] for one in recorded(either)} == {"done"} and not has_repetitions(either)
 
 
@@ -385,11 +391,11 @@ def test_actions_with_approval_wait_for_it(ground: Ground, flown: SyntheticPass,
     window_id = prepared(ground, flown, APPROVED)
     receive(ground, flown.packets, tmp_path)
     assert [one[1:] for one in recorded(ground)] == [("align", "waiting"), ("report", "waiting")]
-    waiting, _ = list_actions(ground, state="waiting")
+    waiting = ground.read(list_actions, ActionFilter(state="waiting")).items
     decided = decide(ground, waiting[-1].id, approve=True, actor="ann")
     assert decided.decided_by == "ann"
     assert [one[1:] for one in recorded(ground)] == [("align", "done"), ("report", "done")]
-    assert get_window(ground, window_id).state == "processed"
+    assert ground.read(get_window, window_id).state == "processed"
     with pytest.raises(StateConflict, match="expected state waiting, found done"):
         decide(ground, waiting[-1].id, approve=False, actor="ann")
 
@@ -397,10 +403,10 @@ def test_actions_with_approval_wait_for_it(ground: Ground, flown: SyntheticPass,
 def test_refused_actions_are_not_done(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
     window_id = prepared(ground, flown, APPROVED)
     receive(ground, flown.packets, tmp_path)
-    waiting, _ = list_actions(ground, state="waiting")
+    waiting = ground.read(list_actions, ActionFilter(state="waiting")).items
     decide(ground, waiting[-1].id, approve=False, actor="ann")
     assert [one[1:] for one in recorded(ground)] == [("align", "refused"), ("report", "refused")]
-    assert get_window(ground, window_id).state == "downlinked"
+    assert ground.read(get_window, window_id).state == "downlinked"
 
 
 @pytest.mark.parametrize("rules", ["[automation]\nevaluate = false\n", "[automation]\nrules = []\n"])
@@ -409,7 +415,7 @@ def test_automation_that_is_switched_off_does_nothing(
 ) -> None:
     window_id = prepared(ground, flown, rules)
     receive(ground, flown.packets, tmp_path)
-    assert recorded(ground) == [] and get_window(ground, window_id).state == "downlinked"
+    assert recorded(ground) == [] and ground.read(get_window, window_id).state == "downlinked"
 
 
 def test_rules_in_force_show_which_are_default(ground: Ground, flown: SyntheticPass) -> None:
@@ -447,7 +453,7 @@ def test_a_report_that_is_requested_again_without_changes_is_kept(
     receive(ground, flown.packets, tmp_path)
     with ground.database.writing() as connection:
         publish(connection, WindowChanged(id=window_id, state="downlinked"))
-    found, _ = list_actions(ground)
+    found = ground.read(list_actions, ActionFilter()).items
     assert found[0].action == "report" and found[0].result is not None and found[0].result["unchanged"]
 
 
@@ -456,7 +462,7 @@ def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(
 ) -> None:
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
-    pass_id = get_window(ground, window_id).pass_id
+    pass_id = ground.read(get_window, window_id).pass_id
     assert pass_id is not None
     whole = evaluation.evaluate(ground, pass_id)
     assert whole.detector is not None
@@ -480,7 +486,8 @@ def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass) -
         add_catalogue(ground, ground.files.put_octets(b"a,b\n1,2\n"), "x.csv")
     for _ in range(2):
         add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
-    held, total = list_catalogues(ground)
+    page = ground.read(list_catalogues, Paging())
+    held, total = page.items, page.total
     assert total == 1 and held[0].name == "craters.csv"
 
 
@@ -539,14 +546,17 @@ def test_a_processed_pass_is_searched_for_landmarks(
     save_catalogue(full.select(np.arange(len(full)) % 3 != 0), thin.folder / "catalogue.csv")
     window_id = prepared(either, thin, LEARNING)
     receive(either, thin.packets, tmp_path)
-    window = get_window(either, window_id)
+    window = either.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
-    [searched] = [one for one in list_actions(either)[0] if one.action == "find_landmarks"]
+    [searched] = [
+        one for one in either.read(list_actions, ActionFilter()).items if one.action == "find_landmarks"
+    ]
     assert (searched.rule, searched.state, searched.pass_id) == (
         "learn from every pass",
         "done",
         window.pass_id,
     )
     assert searched.result is not None and searched.result["added"] > 20
-    found, total = list_landmarks(either, limit=1000)
+    page = either.read(list_landmarks, LandmarkFilter(limit=1000))
+    found, total = page.items, page.total
     assert total == searched.result["added"] and {one.state for one in found} == {"seen"}

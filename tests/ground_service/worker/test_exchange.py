@@ -10,15 +10,15 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from ground_service.access.audit_log import list_entries
+from ground_service.access.model import AuditFilter
 from ground_service.access.service import add_user, authenticate, token_sha256, token_valid
+from ground_service.access.store import list_audit
 from ground_service.commanding.service import get_command, release_command
 from ground_service.errors import Conflict, DatabaseTooNew, DatabaseTooOld, FileDamaged, InvalidInput
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.listing import get_ingest
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.service import ingest_file
-from ground_service.ingest.store import results_of_vehicle
+from ground_service.ingest.store import get_ingest, results_of_vehicle
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store import repository
@@ -85,7 +85,7 @@ def test_an_export_goes_into_either_database_and_back(
         assert (sum(result.rows.values()), result.left_out) == (sum(counts(ground).values()), {})
         assert (counts(other), hashes(other)) == (counts(ground), hashes(ground))
         assert authenticate(other, token).name == "ann"
-        assert list_entries(other)[0] == list_entries(ground)[0]
+        assert other.read(list_audit, AuditFilter()).items == ground.read(list_audit, AuditFilter()).items
         assert verify(other, deep=True).damaged == []
         add_window(other, WindowEntry("new", START, START + NS, 1.0, 76), actor="bob")  # keys go on behind
         with pytest.raises(Conflict, match="expected an empty service, found"):
@@ -244,13 +244,16 @@ def test_a_database_before_version_1_is_carried_over(earlier: Path, tmp_path: Pa
         result = import_database(ground, tmp_path / "old.zip")
         assert result.left_out == {"events": 1}
         assert result.decoded > 100
-        assert [(one.number, one.time[:4]) for one in list_entries(ground)[0]] == [(2, "1970"), (1, "1970")]
+        assert [(one.number, one.time[:4]) for one in ground.read(list_audit, AuditFilter()).items] == [
+            (2, "1970"),
+            (1, "1970"),
+        ]
         assert token_valid(ground, "secret")
         with ground.database.reading() as connection:
             row = repository.get(connection, repository.VEHICLES, 3, "vehicle")
             window = repository.get(connection, repository.WINDOWS, 1, "window")
         assert row["decoded_version"] is not None
-        assert get_ingest(ground, 4).accounting is None  # the earlier one states too little
+        assert ground.read(get_ingest, 4).accounting is None  # the earlier one states too little
         with ground.database.reading() as connection:
             assert [result for _, _, result in results_of_vehicle(connection, 3, 0, 1)] == [None]
         assert (window["edited_by"], window["decided_by"]) == ("bob", None)

@@ -13,8 +13,8 @@ from sqlalchemy import select, update
 from ground_service import events
 from ground_service.errors import StorageFull
 from ground_service.evaluation.model import ChangedFigure
-from ground_service.evaluation.report_overview import list_reports
 from ground_service.evaluation.service import changed_figures, make_report
+from ground_service.evaluation.store import list_reports
 from ground_service.events import (
     CommandsSent,
     FollowUpFailed,
@@ -23,6 +23,7 @@ from ground_service.events import (
     publish,
 )
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
 from ground_service.passes.service import define_pass
@@ -233,8 +234,8 @@ def reported_pass(ground: Ground, early: Path) -> int:
 
 def reports_of(ground: Ground, pass_id: int) -> list[dict[str, Any]]:
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.REPORTS, limit=10, pass_id=pass_id)
-    return sorted(page.rows, key=lambda row: int(row["created_utc_ns"]))
+        rows, _ = repository.newest(connection, repository.REPORTS, Paging(limit=10), pass_id=pass_id)
+    return sorted(rows, key=lambda row: int(row["created_utc_ns"]))
 
 
 def test_late_data_make_a_report_with_the_changed_figures_and_their_event(
@@ -250,7 +251,8 @@ def test_late_data_make_a_report_with_the_changed_figures_and_their_event(
     changed = {one["figure"]: (one["before"], one["after"]) for one in again["changes"]}
     assert changed["frames"] == (first["summary"]["frames"], again["summary"]["frames"])
     assert first["summary"]["frames"] < again["summary"]["frames"]
-    items, total = list_reports(either, pass_id, limit=10, offset=0)
+    page = either.read(list_reports, pass_id, Paging(limit=10, offset=0))
+    items, total = page.items, page.total
     assert total == 2 and [one.id for one in items] == [again["id"], first["id"]]
     assert (items[0].event, items[0].previous) == (again["event_number"], first["id"])
     assert {one.figure for one in items[0].changes or ()} == set(changed) and items[1].changes is None

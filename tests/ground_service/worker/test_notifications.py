@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from ground_service.automation.service import list_actions
+from ground_service.automation.model import ActionFilter
+from ground_service.automation.store import list_actions
 from ground_service.errors import InvalidInput
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
@@ -182,7 +183,7 @@ smtp = "{mailbox.address}"
     add_mission(ground, text.encode())
     with ground.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
-    [action], _ = list_actions(ground)
+    [action] = ground.read(list_actions, ActionFilter()).items
     assert (action.state, action.result) == ("done", {"hook": "delivered", "people": "delivered"})
     [(_, body)] = webhook.received
     document = json.loads(body)
@@ -212,6 +213,6 @@ smtp = "{mailbox.address}"
     add_mission(ground, text.encode())
     with ground.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="pass"))
-    [action], _ = list_actions(ground)
+    [action] = ground.read(list_actions, ActionFilter()).items
     assert action.state == "failed" and "hook: the webhook refuses the message" in (action.error or "")
     assert len(mailbox.received) == 1

@@ -18,6 +18,7 @@ import pytest
 from ground_service.app import create_app
 from ground_service.errors import ObjectsUnavailable
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
@@ -163,7 +164,7 @@ def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
         assert "object store" in refused.json()["detail"] and server.bucket not in refused.text
         assert client.get("/readyz").status_code == 503
         with client.app.state.ground.database.reading() as connection:
-            assert repository.page(connection, repository.INGESTS).total == 0
+            assert repository.newest(connection, repository.INGESTS, Paging())[1] == 0
         server.start()
         assert upload().status_code == 202
         assert verify(client.app.state.ground, deep=True).verdict == "intact"
@@ -217,7 +218,7 @@ def test_integrity_check_reads_the_store_and_not_the_cache(
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     store = server.store().under("files")
     with ground.database.reading() as connection:
-        (sha256,) = (row["sha256"] for row in repository.page(connection, repository.FILES).rows)
+        (sha256,) = (row["sha256"] for row in repository.newest(connection, repository.FILES, Paging())[0])
     octets = ground.files.get(sha256)
     assert verify(ground, deep=True).verdict == "intact"
 
