@@ -61,6 +61,7 @@ def test_uploads_and_jobs_go_on_after_the_server_was_killed_and_came_back(tmp_pa
         client = threading.Thread(target=upload, daemon=True)
         client.start()
         wait_until(lambda: len(jobs) >= 6 or bool(broken), "first uploads")
+        wait_until(lambda: session.get(f"/jobs/{jobs[0]}")["state"] == "done", "workers")
         service.parts["database"].kill()
         assert httpx.get(f"{service.api}/healthz").status_code == 200
         ready = httpx.get(f"{service.api}/readyz", timeout=30.0)
@@ -69,6 +70,7 @@ def test_uploads_and_jobs_go_on_after_the_server_was_killed_and_came_back(tmp_pa
         service.parts["database"].start()
         client.join(180.0)
         assert not broken and len(jobs) == PIECES
+        assert not [name for name, part in service.parts.items() if part.has_ended]
         states, _ = ends_of(session, jobs)
         assert states == {"done": PIECES}
         with open_ground(service.home, database_url=service.url) as ground:
