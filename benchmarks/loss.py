@@ -1,14 +1,13 @@
 """Loss of one process under ingest load: python -m benchmarks.loss [--only NAME ...] [--rate 2].
 
-Two API processes, two workers, a scheduler, Redis and a pair of PostgreSQL servers with automatic failover. Two clients
-upload pieces of a downlink. One part after another is killed (SIGKILL). A supervisor starts ended processes again after
-a second, as the restart policy of the compose file does, but not the lost host of the primary. No person acts. For each
-loss:
+Two API processes, two workers, a scheduler, Redis and PostgreSQL. Two clients upload pieces of a downlink. One part
+after another is killed (SIGKILL). A supervisor starts ended processes again after a second, as the restart policy of
+the compose file does. No person acts. For each loss:
 
 - `uploads_s`: longest time without an acknowledged upload after the kill;
 - `jobs_s`: time from the kill until a job that was accepted after it is done, and `started_s` until it started. The
   jobs that wait at the kill and when that job is done are counted (`waiting`), because it also waits for these;
-- `complete_s`: time until every process runs again, with a scheduler and, but for a lost host, a standby.
+- `complete_s`: time until every process runs again, with a scheduler.
 
 At the end every acknowledged job must be done and no packet may be missing or doubled.
 """
@@ -31,7 +30,6 @@ from typing import Any
 
 from benchmarks.campaigns._clients import Session, cut_pieces
 from benchmarks.campaigns._deployment import Deployment, wait_until
-from benchmarks.campaigns._failover import DatabaseCluster
 from benchmarks.campaigns.kill import contents, ends_of
 from benchmarks.ground import mixed_downlink
 from ground_service.access.service import add_user
@@ -42,8 +40,7 @@ from ground_service.jobs.service import unfinished_jobs
 from ground_service.worker.scheduler import has_scheduler
 from studies.mission_run.parts import runs
 
-PARTS = ("api 1", "worker 1", "scheduler 1", "broker")
-SERVER, HOST = "database server", "database host"
+PARTS = ("api 1", "worker 1", "scheduler 1", "broker", "database")
 LIMIT_S = 60.0
 """Requirement: recovery without a person."""
 
@@ -94,23 +91,13 @@ class Uploads:
             self.acknowledged.append((asked, time.monotonic(), answer.json()["job_id"]))
 
 
-def loss_of(
-    name: str, service: Deployment, cluster: DatabaseCluster, uploads: Uploads, ground: Ground
-) -> dict[str, Any]:
+def loss_of(name: str, service: Deployment, uploads: Uploads, ground: Ground) -> dict[str, Any]:
     """Kill a part and measure the recovery."""
     session = Session(service.apis, uploads._session.token)
-    primary = cluster.primary()
-    if primary is None:
-        raise SystemExit(f"{name}: expected a primary before the kill, found none")
-    before = {part: service.parts[part].pid for part in service.parts}
+    before = service.parts[name].pid
     waiting = [len(unfinished_jobs(ground))]
     killed = time.monotonic()
-    if name == SERVER:
-        cluster.members[primary].kill_server()
-    elif name == HOST:
-        cluster.members[primary].kill()
-    else:
-        service.parts[name].kill()
+    service.parts[name].kill()
 
     def first_after() -> tuple[float, float, str] | None:
         return next((one for one in list(uploads.acknowledged) if one[0] > killed), None)
@@ -126,22 +113,18 @@ def loss_of(
     waiting.append(len(unfinished_jobs(ground)))
 
     def complete() -> bool:
-        if name in service.parts and service.parts[name].pid == before[name]:
+        if service.parts[name].pid == before:
             return False
         try:
             scheduled = has_scheduler(ground)
         except GroundError:
             return False
-        redundant = cluster.primary() not in (None, primary) if name == HOST else cluster.is_redundant()
-        return scheduled and redundant and all(runs(part.pid) for part in service.parts.values())
+        return scheduled and all(runs(part.pid) for part in service.parts.values())
 
     wait_until(complete, f"complete service after the loss of {name}", 300.0)
     complete_s = time.monotonic() - killed
     times = [at for _, at, _ in list(uploads.acknowledged) if at > killed]
     uploads_s = max(later - earlier for earlier, later in itertools.pairwise([killed, *times]))
-    if name == HOST:
-        cluster.members[primary].part.start()
-        wait_until(cluster.is_redundant, "standby on the former primary", 300.0)
     return {
         "lost": name,
         "uploads_s": round(uploads_s, 1),
@@ -165,28 +148,27 @@ def losses(folder: Path, names: tuple[str, ...], rate: float) -> dict[str, Any]:
     with open_ground(folder / "reference") as ground:
         ingest_file(ground, folder / "whole.cadu")
         expected, packets = contents(ground)
-    with DatabaseCluster(folder) as cluster:
-        service = Deployment(folder, 2, cluster=cluster, schedulers=1)
-        supervisor = Supervisor(service)
-        try:
-            with open_ground(service.home, database_url=service.url) as ground:
-                session = Session(service.apis, add_user(ground, "ann", "operator"))
-                uploads = Uploads(session, stream, rate)
-                wait_until(functools.partial(has_scheduler, ground), "scheduler")
-                supervisor.start()
-                for thread in uploads.threads:
-                    thread.start()
-                wait_until(lambda: len(uploads.acknowledged) >= 5, "first uploads")
-                rows = [loss_of(name, service, cluster, uploads, ground) for name in names]
-                wait_until(lambda: len(uploads.acknowledged) > 2 * PIECES, "all pieces", 300.0)
-                uploads.over.set()
-                for thread in uploads.threads:
-                    thread.join()
-                states, attempts = ends_of(session, [job for _, _, job in uploads.acknowledged])
-                found, stored = contents(ground)
-        finally:
-            supervisor.over.set()
-            service.stop()
+    service = Deployment(folder, 2, schedulers=1)
+    supervisor = Supervisor(service)
+    try:
+        with open_ground(service.home, database_url=service.url) as ground:
+            session = Session(service.apis, add_user(ground, "ann", "operator"))
+            uploads = Uploads(session, stream, rate)
+            wait_until(functools.partial(has_scheduler, ground), "scheduler")
+            supervisor.start()
+            for thread in uploads.threads:
+                thread.start()
+            wait_until(lambda: len(uploads.acknowledged) >= 5, "first uploads")
+            rows = [loss_of(name, service, uploads, ground) for name in names]
+            wait_until(lambda: len(uploads.acknowledged) > 2 * PIECES, "all pieces", 300.0)
+            uploads.over.set()
+            for thread in uploads.threads:
+                thread.join()
+            states, attempts = ends_of(session, [job for _, _, job in uploads.acknowledged])
+            found, stored = contents(ground)
+    finally:
+        supervisor.over.set()
+        service.stop()
     return {
         "uploads_a_second": rate,
         "losses": rows,
@@ -203,8 +185,7 @@ def losses(folder: Path, names: tuple[str, ...], rate: float) -> dict[str, Any]:
 def main() -> int:
     """Measure and print; 1 if something was lost or the recovery took longer than required."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    every = (*PARTS, SERVER, HOST)
-    parser.add_argument("--only", choices=every, nargs="+", default=every, help="parts to lose")
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="parts to lose")
     parser.add_argument("--rate", type=float, default=2.0, help="uploads a second")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:

@@ -142,7 +142,7 @@ class Rolling:
             ("server api:8042", f"server 127.0.0.1:{first}"),
             ("server api2:8042", f"server 127.0.0.1:{second}"),
             ("listen 8443 ssl;", f"listen 127.0.0.1:{port} ssl;"),
-            ("/run/secrets/", f"{secrets}/"),
+            ("/run/tls/", f"{secrets}/tls/"),
             ("error_log /dev/stderr", f"error_log {self._folder}/nginx-errors.log"),
             ("rate=100r/s", "rate=10000r/s"),
             ("keepalive_timeout 5s;", f"keepalive_timeout {kept_s:.0f}s;"),
@@ -273,7 +273,7 @@ def roll(
         with open_ground(rolling.home, database_url=rolling.service_url) as ground:
             token = add_user(ground, "ann", "operator")
         ready_s = list(rolling.ready_s)
-        with Load(rolling.url, token, folder / "secrets/tls_certificate", clients, pause_s) as load:
+        with Load(rolling.url, token, folder / "secrets/tls/certificate", clients, pause_s) as load:
             wait_until(lambda: len(load.jobs) >= 4, "first uploads")
             before = sum(load.answers.values())
             rolling.upgrade_schema(new)

@@ -15,28 +15,35 @@ secret() {
   chmod 444 "$folder/$1"
 }
 secret database_superuser_password ''
-secret database_replication_password ''
 secret database_owner_password "${LINNA_DB_OWNER_PASSWORD:-}"
 secret database_password "${LINNA_DB_PASSWORD:-}"
 secret database_backup_password "${LINNA_DB_BACKUP_PASSWORD:-}"
 secret broker_password "${LINNA_REDIS_PASSWORD:-}"
 secret admin_token "${LINNA_ADMIN_TOKEN:-}"
-for pair in tls_certificate:tls_key tls_key:tls_certificate; do
-  if [ -s "$folder/${pair%:*}" ] && [ ! -s "$folder/${pair#*:}" ]; then
-    echo "secrets: expected $folder/${pair#*:} for $folder/${pair%:*}, found none" >&2
+# Of optional parts: empty until a setting names them.
+for name in objects_access_key objects_secret_key oidc_client_secret; do
+  [ -e "$folder/$name" ] || { : > "$folder/$name"; chmod 444 "$folder/$name"; }
+done
+# The folder is mounted whole, so that a renewed certificate is seen.
+tls="$folder/tls"
+mkdir -p "$tls"
+chmod 755 "$tls"
+for pair in certificate:key key:certificate; do
+  if [ -s "$tls/${pair%:*}" ] && [ ! -s "$tls/${pair#*:}" ]; then
+    echo "secrets: expected $tls/${pair#*:} for $tls/${pair%:*}, found none" >&2
     exit 2
   fi
 done
 # Without a certificate of a certification authority, the proxy gets one that it signs itself, for this name.
-if [ ! -s "$folder/tls_certificate" ]; then
+if [ ! -s "$tls/certificate" ]; then
   name="${LINNA_HOST_NAME:-localhost}"
-  rm -f "$folder/tls_certificate" "$folder/tls_key"
+  rm -f "$tls/certificate" "$tls/key"
   said="$(openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=$name" \
-    -addext "subjectAltName=DNS:$name,IP:127.0.0.1" -keyout "$folder/tls_key" -out "$folder/tls_certificate" 2>&1)" || {
-    rm -f "$folder/tls_certificate" "$folder/tls_key"
+    -addext "subjectAltName=DNS:$name,IP:127.0.0.1" -keyout "$tls/key" -out "$tls/certificate" 2>&1)" || {
+    rm -f "$tls/certificate" "$tls/key"
     printf 'secrets: no certificate was made for %s:\n%s\n' "$name" "$said" >&2
     exit 1
   }
-  chmod 444 "$folder/tls_certificate" "$folder/tls_key"
+  chmod 444 "$tls/certificate" "$tls/key"
 fi
 echo "secrets are in $folder; the token of the user admin is in $folder/admin_token"

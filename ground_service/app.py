@@ -15,7 +15,7 @@ from ground_service.access.provider import provider_of
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
-from ground_service.http.limits import BodyLimit, HeadersAndTags, LastRequests, RateLimit, SharedBudgets
+from ground_service.http.limits import BodyLimit, HeadersAndTags, LastRequests
 from ground_service.http.openapi import DescribedApi
 from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
@@ -55,7 +55,6 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     """
 
     broker = settings.resolved_broker_url()
-    budgets = shared_budgets(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -103,8 +102,6 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             await asyncio.to_thread(app.state.uploads.close)
             app.state.dispatcher.close()
             ground.close()
-            if budgets is not None:
-                await budgets.close()
 
     app = DescribedApi(
         title="LINNA ground service",
@@ -122,7 +119,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
     start_tracing(settings)
     problems.install(app)
-    _add_middleware(app, settings, budgets)
+    _add_middleware(app, settings)
     return app
 
 
@@ -138,7 +135,7 @@ def _set_state(app: FastAPI, settings: Settings) -> None:
     app.state.metrics = Metrics(settings.backups)
 
 
-def _add_middleware(app: FastAPI, settings: Settings, budgets: SharedBudgets | None) -> None:
+def _add_middleware(app: FastAPI, settings: Settings) -> None:
     """Add what runs around each request; the last one added runs first."""
     app.add_middleware(
         BodyLimit,
@@ -147,18 +144,9 @@ def _add_middleware(app: FastAPI, settings: Settings, budgets: SharedBudgets | N
         ),
         upload_limit_octets=settings.upload_limit_mib << 20,
     )
-    app.add_middleware(RateLimit, per_second=settings.rate_limit_per_s, budgets=budgets)
     app.add_middleware(PlainText)
     app.add_middleware(SameOrigin, hosts=(settings.host, *settings.allowed_hosts), api_prefix=API_PREFIX)
     app.add_middleware(HeadersAndTags)
     app.add_middleware(LastRequests, state=app.state)
     app.add_middleware(Watch, metrics=app.state.metrics)
     app.add_middleware(ForwardedHeaders, proxies=TrustedProxies(settings.trusted_proxies))
-
-
-def shared_budgets(settings: Settings) -> SharedBudgets | None:
-    """Return the rate limit budgets that API processes share in a Redis broker; None without one."""
-    broker = settings.resolved_broker_url()
-    if settings.rate_limit_per_s <= 0.0 or broker is None or not is_redis(broker):
-        return None
-    return SharedBudgets(broker, settings.rate_limit_per_s)

@@ -6,7 +6,7 @@ GroundError
 │   ├── DatabaseUnavailable      the database cannot be opened or reached
 │   ├── DatabaseBusy             the database cancelled a transaction because of a concurrent one
 │   ├── DatabaseTooNew           written by a newer version of this program
-│   ├── DatabaseTooOld           written before version 1.0; must be exported and imported
+│   ├── DatabaseTooOld           written before version 1.0; its raw files can be ingested again
 │   ├── DatabaseNotMigrated      older than this program and not migrated automatically
 │   ├── StorageFull              no space left for the archive
 │   ├── StorageReadOnly          the archive cannot be written
@@ -83,12 +83,12 @@ class DatabaseTooNew(StoreError):
 
 
 class DatabaseTooOld(StoreError):
-    """The database was written before version 1.0; its rows can be exported and imported, not migrated."""
+    """The database was written before version 1.0; it cannot be migrated."""
 
     def __init__(self, url: str, expected: str, found: str) -> None:
         super().__init__(
             f"database {url}: expected schema revision {expected}, found {found} of a version before 1.0; "
-            "run 'linna db export FILE' on it, then 'linna db import FILE' with a new database"
+            "ingest the raw files under LINNA_HOME/files into a new database with 'linna ingest'"
         )
         self.expected = expected
         self.found = found

@@ -147,9 +147,6 @@ class Settings(BaseSettings):
         default=None, description="Folder of backups, whose age the metrics and the status state"
     )
     log_format: Literal["text", "json"] = Field(default="text", description="Form of the log on stderr")
-    rate_limit_per_s: float = Field(
-        default=200.0, ge=0.0, description="Requests a second that one caller may make; 0: any number"
-    )
     allowed_hosts: Words = Field(
         default=(),
         description="Comma-separated host names of the service for browsers and programs, "
@@ -187,18 +184,9 @@ class Settings(BaseSettings):
     connections: int = Field(
         default=4096, ge=16, description="Simultaneous connections, as far as the limit of open files permits"
     )
-    connections_per_client: int = Field(
-        default=1024, ge=4, description="Simultaneous connections of one address that is not a trusted proxy"
-    )
     sockets: int = Field(default=500, ge=1, description="Simultaneous WebSockets")
     sockets_per_user: int = Field(
         default=30, ge=1, description="Simultaneous WebSockets of one user, or of one address without users"
-    )
-    request_timeout_s: float = Field(
-        default=20.0,
-        ge=1.0,
-        le=3600.0,
-        description="Time limit in seconds for the head of a request, and for every 4 KiB of its body",
     )
     drain_s: float = Field(
         default=0.0,

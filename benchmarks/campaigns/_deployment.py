@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from studies.mission_run.parts import (
     Part,
@@ -17,9 +16,6 @@ from studies.mission_run.parts import (
     free_port,
     listens,
 )
-
-if TYPE_CHECKING:
-    from benchmarks.campaigns._failover import DatabaseCluster
 
 
 def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
@@ -66,10 +62,8 @@ class Deployment:
 
     Parameters
     ----------
-    cluster
-        Pair of database servers that the caller starts and stops; default: one server of this deployment.
     database_settings
-        Settings of that one server.
+        Settings of the database server.
     """
 
     def __init__(
@@ -77,20 +71,14 @@ class Deployment:
         folder: Path,
         apis: int = 1,
         *,
-        cluster: DatabaseCluster | None = None,
         schedulers: int = 0,
         database_settings: Mapping[str, str] | None = None,
         **settings: str,
     ) -> None:
         self.parts: dict[str, Part] = {}
-        self._database: PostgresServer | None = None
-        if cluster is None:
-            self._database = PostgresServer(folder, **(database_settings or {}))
-            self.parts["database"] = self._database.part
-            self.url = self._database.prepare_service()
-        else:
-            self.url = cluster.url
-            cluster.prepare()
+        self._database = PostgresServer(folder, **(database_settings or {}))
+        self.parts["database"] = self._database.part
+        self.url = self._database.prepare_service()
         self.home = folder / "home"
         broker = RedisServer(folder)
         self.parts["broker"] = broker.part
@@ -129,8 +117,7 @@ class Deployment:
     def stop(self) -> None:
         for part in self.parts.values():
             part.end()
-        if self._database is not None:
-            self._database.remove()
+        self._database.remove()
 
 
 class ManyApis:

@@ -4,8 +4,7 @@
 
 Starts PostgreSQL, Redis, two API processes and two workers on private ports. Four clients upload pieces of one
 downlink, cut at random octets, in random order, with and without their place, over and over, and meanwhile enter,
-release, reject and fetch telecommands. One part after another, the front process of an API among them, is killed
-(SIGKILL) and started again.
+release, reject and fetch telecommands. One part after another is killed (SIGKILL) and started again.
 
 In the end every job has to be done, the archive equal to that of the same downlink ingested once, undisturbed, into
 SQLite, and what the clients were told has to hold: every acknowledged telecommand is there once, in the acknowledged
@@ -53,8 +52,7 @@ SPACECRAFT = 76
 CLIENTS = 4
 APIS = 2
 ROUND_S = 10.0
-FRONT = "ground_service.http.front"
-TARGETS = ("api", "front", "worker", "database", "broker")
+TARGETS = ("api", "worker", "database", "broker")
 ENDS = ("done", "failed")
 COUNTS = ("uploads", "attempts", "telecommands", "handed_out", "lost", "doubled", *FAULTS, "seconds")
 
@@ -73,8 +71,7 @@ class Harassment(threading.Thread):
         self.enough = threading.Event()
         self._service, self._rng, self._kills = service, rng, kills
         self._pause_s, self._until = pause_s, until
-        names = list(service.parts)
-        self._targets = [*names, *(f"front of {name}" for name in names if name.startswith("api"))]
+        self._targets = list(service.parts)
 
     def run(self) -> None:
         try:
@@ -82,11 +79,7 @@ class Harassment(threading.Thread):
                 if self.enough.wait(self._rng.uniform(0.0, 2.0 * self._pause_s)):
                     return
                 name = self._rng.choice(self._targets)
-                part = self._service.parts[name.removeprefix("front of ")]
-                if name.startswith("front of "):
-                    if part.kill_child(FRONT):
-                        self.killed["front"] += 1
-                    continue
+                part = self._service.parts[name]
                 part.kill()
                 time.sleep(self._rng.uniform(0.0, self._pause_s))
                 part.start()

@@ -11,7 +11,6 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.errors import Forbidden, NotAuthorised
-from ground_service.http.limits import VERIFIED_CALLER
 from ground_service.http.uploads import Upload, UploadPool
 
 SESSION_COOKIE = "linna_session"
@@ -36,7 +35,6 @@ def caller_of(
         raise NotAuthorised("expected a bearer token in the Authorization header, found none")
     caller = authenticate(ground, token)
     request.state.caller = caller.name
-    setattr(request.state, VERIFIED_CALLER, caller.name)
     return caller
 
 

@@ -1,1 +1,1 @@
-"""What every endpoint shares: connections, limits, origins, uploads, problem details, schemas, time formats."""
+"""What every endpoint shares: limits, origins, uploads, problem details, schemas, time formats."""

@@ -3,34 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import logging
-import math
-import time
-from collections import OrderedDict
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders, State
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ground_service.http.origins import refuse
 from ground_service.http.problems import busy, problem
-from ground_service.http.proxies import address_key
-
-log = logging.getLogger(__name__)
 
 JSON_LIMIT_OCTETS = 1 << 20
 HELD_LIMIT_OCTETS = 64 << 20
 TAGGED_LIMIT_OCTETS = 4 << 20
-
-VERIFIED_CALLER = "verified_caller"
-"""Key in the request state for the user whose token was verified; absent without a verified token."""
-
-CALLERS_KEPT = 10_000
-BURST_S = 2.0
-REDIS_TIMEOUT_S = 1.0
-REDIS_RETRY_S = 10.0
-_WATCHED = ("/healthz", "/readyz", "/metrics")
 
 SECURE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -105,129 +88,6 @@ class BodyLimit:
                 self._held -= taken
         if refusal is not None and not started:
             await refusal(scope, receive, send)
-
-
-class RateLimit:
-    """Rate limit: each caller has a budget of requests for two seconds, refilled continuously.
-
-    A caller is a user if the token was verified before, otherwise the address of the peer (see `proxies`). Requests
-    with invalid tokens therefore use the budget of their address.
-    """
-
-    def __init__(self, app: ASGIApp, per_second: float, budgets: Budgets | None = None) -> None:
-        self._app = app
-        self._rate = per_second
-        self._budgets = LocalBudgets(per_second) if budgets is None else budgets
-        self._verified: OrderedDict[str, str] = OrderedDict()
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket") or self._rate <= 0.0 or scope["path"] in _WATCHED:
-            await self._app(scope, receive, send)
-            return
-        token = _token(scope)
-        user = self._verified.get(token)
-        address = address_key(str((scope.get("client") or ("",))[0]))
-        wait_s = await self._budgets.take(f"address {address}" if user is None else f"user {user}")
-        if wait_s > 0.0:
-            response = problem(429, "too many requests", f"expected at most {self._rate:g} requests a second")
-            response.headers["Retry-After"] = str(math.ceil(wait_s))
-            await refuse(response, scope, receive, send)
-            return
-        try:
-            await self._app(scope, receive, send)
-        finally:
-            if token:
-                self._note(token, scope.get("state", {}).get(VERIFIED_CALLER))
-
-    def _note(self, token: str, caller: str | None) -> None:
-        """Remember the user of a verified token; forget a token that was not verified."""
-        self._verified.pop(token, None)
-        if caller is not None:
-            self._verified[token] = caller
-            if len(self._verified) > CALLERS_KEPT:
-                self._verified.popitem(last=False)
-
-
-class Budgets(Protocol):
-    """Remaining requests of callers."""
-
-    async def take(self, caller: str) -> float:
-        """Take one request from a budget; return the seconds to wait if none is left."""
-
-
-class LocalBudgets:
-    """Budgets of the last `CALLERS_KEPT` callers of this process."""
-
-    def __init__(self, per_second: float) -> None:
-        self._rate = per_second
-        self._depth = max(BURST_S * per_second, 1.0)
-        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    async def take(self, caller: str) -> float:
-        now_s = time.monotonic()
-        left, since = self._left.pop(caller, (self._depth, now_s))
-        left = min(left + (now_s - since) * self._rate, self._depth)
-        allowed = left >= 1.0
-        self._left[caller] = (left - 1.0 if allowed else left, now_s)
-        if len(self._left) > CALLERS_KEPT:
-            self._left.popitem(last=False)
-        return 0.0 if allowed else (1.0 - left) / self._rate
-
-
-_TAKE = """
-local now = redis.call('TIME')
-local now_us = now[1] * 1000000 + now[2]
-local each_us, depth_us = tonumber(ARGV[1]), tonumber(ARGV[2])
-local paid_until = math.max(tonumber(redis.call('GET', KEYS[1]) or '0'), now_us)
-local wait_us = paid_until + each_us - now_us - depth_us
-if wait_us > 0 then return math.ceil(wait_us) end
-redis.call('SET', KEYS[1], string.format('%.0f', paid_until + each_us), 'PX', math.ceil(depth_us / 1000) + 1000)
-return 0
-"""
-"""The generic cell rate algorithm (ATM Forum TM 4.0, 4.4.2): one value for each caller, which expires automatically."""
-
-
-class SharedBudgets:
-    """Budgets in Redis, shared by all API processes; each process has its own while Redis is unavailable."""
-
-    def __init__(self, url: str, per_second: float) -> None:
-        import redis.asyncio
-
-        self._client = redis.asyncio.from_url(url, socket_timeout=REDIS_TIMEOUT_S)
-        self._script = self._client.register_script(_TAKE)
-        self._each_us = 1e6 / per_second
-        self._depth_us = max(BURST_S * per_second, 1.0) * self._each_us
-        self._local = LocalBudgets(per_second)
-        self._away_until = 0.0
-
-    async def take(self, caller: str) -> float:
-        import redis.exceptions
-
-        now_s = time.monotonic()
-        if now_s >= self._away_until:
-            key = "linna:budget:" + hashlib.sha256(caller.encode()).hexdigest()[:32]
-            try:
-                return float(await self._script(keys=[key], args=[self._each_us, self._depth_us])) / 1e6
-            except (redis.exceptions.RedisError, OSError) as error:
-                self._away_until = now_s + REDIS_RETRY_S
-                log.warning(
-                    "rate limit: the broker is unavailable (%s); each process limits on its own", error
-                )
-        return await self._local.take(caller)
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await self._client.aclose()
-
-
-def _token(scope: Scope) -> str:
-    """Return the hash of the token in a request; empty without one. Tokens are not stored."""
-    headers = Headers(scope=scope)
-    token = headers.get("authorization", "")
-    if not token and scope["type"] == "websocket":
-        token = headers.get("sec-websocket-protocol", "")
-    token = token or headers.get("cookie", "")
-    return hashlib.sha256(token.encode()).hexdigest() if token else ""
 
 
 class LastRequests:

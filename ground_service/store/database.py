@@ -237,7 +237,7 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
     DatabaseTooNew
         If a newer version of the program wrote it.
     DatabaseTooOld
-        If a version before 1.0 wrote it: it can only be exported.
+        If a version before 1.0 wrote it.
     DatabaseNotMigrated
         If it is older and must not be upgraded here.
     DatabaseUnavailable, StorageReadOnly, StorageFull

@@ -1,4 +1,4 @@
-"""Rows as JSON lines: one form for both databases, for digests of tables, backups and exports.
+"""Rows as JSON lines: one form for both databases, for digests of tables in backups.
 
 A row is a JSON array in the order of the columns; octets are base64, non-finite numbers are text.
 """
@@ -59,20 +59,6 @@ def row_line(columns: Sequence[Any], row: Row) -> bytes:
     """Return the line of one row, with its line end."""
     values = [_plain(row[column.name], column.type) for column in columns]
     return json.dumps(values, sort_keys=True, separators=(",", ":"), ensure_ascii=True).encode() + b"\n"
-
-
-def parse_line(columns: Sequence[Any], line: bytes) -> Row:
-    """Return the row of a line.
-
-    Raises
-    ------
-    ValueError
-        If the line is not a row of a table with these columns.
-    """
-    values = json.loads(line)
-    if not isinstance(values, list) or len(values) != len(columns):
-        raise ValueError(f"expected {len(columns)} values")
-    return {column.name: _stored(value, column.type) for column, value in zip(columns, values, strict=True)}
 
 
 def lines_digest(lines: Iterable[bytes]) -> TableDigest:
@@ -157,17 +143,4 @@ def _plain(value: Any, kind: Any) -> Any:
         return base64.b64encode(bytes(value)).decode()
     if isinstance(kind, Float):
         return float(value) if math.isfinite(value) else str(float(value))
-    return value
-
-
-def _stored(value: Any, kind: Any) -> Any:
-    if value is None or isinstance(kind, JSON):
-        return value
-    if isinstance(kind, LargeBinary):
-        return base64.b64decode(value, validate=True)
-    if isinstance(kind, Float):
-        return float(value)
-    expected = str if isinstance(kind, String) else int
-    if type(value) is not expected:
-        raise ValueError(f"expected {expected.__name__}, found {type(value).__name__}")
     return value

@@ -28,7 +28,6 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, NotAuthorised
 from ground_service.events import TelemetryReceived, last_number, read_events
 from ground_service.ground import Ground
-from ground_service.http.limits import VERIFIED_CALLER
 from ground_service.http.problems import problem
 from ground_service.http.proxies import address_key
 from ground_service.http.times import time_text
@@ -131,8 +130,6 @@ class Sockets:
             await socket.close(POLICY_VIOLATION)
             yield None
             return
-        if token is not None:
-            setattr(socket.state, VERIFIED_CALLER, caller.name)
         client = socket.client.host if socket.client is not None else ""
         holder = f"user {caller.name}" if token is not None else f"address {address_key(client)}"
         if self._holders[holder] >= self._per_user or len(self._sessions) >= self._total:

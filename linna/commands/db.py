@@ -1,4 +1,4 @@
-"""`linna db`: schema, roles, backup, export, import and retention of the database."""
+"""`linna db`: schema, roles, backup and retention of the database."""
 
 from __future__ import annotations
 
@@ -37,20 +37,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     saving = actions.add_parser("backup", help="write the whole service into a new folder, while it runs")
     saving.add_argument("--out", type=Path, required=True, metavar="DIR")
     saving.set_defaults(handler=run_backup)
-    restoring = actions.add_parser("restore", help="fill an empty service from a backup")
+    restoring = actions.add_parser(
+        "restore", help="fill an empty service from a backup, of SQLite or PostgreSQL"
+    )
     restoring.add_argument("folder", type=Path)
     restoring.set_defaults(handler=run_restore)
-    exporting = actions.add_parser("export", help="write all rows and files into one portable file")
-    exporting.add_argument(
-        "--no-files", action="store_true", help="export rows only; files are referenced by hash"
-    )
-    exporting.set_defaults(handler=run_export)
-    importing = actions.add_parser(
-        "import", help="import an export into an empty service, with SQLite or PostgreSQL"
-    )
-    importing.set_defaults(handler=run_import)
-    for action in (exporting, importing):
-        action.add_argument("file", type=Path)
     tidying = actions.add_parser("tidy", help="delete old feed messages and old finished jobs")
     tidying.add_argument(
         "--days",
@@ -67,8 +58,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         status,
         saving,
         restoring,
-        exporting,
-        importing,
         tidying,
         decoding,
     ):
@@ -185,45 +174,6 @@ def run_restore(arguments: argparse.Namespace) -> int:
         label = ground.database.label
     text = f"{label}: {sum(manifest['rows'].values())} rows, {manifest['files']} files"
     emit(arguments, {"database": label, **manifest}, text=text)
-    return 0
-
-
-def run_export(arguments: argparse.Namespace) -> int:
-    from ground_service.clock import utc_now_ns
-    from ground_service.store.database import open_database
-    from ground_service.store.files import files_of
-    from ground_service.store.objects import objects_of
-    from ground_service.worker.exchange import export_database
-
-    settings = settings_of(arguments)
-    database = open_database(settings.resolved_database_url())
-    manifest = export_database(
-        database,
-        files_of(settings.home.expanduser().absolute(), objects_of(settings)),
-        arguments.file,
-        now_utc_ns=utc_now_ns(),
-        with_files=not arguments.no_files,
-        say=log,
-    )
-    count = sum(table.rows for table in manifest.tables.values())
-    emit(
-        arguments,
-        {"file": str(arguments.file), **manifest.model_dump()},
-        text=f"{arguments.file}: {count} rows, {manifest.files.count} files, audit head {manifest.audit_head}",
-    )
-    return 0
-
-
-def run_import(arguments: argparse.Namespace) -> int:
-    from ground_service.worker.exchange import import_database
-
-    with open_service(arguments) as ground:
-        result = import_database(ground, arguments.file, say=log)
-        label = ground.database.label
-    text = f"{label}: {sum(result.rows.values())} rows, {result.files} files of revision {result.revision}"
-    if result.decoded:
-        text += f"; {result.decoded} values decoded again"
-    emit(arguments, {"database": label, **result.model_dump()}, text=text)
     return 0
 
 

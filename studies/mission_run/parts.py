@@ -107,15 +107,6 @@ class Part:
         assert self._process is not None
         return self._process.pid
 
-    def kill_child(self, module: str) -> bool:
-        """Kill the child process that runs this module, which its parent restarts; return whether there was one."""
-        for pid in descendants(self.pid):
-            with contextlib.suppress(OSError):
-                if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
-                    os.kill(pid, signal.SIGKILL)
-                    return True
-        return False
-
     def end(self, number: signal.Signals | None = None) -> None:
         """End it for good, with a signal first if one is given: it is not started again."""
         self._ended = True

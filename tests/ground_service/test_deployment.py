@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 import yaml
-from sqlalchemy import make_url
+
+from ground_service.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -27,10 +28,21 @@ SECRETS = (
     "broker_password",
     "admin_token",
 )
-FAILOVER: dict[str, Any] = yaml.safe_load((ROOT / "deploy/failover/compose.yml").read_text())
-ADDED = {name: one for name, one in FAILOVER["services"].items() if "image" in one}
-CERTIFICATE = ("tls_certificate", "tls_key")
+OPTIONAL = ("objects_access_key", "objects_secret_key", "oidc_client_secret")
+"""Secrets of optional parts: empty files until a setting names them."""
+
+CERTIFICATE = ("certificate", "key")
+PROCESSES = ("api", "api2", "worker", "scheduler", "migrate", "backup")
 EXACT = re.compile(r"[a-z]+:\d+\.\d+(\.\d+)?-[a-z-]+")
+
+
+def environment_of(name: str) -> dict[str, str]:
+    """Return the environment of a service: the common declaration, then what the service itself states."""
+    service, found = SERVICES[name], {}
+    if "env_file" in service:
+        lines = (ROOT / "deploy/service.env").read_text().splitlines()
+        found = dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+    return found | service.get("environment", {})
 
 
 def default_of(text: str) -> str:
@@ -38,9 +50,9 @@ def default_of(text: str) -> str:
     return re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text)
 
 
-@pytest.mark.parametrize("name", sorted({*SERVICES, *ADDED}))
+@pytest.mark.parametrize("name", sorted(SERVICES))
 def test_every_service_is_confined(name: str) -> None:
-    service = ADDED.get(name) or SERVICES[name]
+    service = SERVICES[name]
     assert service["read_only"] and service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]
     assert service["pids_limit"] and service["mem_limit"]
@@ -108,7 +120,7 @@ def test_a_service_is_in_the_networks_that_it_needs_and_no_others() -> None:
         "front": {"proxy", "api", "api2"},
         "data": {"db", "migrate", "api", "api2", "worker", "scheduler", "backup"},
         "queue": {"broker", "api", "api2", "worker", "scheduler"},
-        "egress": {"api", "api2", "worker"},
+        "egress": {"api", "api2", "worker", "scheduler", "backup"},
     }
     inner = {name for name, options in COMPOSE["networks"].items() if (options or {}).get("internal")}
     assert inner == {"front", "data", "queue"}
@@ -118,6 +130,28 @@ def test_the_api_believes_the_proxy_and_nobody_else() -> None:
     (subnet,) = (entry["subnet"] for entry in COMPOSE["networks"]["front"]["ipam"]["config"])
     assert SERVICES["api"]["environment"]["LINNA_TRUSTED_PROXIES"] == subnet
     assert not default_of(subnet).endswith("/0")
+
+
+def test_every_process_has_the_same_settings() -> None:
+    """A setting in the common declaration reaches all; none of them is given to one process alone."""
+    own = {name: set(SERVICES[name]["environment"]) for name in PROCESSES}
+    common = {"LINNA_ALLOWED_HOSTS", "LINNA_TRUSTED_PROXIES"}
+    without_broker = {"LINNA_BROKER_URL", "LINNA_BROKER_PASSWORD_FILE"}
+    migration = {f"LINNA_{name}" for name in ("MIGRATION_DATABASE_URL", "MIGRATION_DATABASE_PASSWORD_FILE")}
+    assert own == {
+        "api": common | {"LINNA_BACKUPS"},
+        "api2": common | {"LINNA_BACKUPS"},
+        "worker": common,
+        "scheduler": common,
+        "migrate": without_broker | migration | {"LINNA_BACKUP_ROLE"},
+        "backup": without_broker | {"LINNA_DATABASE_URL", "LINNA_DATABASE_PASSWORD_FILE"},
+    }
+    files = {json.dumps(SERVICES[name]["env_file"]) for name in PROCESSES}
+    assert len(files) == 1 and "settings.env" in files.pop()
+    assert {name for name in SERVICES if "env_file" in SERVICES[name]} == set(PROCESSES)
+    known = {f"LINNA_{name.upper()}" for name in Settings.model_fields}
+    known |= {f"LINNA_{name}_PASSWORD_FILE" for name in ("DATABASE", "MIGRATION_DATABASE", "BROKER")}
+    assert all(set(environment_of(name)) <= known for name in PROCESSES)
 
 
 def test_prometheus_in_the_inner_network_may_name_the_api() -> None:
@@ -137,7 +171,7 @@ def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None
 
 
 def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environment() -> None:
-    assert set(COMPOSE["secrets"]) == {*SECRETS, *CERTIFICATE}
+    assert set(COMPOSE["secrets"]) == {*SECRETS, *OPTIONAL}
     for name, secret in COMPOSE["secrets"].items():
         # A file: contents of variables cannot be given to a container with a read-only root.
         assert secret == {"file": f"${{LINNA_SECRETS_DIR:-./secrets}}/{name}"}
@@ -154,20 +188,19 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
         "database_backup_password": {"db", "backup"},
         "broker_password": {"broker", "api", "api2", "worker", "scheduler"},
         "admin_token": {"migrate"},
-        "tls_certificate": {"proxy"},
-        "tls_key": {"proxy"},
+        **{key: set(PROCESSES) for key in OPTIONAL},
     }
     for service in SERVICES.values():
         for name, value in service.get("environment", {}).items():
             # A password or token is named by a file, and no URL holds one.
             secret = any(word in name for word in ("PASSWORD", "TOKEN", "SECRET"))
-            assert not secret or (name.endswith("_FILE") and str(value).startswith("/run/secrets/"))
+            assert not secret or not value or (name.endswith("_FILE") and value.startswith("/run/secrets/"))
             assert not re.search(r"://[^/@]*:[^/@]*@", str(value))
 
 
 def test_the_service_is_not_the_owner_of_its_schema() -> None:
     for name in ("api", "worker", "scheduler"):
-        environment = SERVICES[name]["environment"]
+        environment = environment_of(name)
         assert environment["LINNA_DATABASE_URL"].startswith("postgresql+psycopg://linna@")
         assert not {key for key in environment if "MIGRATION" in key or "ALLOW_DATABASE_OWNER" in key}
     owner = SERVICES["migrate"]["environment"]["LINNA_MIGRATION_DATABASE_URL"]
@@ -189,7 +222,7 @@ def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     (exchange,) = re.findall(r"chmod (\d+) /exchange", DOCKERFILE)
     assert int(exchange, 8) & 0o007 == 0
     assert "exchange:/exchange" in SERVICES["worker"]["volumes"]
-    assert SERVICES["worker"]["environment"]["LINNA_RUNNER_EXCHANGE"] == "/exchange"
+    assert environment_of("worker")["LINNA_RUNNER_EXCHANGE"] == "/exchange"
     assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {
         "worker",
         "runner",
@@ -205,47 +238,15 @@ def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept
         "LINNA_ADMIN_TOKEN": "given" * 5,
     }
     subprocess.run(script, check=True, env=environment, capture_output=True)
-    made = {path.name: path.read_text() for path in folder.iterdir()}
-    assert set(made) == {*SECRETS, *FAILOVER["secrets"], *CERTIFICATE}
+    made = {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
+    assert set(made) == {*SECRETS, *OPTIONAL, *CERTIFICATE}
+    assert {made[name] for name in OPTIONAL} == {""}
     assert made["admin_token"] == "given" * 5
-    drawn = [made[name] for name in (*SECRETS, *FAILOVER["secrets"]) if name != "admin_token"]
-    assert len(set(drawn)) == 6 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
+    drawn = [made[name] for name in SECRETS if name != "admin_token"]
+    assert len(set(drawn)) == 5 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
     assert folder.stat().st_mode & 0o077 == 0
     subprocess.run(script, check=True, env={**environment, "LINNA_ADMIN_TOKEN": "other"}, capture_output=True)
-    assert {path.name: path.read_text() for path in folder.iterdir()} == made
-
-
-def test_with_failover_every_connection_names_both_servers_and_finds_the_primary() -> None:
-    members = {name for name in ADDED if name.startswith("db")}
-    assert members == {"db", "db2"}
-    for name, service in SERVICES.items():
-        for key, value in service.get("environment", {}).items():
-            if not key.endswith("DATABASE_URL"):
-                continue
-            single, pair = make_url(value), make_url(FAILOVER["services"][name]["environment"][key])
-            assert (pair.username, pair.database) == (single.username, single.database)
-            assert set(pair.query["host"]) == {f"{member}:5432" for member in members}
-            # The role of backups can only read, also on the primary.
-            wanted = "primary" if pair.username == "linna_backup" else "read-write"
-            assert pair.query["target_session_attrs"] == wanted
-
-
-def test_failover_needs_a_majority_of_leases_and_a_copy_of_every_commit() -> None:
-    peers = {name: one for name, one in ADDED.items() if name.startswith("etcd")}
-    assert len(peers) == 3
-    for name, one in peers.items():
-        assert one["environment"]["ETCD_NAME"] == name
-        assert f"{name}=http://{name}:2380" in one["environment"]["ETCD_INITIAL_CLUSTER"]
-    cluster = yaml.safe_load((ROOT / "deploy/failover/patroni.yml").read_text())["bootstrap"]["dcs"]
-    assert cluster["synchronous_mode"] is True and cluster["primary_start_timeout"] == 0
-    # A primary gives up before its lease of `ttl` seconds ends.
-    assert cluster["loop_wait"] + 2 * cluster["retry_timeout"] <= cluster["ttl"] <= 30
-    for member in (ADDED["db"], ADDED["db2"]):
-        assert (
-            set(member["networks"]) == {"data", "consensus"}
-            and "database_replication_password" in member["secrets"]
-        )
-    assert FAILOVER["networks"]["consensus"]["internal"]
+    assert {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()} == made
 
 
 def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:
@@ -270,7 +271,6 @@ HOLDERS = {
         "psql",
         ("database_password", "database_owner_password", "database_backup_password"),
     ),
-    "failover/patroni.sh": ("patroni", ("database_superuser_password", "database_replication_password")),
 }
 """Scripts that read passwords, with the program that they start and the names of the passwords."""
 
@@ -292,7 +292,6 @@ def start_script(
         "PATH": f"{programs}:{os.environ['PATH']}",
         "LINNA_SECRETS": str(folder / "secrets"),
         "LINNA_REDIS_USERS": str(written),
-        "LINNA_PATRONI_CONFIGURATION": str(written),
         "POSTGRES_USER": "postgres",
         "POSTGRES_DB": "linna",
     }
@@ -323,14 +322,7 @@ def test_a_server_does_not_start_with_an_empty_password(
 
 def test_passwords_may_have_any_character(tmp_path: Path) -> None:
     odd = """two words, 'quotes' "and" \\ #%s"""
-    (tmp_path / "patroni").mkdir()
     (tmp_path / "redis").mkdir()
-    secrets = dict.fromkeys(HOLDERS["failover/patroni.sh"][1], odd)
-    done, written = start_script("failover/patroni.sh", secrets, tmp_path / "patroni")
-    assert done.returncode == 0, done.stderr
-    found = yaml.safe_load(written.read_text())
-    assert {one["password"] for one in found["postgresql"]["authentication"].values()} == {odd}
-    assert found["restapi"]["authentication"]["password"] == odd
     done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path / "redis")
     assert done.returncode == 0, done.stderr
     assert (
@@ -341,7 +333,9 @@ def test_passwords_may_have_any_character(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", CERTIFICATE)
 def test_a_certificate_without_its_key_is_refused_and_kept(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_text("of a certification authority")
+    tls = tmp_path / "tls"
+    tls.mkdir()
+    (tls / name).write_text("of a certification authority")
     done = subprocess.run(
         ["sh", str(ROOT / "deploy/secrets.sh")],
         env={"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)},
@@ -351,9 +345,9 @@ def test_a_certificate_without_its_key_is_refused_and_kept(name: str, tmp_path: 
     )
     (other,) = set(CERTIFICATE) - {name}
     assert done.returncode == 2
-    assert done.stderr == f"secrets: expected {tmp_path}/{other} for {tmp_path}/{name}, found none\n"
-    assert (tmp_path / name).read_text() == "of a certification authority"
-    assert not (tmp_path / other).exists()
+    assert done.stderr == f"secrets: expected {tls}/{other} for {tls}/{name}, found none\n"
+    assert (tls / name).read_text() == "of a certification authority"
+    assert not (tls / other).exists()
 
 
 def test_nothing_stays_of_a_base_backup_that_fails(tmp_path: Path) -> None:
@@ -378,7 +372,7 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() ->
         int(one) for one in re.findall(r"keepalive 32;.*?keepalive_timeout (\d+)s;", proxy, re.DOTALL)
     )
     for name in upstream:
-        drain_s = int(SERVICES[name]["environment"]["LINNA_DRAIN_S"])
+        drain_s = int(environment_of(name)["LINNA_DRAIN_S"])
         # Then 20 s for requests in progress.
         assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
 
@@ -387,8 +381,18 @@ def test_the_documented_reload_names_the_configuration_of_the_proxy() -> None:
     """The default configuration of nginx names another file with the number of the process."""
     program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
     reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
-    assert reload in (ROOT / "docs/deployment.md").read_text()
+    for name in ("docs/deployment.md", "deploy/prometheus/linna.rules.yml"):
+        text = (ROOT / name).read_text()
+        assert reload in text and text.count("-s reload") == text.count(reload), name
     assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]
+
+
+def test_a_renewed_certificate_is_seen_by_the_proxy() -> None:
+    """A mount of one file keeps the old file when a new one takes its place."""
+    (mount,) = (one for one in SERVICES["proxy"]["volumes"] if one.endswith(":/run/tls:ro"))
+    assert mount == "${LINNA_SECRETS_DIR:-./secrets}/tls:/run/tls:ro"
+    used = re.findall(r"ssl_certificate(?:_key)? (\S+);", (ROOT / "deploy/nginx.conf").read_text())
+    assert used == [f"/run/tls/{name}" for name in CERTIFICATE]
 
 
 def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -> None:
@@ -400,19 +404,6 @@ def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -
     # The worker writes the archive and has the role of the service, the migration that of the owner.
     assert "archive:/var/lib/linna" in SERVICES["worker"]["volumes"]
     assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
-
-
-def test_the_documented_base_backup_with_failover_signs_in_as_the_servers_permit() -> None:
-    text = (ROOT / "docs/deployment.md").read_text()
-    ((secret, hosts, user),) = re.findall(
-        r'PGPASSWORD="\$\(cat /run/secrets/(\w+)\)" \\\n +sh /linna/base-backup.sh --dbname "host=(\S+) user=(\w+) ',
-        text,
-    )
-    assert set(hosts.split(",")) == {name for name in ADDED if name.startswith("db")}
-    assert all(secret in ADDED[name]["secrets"] for name in hosts.split(","))
-    rules = yaml.safe_load((ROOT / "deploy/failover/patroni.yml").read_text())["postgresql"]["pg_hba"]
-    assert f"host replication {user} all scram-sha-256" in rules
-    assert not [rule for rule in rules if rule.startswith("local")]
 
 
 def test_there_is_a_second_worker_and_a_second_scheduler() -> None:

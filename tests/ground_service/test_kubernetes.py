@@ -14,7 +14,7 @@ from sqlalchemy import make_url
 from ground_service.settings import Settings
 from linna.cli import GROUPS
 
-BASE = Path(__file__).resolve().parents[2] / "deploy" / "kubernetes"
+BASE = Path(__file__).resolve().parents[2] / "deploy"
 KUSTOMIZATION: dict[str, Any] = yaml.safe_load((BASE / "kustomization.yaml").read_text())
 RESOURCES: list[dict[str, Any]] = [
     document
@@ -22,6 +22,10 @@ RESOURCES: list[dict[str, Any]] = [
     for document in yaml.safe_load_all((BASE / name).read_text())
 ]
 VERSIONS = ("1.31.0", "1.37.0")
+(GENERATED,) = KUSTOMIZATION["configMapGenerator"]
+LINES = (BASE / GENERATED["envs"][0]).read_text().splitlines() + GENERATED["literals"]
+CONFIGURATION = dict(line.split("=", 1) for line in LINES if line and not line.startswith("#"))
+"""Settings of every process: the declaration that the compose file has, and names of this cluster."""
 
 
 def name_of(resource: dict[str, Any]) -> str:
@@ -38,27 +42,24 @@ PODS = {name_of(one): pod for one in RESOURCES if (pod := pod_of(one)) is not No
 
 
 def test_every_file_is_part_of_the_base() -> None:
-    assert {path.name for path in BASE.glob("*.yaml")} == {*KUSTOMIZATION["resources"], "kustomization.yaml"}
+    assert {f"kubernetes/{path.name}" for path in BASE.glob("kubernetes/*")} == {*KUSTOMIZATION["resources"]}
     names = [name_of(one) for one in RESOURCES]
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("resource", RESOURCES, ids=name_of)
+@pytest.mark.parametrize("resource", [one for one in RESOURCES if one["kind"] != "Cluster"], ids=name_of)
 def test_a_resource_is_valid(resource: dict[str, Any], version: str) -> None:
     kubernetes_validate.validate(resource, version, strict=True)
 
 
-def test_the_failover_overlay_leads_the_base_to_the_primary_and_keeps_a_copy_of_every_commit() -> None:
-    overlay = BASE.parent / "overlays" / "failover"
-    listed = yaml.safe_load((overlay / "kustomization.yaml").read_text())["resources"]
-    assert listed == ["../../kubernetes", *sorted(path.name for path in overlay.glob("[!k]*.yaml"))]
-    cluster, policy = yaml.safe_load_all((overlay / "database.yaml").read_text())
-    kubernetes_validate.validate(policy, VERSIONS[-1], strict=True)
+def test_the_base_leads_to_the_primary_and_keeps_a_copy_of_every_commit() -> None:
+    """The resource of the operator has no schema here."""
+    (cluster,) = (one for one in RESOURCES if one["kind"] == "Cluster")
+    (policy,) = (one for one in RESOURCES if name_of(one) == "NetworkPolicy database-servers")
     spec = cluster["spec"]
     (service,) = spec["managed"]["services"]["additional"]
-    (configured,) = (one for one in RESOURCES if one["kind"] == "ConfigMap")
-    host = make_url(configured["data"]["LINNA_DATABASE_URL"]).host
+    host = make_url(CONFIGURATION["LINNA_DATABASE_URL"]).host
     assert service["selectorType"] == "rw" and service["serviceTemplate"]["metadata"]["name"] == host
     assert spec["instances"] >= 3 and spec["postgresql"]["synchronous"]["number"] == 1
     # The base permits its pods to connect to pods with this label.
@@ -80,7 +81,7 @@ def test_a_pod_meets_the_restricted_standard_and_has_limits(name: str) -> None:
     assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
     assert not {"hostNetwork", "hostPID", "hostIPC"} & set(pod)
     for volume in pod["volumes"]:
-        assert set(volume) <= {"name", "persistentVolumeClaim", "emptyDir", "secret"}
+        assert set(volume) <= {"name", "persistentVolumeClaim", "emptyDir", "projected"}
     for container in pod["containers"]:
         assert container["securityContext"] == {
             "allowPrivilegeEscalation": False,
@@ -99,7 +100,7 @@ def test_what_stays_is_watched_spread_and_survives_the_loss_of_a_node() -> None:
         if one["kind"] == "PodDisruptionBudget"
     }
     stays = [one for one in RESOURCES if one["kind"] == "Deployment"]
-    assert len(stays) == 3
+    assert len(stays) == 2
     for one in stays:
         selector, template = one["spec"]["selector"]["matchLabels"], one["spec"]["template"]
         assert template["metadata"]["labels"] == selector
@@ -112,22 +113,17 @@ def test_what_stays_is_watched_spread_and_survives_the_loss_of_a_node() -> None:
 
 
 def test_secrets_are_files_of_those_who_need_them() -> None:
-    holders = {
-        name: {
-            item["key"]
-            for volume in pod["volumes"]
-            if "secret" in volume
-            for item in volume["secret"]["items"]
-        }
-        for name, pod in PODS.items()
-    }
-    service = {"database_password", "broker_password"}
+    keys = {"objects_access_key", "objects_secret_key"}
+    holders = {}
+    for name, pod in PODS.items():
+        (volume,) = (one["projected"] for one in pod["volumes"] if one["name"] == "secrets")
+        sources = [one["secret"] for one in volume["sources"]]
+        holders[name] = {item["path"] for one in sources for item in one.get("items", [{"path": "all"}])}
     assert holders == {
-        "Deployment linna-api": service,
-        "Deployment linna-worker": service,
-        "Deployment linna-scheduler": service,
-        "Job linna-migrate": {*service, "database_owner_password"},
-        "CronJob linna-backup": {"database_backup_password"},
+        "Deployment linna-api": {"all", "database_password"},
+        "Deployment linna-worker": {"all", "database_password"},
+        "Job linna-migrate": {*keys, "database_password", "database_owner_password"},
+        "CronJob linna-backup": {*keys, "database_backup_password"},
     }
     assert not any(one["kind"] == "Secret" for one in RESOURCES)
 
@@ -135,10 +131,11 @@ def test_secrets_are_files_of_those_who_need_them() -> None:
 def test_every_variable_is_a_setting_and_every_command_exists() -> None:
     known = {f"LINNA_{name.upper()}" for name in Settings.model_fields}
     known |= {f"LINNA_{name}_PASSWORD_FILE" for name in ("DATABASE", "MIGRATION_DATABASE", "BROKER")}
-    (configuration,) = (one["data"] for one in RESOURCES if one["kind"] == "ConfigMap")
-    assert set(configuration) <= known
+    assert GENERATED["envs"] == ["service.env"] and set(CONFIGURATION) <= known
+    assert not any(one["kind"] == "ConfigMap" for one in RESOURCES)
     for pod in PODS.values():
         for container in pod["containers"]:
+            assert container["envFrom"] == [{"configMapRef": {"name": GENERATED["name"]}}]
             assert {variable["name"] for variable in container.get("env", [])} <= known
             words = container.get("args") or container["command"][2].removeprefix("exec linna ").split()
             assert words[0] in GROUPS
@@ -153,10 +150,13 @@ def test_the_network_refuses_what_is_not_named() -> None:
         return set(expression["values"])
 
     assert members("api-ingress") == {"api"}
-    assert members("database") == {"api", "worker", "scheduler", "migrate", "backup"}
-    assert members("broker") == {"api", "worker", "scheduler"}
-    assert members("outside") == {"api", "worker"}
-    assert [name for name, spec in policies.items() if spec.get("ingress")] == ["api-ingress"]
+    assert members("database") == {"api", "worker", "migrate", "backup"}
+    assert members("broker") == {"api", "worker"}
+    assert members("outside") == {"api", "worker", "backup"}
+    assert [name for name, spec in policies.items() if spec.get("ingress")] == [
+        "database-servers",
+        "api-ingress",
+    ]
 
 
 def test_the_backup_cannot_change_the_archive() -> None:

@@ -73,7 +73,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
         ("server api:8042 ", f"server 127.0.0.1:{upstream} "),
         ("server api2:8042 ", f"server 127.0.0.1:{upstream} "),
         ("listen 8443 ssl;", f"listen 127.0.0.1:{port} ssl;"),
-        ("/run/secrets/", f"{secrets}/"),
+        ("/run/tls/", f"{secrets}/tls/"),
         ("error_log /dev/stderr", f"error_log {folder}/error.log"),
     ):
         assert old in text
@@ -94,7 +94,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
             stdout=out,
             stderr=out,
         )
-    made = Proxied(f"localhost:{port}", folder, secrets / "tls_certificate", token)
+    made = Proxied(f"localhost:{port}", folder, secrets / "tls/certificate", token)
 
     def answers() -> bool:
         with made.client() as client:
@@ -193,3 +193,31 @@ def test_a_flood_of_one_address_is_limited_before_the_service(proxied: Proxied, 
     statuses = [answer.status_code for answer in answers]
     assert statuses == [401] * 6 + [429] * 6
     assert all(answer.headers["strict-transport-security"] for answer in answers)
+
+
+def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connected(
+    proxied: Proxied, tmp_path: Path
+) -> None:
+    tls = proxied.certificate.parent
+    before = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
+    assert before.strip() == proxied.certificate.read_text().strip()
+    context = ssl.create_default_context(cafile=str(proxied.certificate))
+    headers = {"Authorization": f"Bearer {proxied.token}"}
+    with connect(f"wss://{proxied.host}/api/v1/live", ssl=context, additional_headers=headers) as opened:
+        environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
+        script = str(ROOT / "deploy/secrets.sh")
+        subprocess.run(["sh", script], check=True, env=environment, capture_output=True)
+        for name in ("certificate", "key"):
+            (tmp_path / "tls" / name).replace(tls / name)
+        configuration = str(proxied.folder / "nginx.conf")
+        errors = str(proxied.folder / "error.log")
+        subprocess.run(["nginx", "-c", configuration, "-e", errors, "-s", "reload"], check=True)
+
+        def renewed() -> bool:
+            found = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
+            return found.strip() == proxied.certificate.read_text().strip()
+
+        wait_for(renewed, "the new certificate")
+        opened.ping().wait(10.0)
+    with proxied.client() as client:
+        assert client.get("/api/v1/session").status_code == 401

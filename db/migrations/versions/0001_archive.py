@@ -1,6 +1,6 @@
 """Create the schema of version 1.0: files, packets, decoded samples, passes, commands, windows, users, audit, builds.
 
-Databases of the eleven revisions before it cannot be migrated; `linna db export` and `linna db import` carry them over.
+Databases of the eleven revisions before it cannot be migrated; their raw files can be ingested again.
 
 Revision: 1.0, the first
 """

@@ -28,8 +28,8 @@ from ground_service.planning.progress import advance_windows
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
 from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
-from ground_service.store.database import prepare_database
 from ground_service.worker.follow_up import follow_in_process
+from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
 

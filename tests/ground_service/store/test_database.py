@@ -102,8 +102,7 @@ def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(
         with pytest.raises(DatabaseTooOld) as caught:
             prepare_database(url(tmp_path), upgrade=upgrade)
     assert f"found {revision} of a version before 1.0" in str(caught.value)
-    assert "run 'linna db export FILE'" in str(caught.value)
-    assert "'linna db import FILE'" in str(caught.value)
+    assert "into a new database with 'linna ingest'" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

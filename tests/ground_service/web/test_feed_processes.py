@@ -1,4 +1,4 @@
-"""Live feed and rate limits of several API processes: PostgreSQL holds the events, Redis carries the wake-ups."""
+"""Live feed of several API processes: PostgreSQL holds the events, Redis carries the wake-ups."""
 
 import asyncio
 import shutil
@@ -144,18 +144,6 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
         assert {21.0, 22.0} <= {one["mean"] for one in history["buckets"]}
     finally:
         station.close()
-
-
-def test_two_processes_share_rate_limits_and_have_their_own_without_redis(
-    tmp_path: Path, server_url: str
-) -> None:
-    with ManyApis(tmp_path, server_url, count=2, LINNA_RATE_LIMIT_PER_S="0.001") as processes:
-        one, two = processes.ports
-        assert ask(one, "missions")[0] == 200
-        status, _, headers = ask(two, "missions")
-        assert status == 429 and 0 < int(headers["Retry-After"]) <= 1000
-        processes.parts["broker"].kill()
-        assert [ask(two, "missions")[0] for _ in range(2)] == [200, 429]
 
 
 def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: str) -> None:

@@ -147,7 +147,7 @@ def test_a_backup_names_rows_that_were_damaged_before(filled: tuple[Ground, str]
     assert manifest["damaged"] == ["users 1: expected content that matches its digest, found changed content"]
 
 
-def test_a_backup_goes_from_either_database_into_either(
+def test_a_backup_moves_from_sqlite_to_postgresql_and_back(
     filled: tuple[Ground, str], saved: Path, tmp_path: Path, migrated_postgres: Callable[[], str]
 ) -> None:
     url = migrated_postgres()
@@ -157,5 +157,9 @@ def test_a_backup_goes_from_either_database_into_either(
         first = json.loads((saved / "backup.json").read_text())
         second = backup(other, tmp_path / "again", now_utc_ns=START)
         assert (second["tables"], second["audit_head"]) == (first["tables"], first["audit_head"])
+        with open_ground(tmp_path / "back") as back:
+            restore(tmp_path / "again", back)
+            assert everything(back) == everything(filled[0])
+            assert verify(back, deep=True).damaged == []
         add_window(other, WindowEntry("new", START, START + NS, 1.0, 76), actor="bob")
         assert verify(other, deep=True).damaged == []
