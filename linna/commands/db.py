@@ -166,8 +166,6 @@ def run_backup(arguments: argparse.Namespace) -> int:
 
     with open_service(arguments) as ground:
         manifest = backup(ground, arguments.out, now_utc_ns=utc_now_ns())
-    for line in manifest["damaged"]:
-        log(f"damaged before the backup: {line}")
     head = manifest["audit_head"]
     text = (
         f"{arguments.out}: {sum(manifest['rows'].values())} rows, {manifest['files']} files, "

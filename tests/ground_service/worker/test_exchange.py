@@ -87,7 +87,7 @@ def test_an_export_goes_into_either_database_and_back(
         assert (counts(other), hashes(other)) == (counts(ground), hashes(ground))
         assert authenticate(other, token).name == "ann"
         assert list_entries(other)[0] == list_entries(ground)[0]
-        assert verify(other, deep=True).damaged == []
+        assert verify(other, rebuild=True).damaged == []
         add_window(other, WindowEntry("new", START, START + NS, 1.0, 76), actor="bob")  # keys go on behind
         with pytest.raises(Conflict, match="expected an empty service, found"):
             import_database(other, path)
@@ -258,7 +258,7 @@ def test_a_database_before_version_1_is_carried_over(earlier: Path, tmp_path: Pa
         assert (window["edited_by"], window["decided_by"]) == ("bob", None)
         release_command(ground, 3, actor="eve")
         assert get_command(ground, 3).record.sequence_count == 2  # two had counts: the next is the third
-        assert verify(ground, deep=True).damaged == []
+        assert verify(ground, rebuild=True).damaged == []
         with open_ground(tmp_path / "fresh") as fresh:
             ingest_file(fresh, ground.files.path(next(iter(result_files(ground)))))
             assert hashes(fresh) == hashes(ground)
