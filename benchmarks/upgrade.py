@@ -45,20 +45,17 @@ from studies.mission_run.parts import Part, PostgresServer, bare_environment, fr
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("kernels", "lunar", "tmtc", "reports", "payload_emulator", "studies", "linna", "scenarios")
-REVISION = "9.9_works_with_1.0"
+REVISION = f"9.9_works_with_{known_revisions()[0]}"
 MIGRATION = f'''
 import sqlalchemy as sa
 from alembic import op
-
-from ground_service.store import row_digests
 
 revision = "{REVISION}"
 down_revision = "{{previous}}"
 
 
 def upgrade() -> None:
-    with row_digests.changed_columns(op.get_bind(), "passes"):
-        op.add_column("passes", sa.Column("remark", sa.Text(), nullable=True))
+    op.add_column("passes", sa.Column("remark", sa.Text(), nullable=True))
     op.create_index("ix_passes_remark", "passes", ["remark"])
     op.create_table("remarks", sa.Column("id", sa.Integer(), primary_key=True), sa.Column("text", sa.Text()))
 '''

@@ -60,7 +60,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "scheduler": ("scheduler", "run the recurring work of a distributed ground service"),
     "runner": ("runner", "run payload builds for the ground service, in a separate container"),
     "db": ("db", "schema, backup, export and import of the database"),
-    "verify": ("verify", "check the integrity of the archive: files, rows, packets, audit chain"),
+    "verify": ("verify", "check the integrity of the archive: files, packets, audit chain"),
     "user": ("user", "manage the users of the ground service and their tokens"),
     "completion": ("completion", "complete commands, options and scenario names in a shell"),
     "audit": ("audit", "list the audit log, and show the head of its hash chain"),

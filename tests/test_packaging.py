@@ -91,6 +91,7 @@ def test_the_wheel_holds_scenarios_models_templates_and_migrations(built: Path) 
         "payload_emulator/flight/models/craters.onnx",
         "reports/pdf_pages.typ",
         "db/migrations/env.py",
+        "db/migrations/schema_1.0.json",
     } <= names
     assert {"ground_service/web/static/site.css", "ground_service/web/templates/pass.html"} <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]

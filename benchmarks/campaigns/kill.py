@@ -112,7 +112,7 @@ def commands_of(ground: Ground, ledger: Ledger) -> tuple[int, Counter[str]]:
         faults["chain_broken"] = sum(1 for _ in audit.broken_entries(connection))
         for number, sha256 in set(ledger.heads):
             faults["heads_lost"] += number > 0 and audit.read_entry_sha256(connection, number) != sha256
-    damage = verify(ground).damaged
+    damage = verify(ground, rebuild=True).damaged
     for one in damage[:5]:
         print(f"damaged: {one}", file=sys.stderr, flush=True)
     faults["rows_damaged"] = len(damage)

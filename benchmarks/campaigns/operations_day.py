@@ -261,7 +261,7 @@ def look_at_audit(desk: Transcript, ground: Ground) -> dict[str, Any]:
     entries, total = page.items, page.total
     for (action, actor), count in sorted(Counter((one.action, one.actor) for one in entries).items()):
         desk.say(f"# audit: {actor} {action} {count}")
-    result = verify(ground)
+    result = verify(ground, rebuild=True)
     desk.say(f"# verify: {result.verdict}, audit head {result.audit_head}")
     return {"audit_entries": total, "verify": result.verdict}
 

@@ -1,14 +1,11 @@
-"""Alembic environment: migrations on the connection of the program, followed by installation of the triggers.
-
-The triggers depend on the tables of this version, so they are recreated after every migration.
-"""
+"""Alembic environment: migrations on the connection of the program, then the triggers of the audit log."""
 
 from __future__ import annotations
 
 from alembic import context
-from sqlalchemy import Connection
+from sqlalchemy import Connection, inspect
 
-from ground_service.store.database import install_triggers
+from ground_service.store.audit import install_guards
 from ground_service.store.models import METADATA
 
 
@@ -34,7 +31,8 @@ def _migrate(connection: Connection) -> None:
         transaction_per_migration=False,
     )
     context.run_migrations()
-    install_triggers(connection)
+    if inspect(connection).has_table("audit"):
+        install_guards(connection)
 
 
 run()

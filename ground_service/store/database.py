@@ -40,7 +40,7 @@ from ground_service.errors import (
     StorageReadOnly,
     storage_error,
 )
-from ground_service.store import audit, events, row_digests
+from ground_service.store import audit, events
 from ground_service.store.files import make_durable_folder
 
 if TYPE_CHECKING:
@@ -139,8 +139,6 @@ class Database:
         """
         with self._translated(), self.engine.connect() as connection:
             connection.execution_options(**{audit.PENDING: [], events.PENDING: []}, linna_write=True)
-            if self.dialect == "sqlite":
-                self._prepare_writer(connection)
             with connection.begin():
                 yield connection
                 audit.append_pending(connection)
@@ -177,13 +175,6 @@ class Database:
                 if held and not connection.invalidated:
                     with contextlib.suppress(SQLAlchemyError):
                         connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": key})
-
-    def _prepare_writer(self, connection: Connection) -> None:
-        driver: Any = connection.connection.driver_connection
-        try:
-            row_digests.prepare_sqlite(driver)
-        except sqlite3.Error as error:
-            raise DatabaseUnavailable(self.label, str(error).splitlines()[0]) from error
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
@@ -312,13 +303,6 @@ def empty_database(database: Database) -> None:
     _migrate(database, "downgrade", "base")
 
 
-def install_triggers(connection: Connection) -> None:
-    """Install the triggers of this version; without the tables they belong to, do nothing."""
-    if inspect(connection).has_table("audit"):
-        audit.install_guards(connection)
-        row_digests.install(connection)
-
-
 def migrations_folder() -> Path:
     """Return the folder of the migration scripts, next to the packages of this project."""
     return Path(ground_service.__file__).resolve().parent.parent / "db" / "migrations"
@@ -415,9 +399,8 @@ def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
 
 
 def _prepare_postgresql(connection: Any, _record: object) -> None:
-    """Mark the session as one of this program, and request durable commits."""
+    """Request durable commits."""
     with connection.cursor() as cursor:
-        cursor.execute(f"SET {row_digests.WRITER_SETTING} = 'on'")
         cursor.execute("SHOW synchronous_commit")
         if cursor.fetchone()[0] not in SAFE_COMMITS:
             cursor.execute("SET synchronous_commit = on")

@@ -688,17 +688,6 @@ AUDIT_HEAD = Table(
 """Number and hash of the newest audit entry: one row, locked while entries are appended."""
 
 
-ROW_DIGESTS = Table(
-    "row_digests",
-    METADATA,
-    key("table_name", String(64)),
-    key("row_key", Text),
-    column("sha256", String(64)),
-    **CLUSTERED,
-)
-"""SHA-256 of a row as the program wrote it, kept by triggers (see `store.row_digests`)."""
-
-
 EVENT_LOG = Table(
     "event_log",
     METADATA,

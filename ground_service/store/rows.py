@@ -13,15 +13,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import JSON, Connection, Float, LargeBinary, String, collate, insert, select, text
+from sqlalchemy import JSON, Connection, Float, LargeBinary, MetaData, String, collate, insert, select, text
 from sqlalchemy import Table as Table
 
 from ground_service.store import models
 
 BLOCK_ROWS = 5000
 
-KEPT_BY_THE_PROGRAM = frozenset({"row_digests", "leases"})
-"""Tables filled by triggers, and the state of running processes, which are not copied."""
+KEPT_BY_THE_PROGRAM = frozenset({"leases", "alembic_version", "row_digests"})
+"""Tables with the state of running processes and of the schema, which are not copied; the last is of version 1.0."""
 
 MADE_WITH_THE_SCHEMA = frozenset({"audit_head"})
 """Tables with rows in an empty database; a copy replaces these rows."""
@@ -79,8 +79,10 @@ def table_lines(connection: Connection, table: Table) -> Iterator[bytes]:
 
 
 def table_digests(connection: Connection) -> dict[str, TableDigest]:
-    """Return the digest of every copied table."""
-    return {table.name: lines_digest(table_lines(connection, table)) for table in copied_tables()}
+    """Return the digest of every copied table, of any revision of the schema."""
+    stored = MetaData()
+    stored.reflect(connection, only=lambda name, _: name not in KEPT_BY_THE_PROGRAM)
+    return {table.name: lines_digest(table_lines(connection, table)) for table in stored.sorted_tables}
 
 
 def first_filled_table(connection: Connection) -> str | None:

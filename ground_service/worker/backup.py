@@ -10,9 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from sqlalchemy import Connection
 
 from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
-from ground_service.store import audit, row_digests, rows
-from ground_service.store.database import Database, prepare_database, schema_revisions
+from ground_service.store import audit, rows
+from ground_service.store.database import Database, open_database, prepare_database, schema_revisions
 from ground_service.store.files import (
     FileArchive,
     StoredFile,
@@ -36,14 +37,10 @@ SCHEMA_VERSION = 2
 MANIFEST = "backup.json"
 DATABASE = "linna.db"
 FILES = "files"
-DAMAGE_LISTED = 20
 
 
 def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
     """Write a backup into a new folder; return its manifest.
-
-    `damaged` in the manifest lists rows of the service that do not match their digests; the backup contains them
-    unchanged.
 
     Raises
     ------
@@ -60,10 +57,6 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
         copy = prepare_database(f"sqlite:///{partial / DATABASE}")
         try:
             with ground.database.snapshot() as connection:
-                damaged = [
-                    f"{one.table} {one.key}: {one.reason}"
-                    for one in islice(_strays(connection), DAMAGE_LISTED)
-                ]
                 _copy_rows(connection, copy)
             with copy.reading() as connection:
                 tables = rows.table_digests(connection)
@@ -84,7 +77,6 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
             "files_sha256": _list_sha256(names),
             "octets": octets,
             "audit_head": asdict(head) if head is not None else None,
-            "damaged": damaged,
         }
         (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         if out.exists():
@@ -98,7 +90,7 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
 
 
 def restore(folder: Path, ground: Ground) -> dict[str, Any]:
-    """Restore a verified backup into an empty service; return its manifest.
+    """Restore a verified backup, also of an earlier revision, into an empty service; return its manifest.
 
     Raises
     ------
@@ -114,10 +106,8 @@ def restore(folder: Path, ground: Ground) -> dict[str, Any]:
         filled = rows.first_filled_table(connection)
     if filled is not None:
         raise Conflict(f"{ground.database.label}: expected an empty service, found rows in {filled}")
-    source = prepare_database(f"sqlite:///{folder / DATABASE}", upgrade=False)
     try:
-        with source.snapshot() as connection:
-            _check_rows(folder, connection, manifest)
+        with _upgraded(folder, manifest) as source, source.snapshot() as connection:
             names = file_names(connection)
             for sha256 in names:
                 _check_file(FileArchive(folder / FILES), sha256)
@@ -126,9 +116,28 @@ def restore(folder: Path, ground: Ground) -> dict[str, Any]:
             _copy_rows(connection, ground.database)
     except OSError as error:
         raise storage_error(error, ground.home) from None
-    finally:
-        source.engine.dispose()
     return manifest
+
+
+@contextmanager
+def _upgraded(folder: Path, manifest: dict[str, Any]) -> Iterator[Database]:
+    """Yield the verified database of a backup; one of an earlier revision is upgraded in a copy."""
+    url = f"sqlite:///{folder / DATABASE}"
+    with tempfile.TemporaryDirectory(prefix="linna-restore-") as scratch:
+        stored = open_database(url)
+        try:
+            found, head, _ = schema_revisions(stored)
+            with stored.snapshot() as connection:
+                _check_rows(folder, connection, manifest)
+        finally:
+            stored.engine.dispose()
+        if found != head:
+            url = f"sqlite:///{shutil.copyfile(folder / DATABASE, Path(scratch) / DATABASE)}"
+        source = prepare_database(url)
+        try:
+            yield source
+        finally:
+            source.engine.dispose()
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
@@ -149,7 +158,10 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) -> None:
     """Compare every table, the list of files and the audit chain of a backup with its manifest."""
-    for name, table in rows.table_digests(connection).items():
+    digests = rows.table_digests(connection)
+    for name in sorted(manifest["tables"].keys() - digests):
+        raise InvalidInput(str(folder / DATABASE), name, "the rows that were saved", "no such table")
+    for name, table in digests.items():
         if manifest["rows"].get(name) != table.rows:
             raise InvalidInput(
                 str(folder / DATABASE), name, f"{manifest['rows'].get(name)} rows", str(table.rows)
@@ -166,11 +178,6 @@ def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) 
         raise InvalidInput(
             str(folder / DATABASE), f"audit {broken.number}", "a complete chain", broken.reason
         )
-
-
-def _strays(connection: Connection) -> Iterator[row_digests.StrayRow]:
-    for table in row_digests.guarded_tables():
-        yield from row_digests.stray_rows(connection, table)
 
 
 def _list_sha256(names: list[str]) -> str:

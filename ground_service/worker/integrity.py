@@ -1,17 +1,17 @@
-"""Integrity check of an archive: files, rows, packets, decoded values, and the audit chain.
+"""Integrity check of an archive: raw files, packets, the audit chain and the database itself.
 
-Derived data are generated again in a scratch archive and compared by content: from the stored packets, or (`deep`) from
-the raw files, as in their first ingest. All other data have digests. The check does not detect changes by a person who
-can write to the database and computes matching digests and a matching chain; for the audit log, a head of the chain
-that was stored elsewhere detects them.
+With `rebuild`, what follows from the raw files is derived again in a scratch database and compared. Entered rows
+(users, windows, telecommands) follow from nothing and are not checked; a backup has a digest of each table. A person
+who can write to the database can forge the chain; a head of the chain that was stored elsewhere detects that.
 """
 
 from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,26 +19,28 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection
 
-from ground_service.errors import GroundError, InvalidInput
-from ground_service.ground import Ground, open_ground
-from ground_service.ingest.packets import DIGEST_OCTETS, batch_of_cut
+from ground_service.errors import GroundError
+from ground_service.ground import Ground
+from ground_service.ingest.packets import DIGEST_OCTETS
 from ground_service.ingest.parameters import decode_declared
-from ground_service.ingest.service import Place, ingest_stored
-from ground_service.ingest.store import store_batch
-from ground_service.store import audit, row_digests
-from ground_service.store.files import FileArchive, StoredFile
-from ground_service.store.vehicles import FLOWN, all_vehicles, vehicle_id
+from ground_service.ingest.service import run_ingest
+from ground_service.store import audit, events
+from ground_service.store.database import prepare_database
+from ground_service.store.files import FileArchive
+from ground_service.store.vehicles import all_vehicles
+from ground_service.timekeeping.core import utc_ns_of_ticks
+from ground_service.timekeeping.recorrelation import AUTOMATIC, recorrelate
+from ground_service.timekeeping.store import correlations_in_force, load_correlations
 from ground_service.worker import integrity_store as store
-from tmtc.dictionary import DICTIONARY
+from ground_service.worker.follow_up import CONSUMER
 from tmtc.errors import TmtcError
 from tmtc.packets import PRIMARY_HEADER_LENGTH
-from tmtc.stream import whole_packets
 
-BLOCK_PACKETS = 20_000
 LIMIT_OF_A_KIND = 200
 """Largest number of listed damages of each kind; the rest is only counted."""
 
-INGESTED = ("done", "failed")
+SAME_TIME_NS = 1000
+"""Difference of two time correlations that rounding can cause; the on-board clock counts steps of 15,259 ns."""
 
 Say = Callable[[str], None]
 
@@ -76,8 +78,8 @@ class _Findings:
     def count(self, kind: str, number: int = 1) -> None:
         self.checked[kind] = self.checked.get(kind, 0) + number
 
-    def skip(self, reason: str, number: int = 1) -> None:
-        self.unchecked[reason] = self.unchecked.get(reason, 0) + number
+    def skip(self, reason: str) -> None:
+        self.unchecked[reason] = self.unchecked.get(reason, 0) + 1
 
     def damage(self, kind: str, key: object, reason: str) -> None:
         self.counts[kind] = self.counts.get(kind, 0) + 1
@@ -86,39 +88,31 @@ class _Findings:
 
 
 def verify(
-    ground: Ground, *, deep: bool = False, expected_head: audit.Head | None = None, say: Say | None = None
+    ground: Ground, *, rebuild: bool = False, expected_head: audit.Head | None = None, say: Say | None = None
 ) -> Verification:
     """Check the integrity of an archive, in one snapshot of the database, without changes.
 
     Parameters
     ----------
-    deep
-        Ingest all raw files again into a scratch archive and compare; otherwise decode the stored packets again.
+    rebuild
+        Ingest all raw files again into a scratch database and compare what is derived from them.
     expected_head
         Head of the audit chain that was stored elsewhere: its entry must be in the chain.
     """
     found = _Findings()
     tell = say or (lambda _text: None)
     with ground.database.snapshot() as connection:
-        tell("schema and rows")
-        _check_schema(connection, found)
-        _check_rows(connection, found)
+        tell("database")
+        _check_database(connection, found)
         tell("audit chain")
         head = _check_audit(connection, expected_head, found)
         tell("files")
         good = _check_files(connection, ground.files, found)
-        tell("raw files ingested again" if deep else "packets decoded again")
-        with _scratch(ground) as scratch:
-            with scratch.database.writing() as writing:
-                store.copy_missions(connection, writing)
-            if deep:
-                _ingest_again(connection, ground, scratch, good, found)
-            else:
-                _decode_again(connection, scratch, found)
-            _decode_declared_again(scratch, found)
-            tell("packets and values")
-            with scratch.database.reading() as made:
-                _compare(connection, made, found)
+        tell("packets")
+        _check_packets(connection, found)
+        if rebuild:
+            tell("derivation from the raw files")
+            _rebuild(connection, ground, good, found)
     total = sum(found.counts.values())
     return Verification(
         checked=dict(sorted(found.checked.items())),
@@ -130,27 +124,13 @@ def verify(
     )
 
 
-# Rows, chain, files
-
-
-def _check_schema(connection: Connection, found: _Findings) -> None:
+def _check_database(connection: Connection, found: _Findings) -> None:
     for name in audit.missing_guards(connection):
         found.damage("schema", name, "expected this trigger of the audit table, found none")
-    for name in row_digests.missing_triggers(connection):
-        found.damage("schema", name, "expected the trigger of row digests, found none")
     for line in store.database_faults(connection):
         found.damage("schema", "linna.db", line)
     for table, key, parent in store.dangling_references(connection):
         found.damage(table, key, f"expected the row of {parent} that it names, found none")
-
-
-def _check_rows(connection: Connection, found: _Findings) -> None:
-    for table in row_digests.guarded_tables():
-        found.count(table.name, store.count_rows(connection, table))
-        for stray in row_digests.stray_rows(connection, table):
-            found.damage(stray.table, stray.key, stray.reason)
-    for stray in row_digests.unknown_digests(connection):
-        found.damage(stray.table, stray.key, stray.reason)
 
 
 def _check_audit(connection: Connection, expected: audit.Head | None, found: _Findings) -> audit.Head | None:
@@ -197,222 +177,111 @@ def _sha256(blocks: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
+def _check_packets(connection: Connection, found: _Findings) -> None:
+    for key, digest, octets in store.packets(connection):
+        found.count("packets")
+        if hashlib.blake2b(octets, digest_size=DIGEST_OCTETS).digest() != digest:
+            found.damage("packets", key, "expected octets that match its digest, found other octets")
+        elif PRIMARY_HEADER_LENGTH + 1 + int.from_bytes(octets[4:6], "big") != len(octets):
+            found.damage("packets", key, "expected the length of its header, found another")
+
+
 # What is derived
+
+
+def _rebuild(connection: Connection, ground: Ground, good: set[str], found: _Findings) -> None:
+    if found.counts.keys() - {"files", "packets", "audit"}:
+        found.skip("derived rows, because the database is damaged")
+        return
+    with _scratch(ground) as scratch:
+        with scratch.database.writing() as writing:
+            store.copy_entered(connection, writing)
+        for one in store.ingests(connection):
+            ground.check_stopping()
+            if one.state not in ("done", "failed"):
+                found.skip("unfinished ingests")
+            elif not one.has_piece:
+                found.damage("ingests", one.id, "expected the row of its piece, found none")
+            elif one.sha256 in good:
+                found.count("raw files ingested again")
+                try:
+                    run_ingest(scratch, one.id)
+                except (GroundError, TmtcError) as error:
+                    if one.state == "done":
+                        reason = f"expected a file that can be ingested, found: {error}"
+                        found.damage("ingests", one.id, reason)
+        for vehicle in all_vehicles(connection):
+            try:
+                decode_declared(scratch, vehicle.id)
+            except (GroundError, TmtcError) as error:
+                reason = f"expected a usable mission description, found: {error}"
+                found.damage("missions", f"spacecraft {vehicle.ccsds_id}", reason)
+            _compare_times(connection, scratch, vehicle.id, found)
+        with scratch.database.reading() as made:
+            excuse = store.excuses(connection, made)
+            for table in store.DERIVED:
+                stored, derived = store.rows(connection, table), store.rows(made, table)
+                _compare_rows(table, stored, derived, excuse, found)
 
 
 @contextmanager
 def _scratch(ground: Ground) -> Iterator[Ground]:
-    with (
-        tempfile.TemporaryDirectory(prefix="linna-verify-") as folder,
-        open_ground(Path(folder), ground.data) as scratch,
-    ):
-        yield scratch
+    """Yield a ground with an empty database and the files of the archive, which are only read."""
+    with tempfile.TemporaryDirectory(prefix="linna-verify-") as folder:
+        database = prepare_database(f"sqlite:///{folder}/linna.db")
+        try:
+            yield replace(ground, database=database, home=Path(folder))
+        finally:
+            database.engine.dispose()
 
 
-def _decode_declared_again(scratch: Ground, found: _Findings) -> None:
-    """Decode the declared packets of every vehicle of the scratch archive with the newest mission description."""
+def _compare_times(connection: Connection, scratch: Ground, vehicle: int, found: _Findings) -> None:
+    """Fit the time correlations of a vehicle again and compare the times that they give."""
+    if any(one.method != AUTOMATIC for one in correlations_in_force(connection, vehicle)):
+        found.skip("vehicles with time correlations that a person entered")
+        return
+    if events.position_of(connection, CONSUMER) < events.last_number(connection):
+        found.skip("vehicles with follow-up work that is not done")
+        return
+    recorrelate(scratch, vehicle)
+    stored = load_correlations(connection, vehicle)
     with scratch.database.reading() as made:
-        vehicles = all_vehicles(made)
-    for vehicle in vehicles:
-        try:
-            decode_declared(scratch, vehicle.id)
-        except (GroundError, TmtcError) as error:
-            found.damage(
-                "missions",
-                f"spacecraft {vehicle.ccsds_id}",
-                f"expected a usable mission description, found: {error}",
-            )
-
-
-def _ingest_again(
-    connection: Connection, ground: Ground, scratch: Ground, good: set[str], found: _Findings
-) -> None:
-    """Ingest every raw file into the scratch archive, as in its first ingest."""
-    seen = set()
-    for one in store.recorded_ingests(connection):
-        ground.check_stopping()
-        place = Place(one.stream, one.position) if one.stream and one.position is not None else None
-        key = (one.sha256, one.ccsds_id, one.instance, one.spacecraft_id, place, one.station or "", one.link)
-        if one.state not in INGESTED:
-            found.skip("unfinished ingests")
-            continue
-        if key in seen or one.sha256 not in good:
-            continue
-        seen.add(key)
-        found.count("raw files ingested again")
-        source = ground.files.path(one.sha256)
-        linked = scratch.files.path(one.sha256)
-        linked.parent.mkdir(parents=True, exist_ok=True)
-        if not linked.exists():
-            linked.symlink_to(source)
-        try:
-            _ingest_one(scratch, StoredFile(one.sha256, one.octets, linked), one, place)
-        except (GroundError, TmtcError) as error:
-            if one.state == "done":
-                found.damage("ingests", one.id, f"expected a file that can be ingested, found: {error}")
-
-
-def _ingest_one(scratch: Ground, stored: StoredFile, one: store.RecordedIngest, place: Place | None) -> None:
-    instance = one.scope or one.instance or FLOWN
-    spacecraft = one.spacecraft_id
-    if one.scope is None and one.ccsds_id is not None:
-        # an ingest older than the record of pieces: the statements of its sender are not known
-        try:
-            ingest_stored(scratch, stored, name=one.name, instance=instance)
-            return
-        except GroundError:
-            spacecraft = one.ccsds_id  # bare packets carry no spacecraft id
-    ingest_stored(
-        scratch,
-        stored,
-        name=one.name,
-        spacecraft_id=spacecraft,
-        instance=instance,
-        place=place,
-        station=one.station or "",
-        link=one.link,
-    )
-
-
-def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> None:
-    """Store the packets of this archive in the scratch archive, as in their first ingest."""
-    for vehicle in all_vehicles(connection):
-        try:
-            with scratch.database.writing() as writing:
-                copy = vehicle_id(writing, vehicle.ccsds_id, vehicle.instance)
-        except InvalidInput as error:
-            found.damage("vehicles", vehicle.id, str(error))
-            continue
-        for block in store.packet_blocks(connection, vehicle.id, BLOCK_PACKETS):
-            whole = [octets for key, digest, octets in block if _whole(key, digest, octets, found)]
-            buffer = b"".join(whole)
-            cut = whole_packets(np.array([len(octets) for octets in whole], dtype=np.int64))
-            batch = batch_of_cut(buffer, cut, DICTIONARY, vehicle.ccsds_id)
-            with scratch.database.writing() as writing:
-                store_batch(writing, copy, batch)
-
-
-def _whole(key: int, digest: bytes, octets: bytes, found: _Findings) -> bool:
-    """Return whether a stored packet matches its digest and the length in its header."""
-    if hashlib.blake2b(octets, digest_size=DIGEST_OCTETS).digest() != digest:
-        found.damage("packets", key, "expected octets that match its digest, found other octets")
-        return False
-    if len(octets) <= PRIMARY_HEADER_LENGTH or len(octets) != PRIMARY_HEADER_LENGTH + 1 + int.from_bytes(
-        octets[4:6], "big"
-    ):
-        found.damage("packets", key, "expected the length of its header, found another")
-        return False
-    return True
-
-
-def _compare(connection: Connection, made: Connection, found: _Findings) -> None:
-    """Compare packets and values with those of the scratch archive."""
-    copies = {(one.ccsds_id, one.instance): one.id for one in all_vehicles(made)}
-    vehicles = all_vehicles(connection)
-    for vehicle in vehicles:
-        copy = copies.get((vehicle.ccsds_id, vehicle.instance), 0)
-        _compare_rows("packets", store.packets(connection, vehicle.id), store.packets(made, copy), found)
-        _compare_parameters(connection, made, vehicle.id, copy, found)
-        if vehicle.decoded_version not in (None, DICTIONARY.version):
-            found.skip("vehicles not yet decoded with this dictionary")
-            continue
-        for name, table in store.SAMPLES.items():
-            _check_packets_of(connection, table, vehicle.id, found)
-            _compare_rows(
-                name, store.values(connection, table, vehicle.id), store.values(made, table, copy), found
-            )
-    for table in store.DERIVED:
-        name = table.name
-        for unknown, count in store.rows_of_others(connection, table, [one.id for one in vehicles]):
-            found.damage(name, f"vehicle {unknown}", f"expected no rows of an unknown vehicle, found {count}")
-        for version, count in store.rows_of_other_versions(connection, table):
-            if version > DICTIONARY.version:
-                found.damage(
-                    name, f"dictionary version {version}", f"expected no newer version, found {count} rows"
-                )
-            else:
-                found.skip(f"values decoded with dictionary version {version}", count)
-
-
-def _compare_parameters(
-    connection: Connection, made: Connection, vehicle: int, copy: int, found: _Findings
-) -> None:
-    """Compare the values of declared packets of a vehicle with those of the scratch archive.
-
-    The scratch archive decodes with the newest mission description only. Its definitions have other numbers, so
-    definitions are compared by digest.
-    """
-    name = store.PARAMETER_SAMPLES.name
-    _check_packets_of(connection, store.PARAMETER_SAMPLES, vehicle, found)
-    digests, decoded_to = store.definition_digests(connection), store.decoded_to(connection, vehicle)
-    made_digests, newest = store.definition_digests(made), store.decoded_to(made, copy)
-    counts = store.values_by_definition(connection, vehicle)
-    numbers = {digest: definition for definition, digest in digests.items()}
-    compared = {numbers.get(made_digests[definition], 0): definition for definition in newest}
-    for definition, count in counts.items():
-        if definition in compared:
-            continue
-        if definition in digests and definition in decoded_to:
-            found.skip("values decoded with an earlier mission description", count)
-        else:
-            found.damage(
-                name,
-                f"vehicle {vehicle}, definition {definition}",
-                f"expected no rows of an unknown definition, found {count}",
-            )
-    for stored, definition in compared.items():
-        pending: set[bytes] | None = set()
-        if stored in decoded_to:
-            pending = store.pending_packets(connection, vehicle, decoded_to[stored])
-        elif stored not in counts:  # not begun
-            pending = None
-        _compare_rows(
-            name,
-            store.parameter_values(connection, vehicle, stored),
-            store.parameter_values(made, copy, definition),
-            found,
-            pending=pending,
-        )
-
-
-def _check_packets_of(connection: Connection, table: store.Table, vehicle: int, found: _Findings) -> None:
-    """Report packets referenced by values that are missing or have another number."""
-    for packet, count in store.missing_packets(connection, table, vehicle):
-        found.damage("packets", packet, f"expected the packet of {count} rows of {table.name}, found none")
+        derived = load_correlations(made, vehicle)
+    found.count("correlations", len(stored))
+    ends = [end for one in (*stored, *derived) for end in (one.start_ticks, one.stop_ticks)]
+    ticks = np.array(ends, dtype=np.int64)
+    difference = utc_ns_of_ticks(ticks, stored)[0] - utc_ns_of_ticks(ticks, derived)[0]
+    if len(stored) != len(derived) or (np.abs(difference) > SAME_TIME_NS).any():
+        reason = f"expected {len(derived)} lines that the time reports give, found {len(stored)} that differ"
+        found.damage("correlations", f"vehicle {vehicle}", reason)
 
 
 def _compare_rows(
-    kind: str,
-    stored: store.Keyed,
-    expected: store.Keyed,
-    found: _Findings,
-    *,
-    pending: Collection[bytes] | None = (),
+    table: store.Table, stored: store.Rows, derived: store.Rows, excuse: store.Excuse, found: _Findings
 ) -> None:
-    """Merge two lists in the order of their keys and report their differences.
-
-    Rows of `pending` packets (digest, the second value of a key; None: of all packets) may be missing.
-    """
-    mine, other = next(stored, None), next(expected, None)
+    """Merge two lists in the order of their keys and report their differences."""
+    count = 0
+    mine, other = next(stored, None), next(derived, None)
     while mine is not None or other is not None:
-        if mine is None or (other is not None and other[0] < mine[0]):
-            assert other is not None
-            if pending is None or other[0][1] in pending:
-                found.skip(f"packets not yet decoded to rows of {kind}")
+        key = min(one[0] for one in (mine, other) if one is not None)
+        here = mine if mine is not None and mine[0] == key else None
+        there = other if other is not None and other[0] == key else None
+        count += here is not None
+        if not store.same_values(table, here, there):
+            reason = excuse(table, key, here is not None, there is not None)
+            if reason is not None:
+                found.skip(f"rows of {table.name} {reason}")
+            elif here is None:
+                found.damage(table.name, _words(key), "expected this row, found none")
+            elif there is None:
+                found.damage(
+                    table.name, _words(key), "expected no such row, found one that the raw data do not give"
+                )
             else:
-                found.damage(kind, _words(other[0]), "expected this row, found none")
-            other = next(expected, None)
-            continue
-        found.count(kind)
-        if other is None or mine[0] < other[0]:
-            found.damage(
-                kind, _words(mine[0]), "expected no such row, found one that the raw data do not give"
-            )
-            mine = next(stored, None)
-            continue
-        if mine[1] != other[1]:
-            found.damage(kind, _words(mine[0]), "expected the values of its packet, found others")
-        mine, other = next(stored, None), next(expected, None)
+                found.damage(table.name, _words(key), "expected the values of its packets, found others")
+        mine = next(stored, None) if here is not None else mine
+        other = next(derived, None) if there is not None else other
+    found.checked[table.name] = count
 
 
 def _words(key: tuple[Any, ...]) -> str:

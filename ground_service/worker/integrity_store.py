@@ -1,49 +1,50 @@
-"""SQL of the integrity check: stored and derived rows in the order of keys that do not depend on row numbers."""
+"""SQL of the integrity check: derived rows in the order of keys that do not depend on row numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator
+from itertools import groupby
+from typing import Any, NamedTuple
 
-from sqlalchemy import Connection, and_, func, insert, select, text
+import numpy as np
+from sqlalchemy import Connection, and_, func, select, text
 from sqlalchemy import Table as Table
 
-from ground_service.errors import InvalidInput
-from ground_service.store import repository
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store import models
+from ground_service.store.rollups import PARAMETERS_CODE
+from ground_service.store.rows import insert_rows, row_blocks
 from tmtc.dictionary import DICTIONARY
 
-SAMPLES = repository.SAMPLES
-PARAMETER_SAMPLES = repository.PARAMETER_SAMPLES
-DERIVED = (repository.PACKETS, PARAMETER_SAMPLES, *SAMPLES.values())
+DERIVED = (models.PACKETS, models.PARAMETER_SAMPLES, *models.SAMPLE_TABLES, models.ROLLUPS)
 """Tables whose rows follow from the raw files."""
 
+ENTERED = (
+    models.FILES, models.VEHICLES, models.INGESTS, models.PIECES, models.MISSIONS, models.EPHEMERIDES,
+    models.PASSES, models.RECEPTIONS, models.PACKET_DEFINITIONS,
+)  # fmt: skip
+"""Tables that decide what follows from the raw files."""
+
 FETCHED_ROWS = 20_000
-_PACKETS = repository.PACKETS
+ROUNDING = 1e-9
+"""Relative difference of two sums of the same numbers in another order."""
 
-Keyed = Iterator[tuple[tuple[Any, ...], tuple[Any, ...]]]
-"""Rows as keys and other values, in the order of the keys."""
+_PACKETS: Any = models.PACKETS
+
+Row = tuple[tuple[Any, ...], tuple[Any, ...]]
+Rows = Iterator[Row]
+"""Keys and other values, in the order of the keys."""
+
+Excuse = Callable[[Table, tuple[Any, ...], bool, bool], str | None]
+"""Reason why a row of this key, stored or not and derived or not, may differ; None: it may not."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedIngest:
-    """Ingest with its file, its vehicle, and the statements of the sender; None: not recorded."""
+class RecordedIngest(NamedTuple):
+    """Ingest as recorded."""
 
     id: int
     sha256: str
     state: str
-    ccsds_id: int | None
-    instance: str | None
-    name: str
-    octets: int
-    scope: str | None
-    spacecraft_id: int | None
-    stream: str | None
-    position: int | None
-    station: str | None
-    link: str | None
+    has_piece: bool
 
 
 def database_faults(connection: Connection) -> list[str]:
@@ -54,200 +55,126 @@ def database_faults(connection: Connection) -> list[str]:
     return [str(line) for line in lines if line != "ok"]
 
 
-def dangling_references(connection: Connection) -> list[tuple[str, Any, str]]:
-    """Return table, row number and referenced table of foreign keys without a row; PostgreSQL permits none."""
-    if connection.dialect.name != "sqlite":
-        return []
-    return [
-        (str(row[0]), row[1], str(row[2])) for row in connection.execute(text("PRAGMA foreign_key_check"))
-    ]
-
-
-def count_rows(connection: Connection, table: Table) -> int:
-    """Return the number of rows of a table."""
-    return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
+def dangling_references(connection: Connection) -> Iterator[tuple[str, Any, str]]:
+    """Yield table, key and referenced table of foreign keys without a row."""
+    for table in models.METADATA.sorted_tables:
+        for reference in table.foreign_keys:
+            parent = reference.column.table
+            other = parent.alias()
+            found = other.c[reference.column.name]
+            query = (
+                select(*table.primary_key)
+                .outerjoin_from(table, other, found == reference.parent)
+                .where(reference.parent.is_not(None), found.is_(None))
+            )
+            for key in connection.execute(query):
+                yield table.name, " ".join(map(str, key)), parent.name
 
 
 def files(connection: Connection) -> list[tuple[str, int]]:
     """Return hash and octets of the files of the archive."""
-    table = repository.FILES
+    table = models.FILES
     rows = connection.execute(select(table.c.sha256, table.c.octets).order_by(table.c.sha256))
     return [(sha256, int(octets)) for sha256, octets in rows]
 
 
-def copy_missions(connection: Connection, writing: Connection) -> None:
-    """Copy the mission descriptions to a scratch archive: they declare links and packets.
-
-    The passes of archives are copied, too: the descriptions of archives hold for the instances of these passes.
-    """
-    missions, passes, vehicles = repository.MISSIONS, repository.PASSES, repository.VEHICLES
-    rows = connection.execute(select(missions)).mappings().all()
-    if rows:
-        writing.execute(insert(missions), [dict(row) for row in rows])
-    query = (
-        select(passes, vehicles.c.ccsds_id, vehicles.c.instance)
-        .join(vehicles, vehicles.c.id == passes.c.vehicle_id)
-        .where(passes.c.archive_digest.is_not(None), passes.c.mission_id.in_(select(missions.c.id)))
-        .order_by(passes.c.id)
-    )
-    for row in connection.execute(query).mappings().all():
-        kept = {column.name: row[column] for column in passes.c if not column.name.endswith("_sha256")}
-        with suppress(InvalidInput):  # a vehicle that is not valid is reported when its packets are decoded
-            vehicle = vehicle_id(writing, row["ccsds_id"], row["instance"])
-            kept |= {"vehicle_id": vehicle, "ephemeris_id": None}
-            writing.execute(insert(passes).values(kept))
+def packets(connection: Connection) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield id, digest and octets of all packets."""
+    query = select(_PACKETS.c.id, _PACKETS.c.digest, _PACKETS.c.octets)
+    for key, digest, octets in connection.execution_options(yield_per=FETCHED_ROWS).execute(query):
+        yield int(key), bytes(digest), bytes(octets)
 
 
-def recorded_ingests(connection: Connection) -> list[RecordedIngest]:
+def ingests(connection: Connection) -> list[RecordedIngest]:
     """Return all ingests, oldest first."""
-    ingests, vehicles, stored, pieces = (
-        repository.INGESTS,
-        repository.VEHICLES,
-        repository.FILES,
-        repository.PIECES,
-    )
+    table, pieces = models.INGESTS, models.PIECES
     query = (
-        select(
-            ingests.c.id,
-            ingests.c.file_sha256.label("sha256"),
-            ingests.c.state,
-            vehicles.c.ccsds_id,
-            vehicles.c.instance,
-            func.coalesce(stored.c.name, "").label("name"),
-            func.coalesce(stored.c.octets, 0).label("octets"),
-            pieces.c.scope,
-            pieces.c.spacecraft_id,
-            pieces.c.stream,
-            pieces.c.position,
-            pieces.c.station,
-            pieces.c.link,
+        select(table.c.id, table.c.file_sha256, table.c.state, pieces.c.ingest_id.is_not(None))
+        .outerjoin(pieces, pieces.c.ingest_id == table.c.id)
+        .order_by(table.c.id)
+    )
+    return [RecordedIngest(*row) for row in connection.execute(query)]
+
+
+def copy_entered(connection: Connection, writing: Connection) -> None:
+    """Copy the rows that decide what follows from the raw files, with their keys, to an empty database."""
+    for table in models.METADATA.sorted_tables:
+        if table in ENTERED:
+            insert_rows(writing, table, row_blocks(connection, table))
+    fresh = ("decoded_version", "redecoding_version", "redecoded_to", "redecode_until")
+    writing.execute(models.VEHICLES.update().values(dict.fromkeys(fresh)))
+    counts = dict.fromkeys(("packets_stored", "packets_joined", "samples_stored"), 0)
+    writing.execute(models.PIECES.update().values(links_tried=None, **counts))
+
+
+def rows(connection: Connection, table: Table) -> Rows:
+    """Return the rows of a derived table; the digest of its packet stands for the number of a packet."""
+    if table is _PACKETS:
+        key = [table.c[name] for name in ("vehicle_id", "apid", "ticks", "sequence_count", "digest")]
+        query = select(*key, table.c.octets).order_by(*key)
+    elif "packet_id" in table.c:
+        key = [one for one in table.primary_key if one.name != "packet_id"]
+        others = [one for one in table.c if not one.primary_key]
+        same = and_(_PACKETS.c.id == table.c.packet_id, _PACKETS.c.vehicle_id == table.c.vehicle_id)
+        query = select(*key, _PACKETS.c.digest, *others).outerjoin(_PACKETS, same).order_by(*key)
+        key.append(_PACKETS.c.digest)
+    else:
+        key = list(table.primary_key)
+        query = select(*key, *(one for one in table.c if not one.primary_key)).order_by(*key)
+    size = len(key)
+    found = (
+        tuple(bytes(value) if isinstance(value, memoryview) else value for value in row)
+        for row in connection.execution_options(yield_per=FETCHED_ROWS).execute(query)
+    )
+    # The digest is the last part of a key: an index gives the order of the others.
+    for _, together in groupby(found, key=lambda row: row[: size - 1]):
+        keyed = (
+            ((*row[: size - 1], b"" if row[size - 1] is None else row[size - 1]), row[size:])
+            for row in together
         )
-        .outerjoin(pieces, pieces.c.ingest_id == ingests.c.id)
-        .outerjoin(vehicles, vehicles.c.id == ingests.c.vehicle_id)
-        .outerjoin(stored, stored.c.sha256 == ingests.c.file_sha256)
-        .order_by(ingests.c.id)
-    )
-    return [RecordedIngest(**row) for row in connection.execute(query).mappings()]
+        yield from sorted(keyed, key=lambda one: one[0])
 
 
-def packet_blocks(
-    connection: Connection, vehicle: int, limit: int
-) -> Iterator[list[tuple[int, bytes, bytes]]]:
-    """Yield id, digest and octets of the packets of a vehicle in blocks, in the order of their ids."""
-    last = 0
-    while True:
-        rows = connection.execute(
-            select(_PACKETS.c.id, _PACKETS.c.digest, _PACKETS.c.octets)
-            .where(_PACKETS.c.vehicle_id == vehicle, _PACKETS.c.id > last)
-            .order_by(_PACKETS.c.id)
-            .limit(limit)
-        )
-        block = [(int(key), bytes(digest), bytes(octets)) for key, digest, octets in rows]
-        if not block:
-            return
-        yield block
-        last = block[-1][0]
+def same_values(table: Table, stored: Row | None, derived: Row | None) -> bool:
+    """Return whether two rows agree; sums of roll-ups up to the order of addition."""
+    if stored is None or derived is None or table is not models.ROLLUPS:
+        return stored == derived
+    *counts, statistics = stored[1]
+    *others, expected = derived[1]
+    if counts != others or len(statistics) != len(expected):
+        return False
+    found, made = np.frombuffer(statistics, "<f8"), np.frombuffer(expected, "<f8")
+    extremes = np.abs(made.reshape(-1, 4)[:, 2:])
+    scale = np.where(np.isfinite(extremes), extremes, 0.0).max(axis=1) * made[0::4]
+    is_sum = np.arange(len(made)) % 4 == 1
+    close = np.abs(found[1::4] - made[1::4]) <= ROUNDING * scale
+    return bool(close.all()) and found[~is_sum].tobytes() == made[~is_sum].tobytes()
 
 
-def rows_of_others(connection: Connection, table: Table, vehicles: Collection[int]) -> list[tuple[int, int]]:
-    """Return vehicle and number of the rows of other vehicles."""
-    query = (
-        select(table.c.vehicle_id, func.count())
-        .where(table.c.vehicle_id.not_in(list(vehicles)))
-        .group_by(table.c.vehicle_id)
-    )
-    return [(int(vehicle), int(count)) for vehicle, count in connection.execute(query)]
+def excuses(connection: Connection, made: Connection) -> Excuse:
+    """Return the function that says why a row may differ: it is not decoded yet, or by an earlier definition."""
+    vehicles, decodings = models.VEHICLES, models.PACKET_DECODINGS
+    older = vehicles.c.decoded_version < DICTIONARY.version
+    behind = set(connection.execute(select(vehicles.c.id).where(older)).scalars())
+    newest_packet = select(_PACKETS.c.vehicle_id, func.max(_PACKETS.c.id)).group_by(_PACKETS.c.vehicle_id)
+    last = {int(row[0]): int(row[1]) for row in connection.execute(newest_packet)}
+    columns = select(decodings.c.vehicle_id, decodings.c.definition_id, decodings.c.decoded_to)
+    decoded = {(one, other): to for one, other, to in connection.execute(columns)}
+    newest = {(one, other) for one, other, _ in made.execute(columns)}
 
+    def excuse(table: Table, key: tuple[Any, ...], stored: bool, derived: bool) -> str | None:
+        rolled = table is models.ROLLUPS
+        if table is _PACKETS:
+            return None
+        vehicle, version = key[:2]
+        if table is models.PARAMETER_SAMPLES or (rolled and key[2] == PARAMETERS_CODE):
+            to = decoded.get((vehicle, version))
+            if stored and not derived and to is not None and (vehicle, version) not in newest:
+                return "decoded with an earlier mission description"
+            is_pending = to < last.get(vehicle, 0) if to is not None else not stored
+            return "not yet decoded" if is_pending and (rolled or not stored) else None
+        if version < DICTIONARY.version and not derived:
+            return f"decoded with dictionary version {version}"
+        return "not yet decoded" if vehicle in behind and not stored else None
 
-def rows_of_other_versions(connection: Connection, table: Table) -> list[tuple[int, int]]:
-    """Return version and number of the rows of other dictionary versions; none of a table without versions."""
-    if "dictionary_version" not in table.c:
-        return []
-    query = (
-        select(table.c.dictionary_version, func.count())
-        .where(table.c.dictionary_version != DICTIONARY.version)
-        .group_by(table.c.dictionary_version)
-    )
-    return [(int(version), int(count)) for version, count in connection.execute(query)]
-
-
-def missing_packets(connection: Connection, table: Table, vehicle: int) -> list[tuple[int, int]]:
-    """Return the packets of a vehicle that rows reference but that are missing, and the number of these rows."""
-    query = (
-        select(table.c.packet_id, func.count())
-        .outerjoin(_PACKETS, and_(_PACKETS.c.id == table.c.packet_id, _PACKETS.c.vehicle_id == vehicle))
-        .where(table.c.vehicle_id == vehicle, _PACKETS.c.id.is_(None))
-        .group_by(table.c.packet_id)
-        .order_by(table.c.packet_id)
-    )
-    return [(int(packet), int(count)) for packet, count in connection.execute(query)]
-
-
-def values_by_definition(connection: Connection, vehicle: int) -> dict[int, int]:
-    """Return the number of values of declared packets of a vehicle by definition."""
-    table = PARAMETER_SAMPLES
-    query = select(table.c.definition_id, func.count()).where(table.c.vehicle_id == vehicle)
-    rows = connection.execute(query.group_by(table.c.definition_id))
-    return {int(definition): int(count) for definition, count in rows}
-
-
-def definition_digests(connection: Connection) -> dict[int, str]:
-    """Return the digests of the definitions of packets."""
-    table = repository.PACKET_DEFINITIONS
-    return {int(key): str(digest) for key, digest in connection.execute(select(table.c.id, table.c.digest))}
-
-
-def decoded_to(connection: Connection, vehicle: int) -> dict[int, int]:
-    """Return the last decoded packet of a vehicle by definition."""
-    table = repository.PACKET_DECODINGS
-    query = select(table.c.definition_id, table.c.decoded_to).where(table.c.vehicle_id == vehicle)
-    return {int(definition): int(last) for definition, last in connection.execute(query)}
-
-
-def pending_packets(connection: Connection, vehicle: int, last: int) -> set[bytes]:
-    """Return the digests of packets that are stored but not yet decoded."""
-    query = select(_PACKETS.c.digest).where(_PACKETS.c.vehicle_id == vehicle, _PACKETS.c.id > last)
-    return {bytes(digest) for digest in connection.execute(query).scalars()}
-
-
-def packets(connection: Connection, vehicle: int) -> Keyed:
-    """Return the packets of a vehicle."""
-    names = ("apid", "ticks", "sequence_count", "digest")
-    query = (
-        select(*(_PACKETS.c[name] for name in names), _PACKETS.c.octets)
-        .where(_PACKETS.c.vehicle_id == vehicle)
-        .order_by(*(_PACKETS.c[name] for name in names))
-    )
-    return _keyed(connection, query, len(names))
-
-
-def values(connection: Connection, table: Table, vehicle: int) -> Keyed:
-    """Return the samples of a vehicle that this version's dictionary has decoded, by time and packet."""
-    kept = [column for column in table.columns if column.name not in ("vehicle_id", "packet_id", "ticks")]
-    query = _with_digest(table, kept).where(
-        table.c.vehicle_id == vehicle, table.c.dictionary_version == DICTIONARY.version
-    )
-    return _keyed(connection, query.order_by(table.c.ticks, func.coalesce(_PACKETS.c.digest, b"")), 2)
-
-
-def parameter_values(connection: Connection, vehicle: int, definition: int) -> Keyed:
-    """Return the values that a definition has decoded from the packets of a vehicle."""
-    table = PARAMETER_SAMPLES
-    query = _with_digest(table, [table.c.container, table.c["values"]]).where(
-        table.c.vehicle_id == vehicle, table.c.definition_id == definition
-    )
-    order = (table.c.ticks, func.coalesce(_PACKETS.c.digest, b""), table.c.container)
-    return _keyed(connection, query.order_by(*order), 3)
-
-
-def _with_digest(table: Table, columns: Iterable[Any]) -> Any:
-    same = and_(_PACKETS.c.id == table.c.packet_id, _PACKETS.c.vehicle_id == table.c.vehicle_id)
-    return select(table.c.ticks, _PACKETS.c.digest, *columns).outerjoin(_PACKETS, same)
-
-
-def _keyed(connection: Connection, query: Any, key_columns: int) -> Keyed:
-    rows: Iterable[Any] = connection.execution_options(yield_per=FETCHED_ROWS).execute(query)
-    for row in rows:
-        found = tuple(bytes(value) if isinstance(value, memoryview) else value for value in row)
-        key = tuple(b"" if value is None else value for value in found[:key_columns])
-        yield key, found[key_columns:]
+    return excuse

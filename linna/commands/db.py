@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.commands._ground import add_service_options, open_service, settings_of
-from linna.output import add_json_flag, emit, log
+from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
     from ground_service.settings import Settings
@@ -155,8 +155,6 @@ def run_backup(arguments: argparse.Namespace) -> int:
 
     with open_service(arguments) as ground:
         manifest = backup(ground, arguments.out, now_utc_ns=utc_now_ns())
-    for line in manifest["damaged"]:
-        log(f"damaged before the backup: {line}")
     head = manifest["audit_head"]
     text = (
         f"{arguments.out}: {sum(manifest['rows'].values())} rows, {manifest['files']} files, "

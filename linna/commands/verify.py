@@ -13,9 +13,9 @@ LINES = 50
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--all",
+        "--rebuild",
         action="store_true",
-        help="ingest every raw file again and compare (default: decode the stored packets again)",
+        help="also derive packets, values, roll-ups and time correlations again from the raw files and compare",
     )
     parser.add_argument(
         "--head",
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     head = parse_head(arguments.head) if arguments.head is not None else None
     began = time.monotonic()
     with open_service(arguments) as ground:
-        result = verify(ground, deep=arguments.all, expected_head=head, say=log)
+        result = verify(ground, rebuild=arguments.rebuild, expected_head=head, say=log)
     figures = {**result.model_dump(), "wall_s": round(time.monotonic() - began, 3)}
     lines = [f"{one.kind} {one.key}: {one.reason}" for one in result.damaged[:LINES]]
     if result.damaged_total > len(lines):

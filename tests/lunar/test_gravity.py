@@ -9,7 +9,6 @@ import mpmath
 import numpy as np
 import pytest
 
-from kernels.compiled import njit
 from lunar import _gravity_kernel as kernel
 from lunar.errors import DataFileError, OrbitError
 from lunar.gravity import (

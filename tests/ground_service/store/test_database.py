@@ -3,6 +3,7 @@
 import errno
 import os
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -47,9 +48,15 @@ def test_a_new_database_is_made_with_the_newest_schema(tmp_path: Path) -> None:
     database.engine.dispose()
 
 
-def test_a_migrated_database_has_the_schema_of_the_models(tmp_path: Path) -> None:
-    migrated = prepare_database(url(tmp_path / "migrated"))
-    made = open_database(url(tmp_path / "made"))
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_migrated_database_has_the_schema_of_the_models(
+    tmp_path: Path, new_postgres_database: Callable[[], str], kind: str
+) -> None:
+    """A change of the tables without a migration fails here."""
+    urls = [url(tmp_path / "a"), url(tmp_path / "b")]
+    if kind == "postgresql":
+        urls = [new_postgres_database(), new_postgres_database()]
+    migrated, made = prepare_database(urls[0], upgrade=True), open_database(urls[1])
     with made.writing() as connection:
         METADATA.create_all(connection)
     assert described_schema(migrated) == described_schema(made)

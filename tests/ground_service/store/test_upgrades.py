@@ -1,8 +1,10 @@
-"""Upgrades without interruption: expansions of the schema, versions side by side, locks, digests of rows."""
+"""Upgrades without interruption: expansions of the schema, versions side by side, locks, databases of version 1.0."""
 
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +14,8 @@ from sqlalchemy import MetaData, text
 
 from ground_service.access.service import add_user, list_users
 from ground_service.errors import DatabaseTooNew
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.store import database as stores
-from ground_service.store import row_digests
 from ground_service.store.database import (
     Database,
     known_revisions,
@@ -25,7 +26,9 @@ from ground_service.store.database import (
     upgrade_database,
 )
 from ground_service.store.models import METADATA
+from ground_service.store.snapshot import create_schema
 from tests.ground_service.conftest import wait_for
+from tests.ground_service.schema import described_schema
 from tests.ground_service.store.schema_rules import RULE, breaking_changes
 
 HEAD = known_revisions()[0]
@@ -45,7 +48,6 @@ def migrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Migrations:
         body = "".join(f"    {one}\n" for one in statements)
         (folder / "versions/9999_further.py").write_text(
             "import sqlalchemy as sa\nfrom alembic import op\n"
-            "from ground_service.store import row_digests\n"
             f'revision = "{revision}"\ndown_revision = "{HEAD}"\n\ndef upgrade() -> None:\n{body}'
         )
         monkeypatch.setattr(stores, "migrations_folder", lambda: folder)
@@ -129,21 +131,65 @@ def test_a_program_works_with_an_expanded_schema_and_with_no_other_newer_one(
         prepare_database(url)
 
 
-def test_a_column_is_added_and_only_rows_that_did_not_match_before_do_not_match_afterwards(
-    either: Ground, migrations: Migrations
+def of_version_1(database: Database) -> None:
+    """Make a database as version 1.0 left it: its schema, a user, and the triggers of row digests."""
+    stores._migrate(database, "upgrade", "1.0")
+    statements = [
+        "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)",
+        "INSERT INTO row_digests VALUES ('users', '1', 'x')",
+    ]
+    if database.dialect == "postgresql":
+        statements += [
+            "CREATE FUNCTION linna_digest_users() RETURNS trigger LANGUAGE plpgsql AS "
+            "$$BEGIN INSERT INTO row_digests VALUES ('users', NEW.id::text, 'x'); RETURN NULL; END$$",
+            "CREATE TRIGGER row_digest AFTER INSERT ON users FOR EACH ROW EXECUTE FUNCTION linna_digest_users()",
+        ]
+    with database.writing() as connection:
+        for statement in statements:
+            connection.exec_driver_sql(statement)
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_database_of_version_1_0_is_upgraded(
+    tmp_path: Path, new_postgres_database: Callable[[], str], kind: str
 ) -> None:
-    for name in ("ann", "bob", "eve"):
-        add_user(either, name, "viewer")
-    with either.database.writing() as connection:
-        bob = connection.execute(text("SELECT id FROM users WHERE name = 'bob'")).scalar_one()
-        where = f"table_name = 'users' AND row_key = '{bob}'"
-        connection.execute(text(f"UPDATE row_digests SET sha256 = 'x' WHERE {where}"))
-    migrations(EXPANSION, f'with row_digests.changed_columns(op.get_bind(), "users"): {ADD}')
-    upgrade_database(either.database)
-    with either.database.reading() as connection:
-        table = row_digests._as_stored(connection, "users")
-        assert "remark" in table.columns
-        assert [one.key for one in row_digests.stray_rows(connection, table)] == [str(bob)]
+    url = f"sqlite:///{tmp_path / 'linna.db'}" if kind == "sqlite" else new_postgres_database()
+    old, made = open_database(url), open_database(f"sqlite:///{tmp_path / 'made.db'}")
+    if kind == "postgresql":
+        made = open_database(new_postgres_database())
+    of_version_1(old)
+    old.engine.dispose()
+    prepare_database(url, upgrade=True).engine.dispose()
+    with open_ground(tmp_path, database_url=url) as ground:
+        assert [one.name for one in list_users(ground)] == ["ann"]
+        add_user(ground, "bob", "viewer")
+        with made.writing() as connection:
+            METADATA.create_all(connection)
+        assert described_schema(ground.database) == described_schema(made)
+        if kind == "postgresql":
+            with ground.database.reading() as connection:
+                left = "SELECT count(*) FROM pg_proc WHERE starts_with(proname, 'linna_digest')"
+                assert connection.execute(text(left)).scalar() == 0
+    made.engine.dispose()
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(
+    tmp_path: Path, new_postgres_database: Callable[[], str], kind: str
+) -> None:
+    found, made = (
+        open_database(f"sqlite:///{tmp_path / name}" if kind == "sqlite" else new_postgres_database())
+        for name in ("found", "made")
+    )
+    command = [sys.executable, "-m", "ground_service.store.snapshot", str(tmp_path / "schema.json")]
+    subprocess.run(command, check=True)
+    with found.writing() as connection:
+        create_schema(connection, tmp_path / "schema.json")
+    with made.writing() as connection:
+        METADATA.create_all(connection)
+    assert described_schema(found) == described_schema(made) != {}
+    for database in (found, made):
+        database.engine.dispose()
 
 
 def test_a_migration_gives_way_to_requests_that_hold_locks(

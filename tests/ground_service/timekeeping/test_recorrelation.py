@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import text
 
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
@@ -27,6 +28,7 @@ from ground_service.timekeeping.recorrelation import (
 )
 from ground_service.timekeeping.service import TimePoint, correlate, correlate_again, correlations_on_record
 from ground_service.worker.follow_up import open_following
+from ground_service.worker.integrity import verify
 from linna.cli import run
 from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import ephemeris_from_states
@@ -273,3 +275,38 @@ def test_telemetry_without_receptions_leaves_the_clock_ideal(
 ) -> None:
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     assert in_force(ground, vehicle) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "kinds"),
+    [
+        ("reference_utc_ns = reference_utc_ns + 900", set()),  # rounding
+        ("reference_utc_ns = reference_utc_ns + 1100", {"correlations"}),
+        ("drift_ppb = drift_ppb + 5", {"correlations"}),
+        ("superseded = 1", {"correlations"}),
+        ("method = 'entered'", set()),
+    ],
+)
+def test_verification_fits_the_correlations_again(
+    either: Ground, tmp_path: Path, spacecraft: Spacecraft, changes: str, kinds: set[str]
+) -> None:
+    ingest(either, tmp_path, spacecraft.downlink())
+    receive(either, spacecraft.reports)
+    intact = verify(either, rebuild=True)
+    assert (intact.damaged, intact.unchecked, intact.checked["correlations"]) == ([], {}, 2)
+    with either.database.writing() as connection:
+        connection.execute(text(f"UPDATE correlations SET {changes} WHERE boot_count = 8"))
+    found = verify(either, rebuild=True)
+    assert {one.kind for one in found.damaged} == kinds
+    assert bool(found.unchecked) == changes.startswith("method")
+
+
+def test_verification_does_not_expect_correlations_before_the_follow_up_work(
+    either: Ground, tmp_path: Path, spacecraft: Spacecraft, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receive(either, spacecraft.reports)
+    monkeypatch.setattr(either.database.listeners, "_functions", [])
+    ingest(either, tmp_path, spacecraft.downlink())
+    found = verify(either, rebuild=True)
+    assert found.damaged == []
+    assert found.unchecked == {"vehicles with follow-up work that is not done": 1}

@@ -167,7 +167,7 @@ def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
             assert repository.newest(connection, repository.INGESTS, Paging())[1] == 0
         server.start()
         assert upload().status_code == 202
-        assert verify(client.app.state.ground, deep=True).verdict == "intact"
+        assert verify(client.app.state.ground, rebuild=True).verdict == "intact"
 
 
 def test_a_job_without_the_store_waits_and_loses_nothing(
@@ -187,7 +187,7 @@ def test_a_job_without_the_store_waits_and_loses_nothing(
     assert job_of(first, job)["state"] == "queued"
     server.start()
     assert run_job(second, job).state == "done"
-    assert verify(first, deep=True).verdict == "intact"
+    assert verify(first, rebuild=True).verdict == "intact"
 
 
 def test_an_import_that_loses_the_store_half_way_is_repeated(
@@ -208,7 +208,7 @@ def test_an_import_that_loses_the_store_half_way_is_repeated(
     server.start()
     assert len(calls) == 3
     import_archive(ground, synthetic_pass.folder)
-    assert verify(ground, deep=True).verdict == "intact"
+    assert verify(ground, rebuild=True).verdict == "intact"
 
 
 def test_integrity_check_reads_the_store_and_not_the_cache(
@@ -220,7 +220,7 @@ def test_integrity_check_reads_the_store_and_not_the_cache(
     with ground.database.reading() as connection:
         (sha256,) = (row["sha256"] for row in repository.newest(connection, repository.FILES, Paging())[0])
     octets = ground.files.get(sha256)
-    assert verify(ground, deep=True).verdict == "intact"
+    assert verify(ground, rebuild=True).verdict == "intact"
 
     def found(body: bytes | None) -> list[str]:
         if body is None:
@@ -251,7 +251,7 @@ def test_a_backup_of_an_object_store_is_restored_into_another(
     assert not [path for path in (tmp_path / "home" / "files").rglob("*") if path.is_file()]
     other = opened("other", folder="other")
     restore(tmp_path / "backup", other)
-    assert verify(other, deep=True).verdict == "intact"
+    assert verify(other, rebuild=True).verdict == "intact"
     assert registered_build(other, build.digest).files == build.files
     assert pass_id > 0
 
