@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.campaigns.uploads import campaign, verdict
 
 
+@pytest.mark.campaign
 def test_uploads_half_sent_requests_and_a_stop(tmp_path: Path) -> None:
     figures = campaign(
         tmp_path, uploads=16, half=8, sockets=6, postgres=False, packets=2, watched_s=0.5,

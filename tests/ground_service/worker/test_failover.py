@@ -55,6 +55,7 @@ def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(
         database.engine.dispose()
 
 
+@pytest.mark.campaign
 def test_a_killed_primary_is_replaced_and_no_acknowledged_upload_is_lost(
     cluster: DatabaseCluster, tmp_path: Path
 ) -> None:
