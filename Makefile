@@ -21,13 +21,17 @@ SEED   ?= 1
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 
-.PHONY: demo test check openmct docs pictures page-table links sbom licences package release bench bench-planning mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures page-table links sbom licences package release bench bench-planning campaigns mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# Long campaigns; each has a short twin in `make test` (docs/mutation.md).
+campaigns: $(VENV)/.dev
+	$(BIN)/python -m pytest -m campaign -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -23,7 +23,7 @@ def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> 
     while time.monotonic() < until:
         if ready():
             return
-        time.sleep(0.2)
+        time.sleep(0.05)
     raise SystemExit(f"{what}: not ready within {seconds:.0f} s")
 
 

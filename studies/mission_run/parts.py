@@ -82,7 +82,7 @@ class Part:
             while time.monotonic() < until and self._process.poll() is None:
                 if self._ready():
                     return
-                time.sleep(0.1)
+                time.sleep(0.02)
             time.sleep(0.5)
         if self._ended:
             return
@@ -143,7 +143,7 @@ def kill_family(pid: int) -> None:
             os.kill(one, signal.SIGKILL)
     until = time.monotonic() + 10.0
     while any(runs(one) for one in family) and time.monotonic() < until:
-        time.sleep(0.05)
+        time.sleep(0.01)
 
 
 def runs(pid: int) -> bool:

@@ -18,6 +18,7 @@ def folder() -> Iterator[Path]:
     shutil.rmtree(made, ignore_errors=True)
 
 
+@pytest.mark.campaign
 def test_an_upgrade_under_load_answers_every_request(folder: Path) -> None:
     for program in ("nginx", "redis-server"):
         if shutil.which(program) is None:

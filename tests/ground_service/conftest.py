@@ -441,7 +441,7 @@ def wait_for(ready: Callable[[], bool], what: str, seconds: float = 60.0) -> Non
     while time.monotonic() < until:
         if ready():
             return
-        time.sleep(0.1)
+        time.sleep(0.02)
     pytest.fail(f"{what} was not ready within {seconds:.0f} s")
 
 

@@ -15,6 +15,7 @@ from ground_service.jobs.service import enter_job
 from tests.ground_service.conftest import wait_for
 
 
+@pytest.mark.campaign
 def test_every_query_of_the_dashboard_has_data(tmp_path: Path, migrated_postgres: Callable[[], str]) -> None:
     for program in ("prometheus", "redis-server"):
         if shutil.which(program) is None:

@@ -1,19 +1,23 @@
-"""Starting the server: what is imported, and the addresses that are refused in one line."""
+"""Starting and ending the server: what is imported, refused addresses, draining."""
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import httpx
 import pytest
+import uvicorn
 
 from ground_service.access.service import add_user
+from ground_service.app import create_app
 from ground_service.errors import ServerError
 from ground_service.ground import open_ground
-from ground_service.server import bind, serve
+from ground_service.server import _server, bind, serve
 from ground_service.settings import Settings
 from studies.mission_run.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
@@ -77,3 +81,27 @@ def test_the_service_starts_without_libraries_that_only_computations_need() -> N
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
+
+
+def test_a_terminated_server_drains_before_it_ends(tmp_path: Path) -> None:
+    """It is not ready any more, answers for the time of the draining with the end of each connection, and ends."""
+    app = create_app(Settings(home=tmp_path))
+    listener = bind("127.0.0.1", 0)
+    url = "http://{}:{}".format(*listener.getsockname())
+    listener.listen()
+    server = _server(uvicorn.Config(app, log_level="error"), listener, app.state, drain_s=1.0)
+    running = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    running.start()
+
+    def ask(path: str) -> tuple[int, str | None]:
+        answer = httpx.get(f"{url}{path}", timeout=60)
+        return answer.status_code, answer.headers.get("Connection")
+
+    wait_for(lambda: server.started or not running.is_alive(), "the server")
+    assert ask("/readyz") == (200, None)
+    server.handle_exit(signal.SIGTERM, None)
+    assert ask("/readyz") == (503, "close")
+    assert ask("/api/v1/missions") == (200, "close")
+    running.join(60)
+    with pytest.raises(httpx.ConnectError):
+        ask("/readyz")

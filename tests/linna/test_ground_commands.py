@@ -79,7 +79,7 @@ def served(home: Path, role: str) -> Iterator[list[str]]:
     thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
     thread.start()
     while not service.started and thread.is_alive():
-        time.sleep(0.05)
+        time.sleep(0.01)
     try:
         yield ["--server", f"http://127.0.0.1:{listener.getsockname()[1]}", "--token", token]
     finally:
@@ -100,63 +100,6 @@ def asked(capsys: pytest.CaptureFixture[str], *words: Any, status: int = 0) -> A
     printed = capsys.readouterr()
     assert code == status, printed.err
     return json.loads(printed.out) if status == 0 else printed.err
-
-
-def comparable(value: Any) -> Any:
-    """What two services have to say alike: no times of entry, no names of files."""
-    if isinstance(value, dict):
-        dropped = (
-            "created",
-            "changed",
-            "requested",
-            "decided",
-            "file",
-            "created_by",
-            "requested_by",
-            "decided_by",
-        )
-        return {key: comparable(item) for key, item in value.items() if key not in dropped}
-    return [comparable(item) for item in value] if isinstance(value, list) else value
-
-
-def test_every_command_says_the_same_here_and_on_a_server(
-    capsys: pytest.CaptureFixture[str], server: list[str], reference: Path, downlink: Path, tmp_path: Path
-) -> None:
-    told: list[list[Any]] = []
-    for where in (["--home", tmp_path / "here", "--as", "ann"], server):
-        said = []
-
-        def ask(*words: Any, said: list[Any] = said, where: list[Any] = where, status: int = 0) -> Any:
-            answer = asked(capsys, *words, *where, status=status)
-            said.append(comparable(answer))
-            return answer
-
-        ask("plan", "ephemeris", reference)
-        found = ask("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 900)
-        first = found["candidates"][0]
-        window = ["--start", first["start"], "--stop", first["stop"], "--spacecraft-id", 76]
-        key = ask("plan", "add", *window, "--name", "w")["id"]
-        ask("plan", "approve", key)
-        ask("plan", "add", *window, status=2)
-        ask("plan", "uplink", key)
-        ask("command", "uplink", "--spacecraft-id", 76, "--out", tmp_path / "up.cltu")
-        ask("plan", "show", key)
-        ask("plan", "list")
-        ask("plan", "export", "--out", tmp_path / "plan.json")
-        ask("plan", "import", tmp_path / "plan.json")
-        ask("plan", "delete", key, status=2)
-        ask("ingest", downlink)
-        ask("ingest", downlink)
-        ask("ingest", tmp_path / "nothing", status=2)
-        ask("command", "enter", "test_connection", "--spacecraft-id", 76)
-        ask("command", "enter", "dance", "--spacecraft-id", 76, status=2)
-        ask("command", "reject", 6, "--reason", "not now")
-        assert ask("command", "show", 6)["remark"] == "not now"
-        ask("command", "list")
-        ask("pass", "list")
-        ask("report", 99, "--out", tmp_path / "r", status=2)
-        told.append(said)
-    assert told[0] == told[1]
 
 
 def test_a_pass_archive_is_imported_and_reported_over_the_wire(
@@ -297,6 +240,7 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
                 76,
             ]
             number = do("plan", "add", *window)["id"]
+            ask("plan", "add", *window)
             do("plan", "approve", number)
             do("plan", "draft", number)
             do("plan", "approve", number)
@@ -317,6 +261,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             do("command", "uplink", "--spacecraft-id", 76, "--out", tmp_path / "up.cltu")
             rejected = do("command", "enter", "test_connection", "--spacecraft-id", 76)["id"]
             do("command", "reject", rejected, "--reason", "exercise")
+            assert do("command", "show", rejected)["remark"] == "exercise"
+            ask("command", "enter", "dance", "--spacecraft-id", 76)
             ask("command", "list", "--limit", 2)
             ask("command", "receiver", "--spacecraft-id", 76)
             do("ingest", synthetic_archive)

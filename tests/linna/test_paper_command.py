@@ -13,10 +13,10 @@ from studies import paper_steps
 from studies.paper_steps import Effort, Workshop
 
 SMALL = Effort(
-    hours=0.5,
+    hours=0.1,
     unseen_passes=1,
-    sample_frames=20,
-    method_frames=20,
+    sample_frames=8,
+    method_frames=8,
     training_steps=1,
     days=1.0,
     fov_step_s=600.0,
@@ -59,7 +59,7 @@ def test_the_document_has_the_figures_tables_and_differences(
     } <= {figure["key"] for figure in index["figures"]}
     assert index["tables"][-1]["columns"] == ["subject", "paper", "this system", "reason"]
     images = next(row for row in index["differences"] if row["subject"] == "Images of the session")
-    assert "5" in images["paper"] and "0.5 h" in images["here"] and "32.5 h" in images["reason"]
+    assert "5" in images["paper"] and "0.1 h" in images["here"] and "32.5 h" in images["reason"]
 
 
 def test_a_second_run_repeats_no_step(document: tuple[Path, dict[str, Any], list[str]]) -> None:

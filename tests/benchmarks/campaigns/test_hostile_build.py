@@ -1,4 +1,4 @@
-"""Hostile build against the sandbox: the shortest run with each profile of the campaign."""
+"""Hostile build against the sandbox: two kinds of attack in the suite, every kind with each profile as campaign."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ def held(result: ProfileResult) -> bool:
     return went_well(result)
 
 
-def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests() -> None:
-    result = campaign("user", KINDS)
+@pytest.mark.parametrize("kinds", [("explore", "daemon"), pytest.param(KINDS, marks=pytest.mark.campaign)])
+def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds: tuple[str, ...]) -> None:
+    result = campaign("user", kinds)
     assert held(result)
     assert result.attempts > 150 and "private root" in result.isolation
 
 
 @root_only
+@pytest.mark.campaign
 def test_a_hostile_build_achieves_nothing_with_the_profile_of_the_image() -> None:
     assert held(campaign("image", ("explore", "daemon")))
 
@@ -38,7 +40,7 @@ def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces() -> Non
 
 
 @root_only
-def test_a_hostile_build_achieves_nothing_in_the_runner() -> None:
-    kinds = ("explore", "leave files", "disk fill", "daemon", "stop others", "link out", "flood")
+@pytest.mark.parametrize("kinds", [("explore", "daemon"), pytest.param(KINDS, marks=pytest.mark.campaign)])
+def test_a_hostile_build_achieves_nothing_in_the_runner(kinds: tuple[str, ...]) -> None:
     result = campaign("no unshare, runner", kinds)
     assert held(result) and result.isolation.startswith("runner, user 19")

@@ -22,6 +22,7 @@ def campaign(monkeypatch: Any, capsys: pytest.CaptureFixture[str], words: str) -
     return code, json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.campaign
 def test_nothing_is_lost_or_doubled_by_kills_and_a_campaign_goes_on_where_it_ended(
     monkeypatch: Any, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -69,7 +69,7 @@ class Queue:
         pass
 
 
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+@pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.campaign)])
 def client(
     request: pytest.FixtureRequest, synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[TestClient]:

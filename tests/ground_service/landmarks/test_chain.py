@@ -17,6 +17,7 @@ import pytest
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
+from ground_service.landmarks.service import decide_landmark
 from ground_service.passes.archive_import import import_archive
 from ground_service.regression.builds import load_build
 from linna import cli
@@ -90,8 +91,10 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     proposed = linna("landmarks", "list", "--state", "proposed", "--limit", 500)["landmarks"]
     assert before["proposed"] == len(proposed) > 20
     linna("landmarks", "reject", proposed[0]["id"], "--reason", "no rim", "--as", "ann")
-    for one in proposed[1:]:
-        linna("landmarks", "accept", one["id"], "--as", "ann")
+    linna("landmarks", "accept", proposed[1]["id"], "--as", "ann")
+    with open_ground(linna.home) as ground:
+        for one in proposed[2:]:
+            decide_landmark(ground, one["id"], accept=True, reason="", actor="ann")
     shown = linna("landmarks", "show", proposed[1]["id"])
     assert (shown["state"], shown["decided_by"], len(shown["evidence"])) == ("accepted", "ann", 2)
     linna("landmarks", "export", "--catalogue", folder / "old.csv", "--out", folder / "new.csv")
@@ -105,6 +108,7 @@ def build(learned: Learned) -> Path:
     return _trained(learned.folder)
 
 
+@pytest.mark.campaign
 def test_the_gate_judges_the_network_trained_with_the_labels_on_an_archived_pass(
     learned: Learned, build: Path
 ) -> None:

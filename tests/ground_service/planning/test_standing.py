@@ -116,7 +116,7 @@ def request(ground: Ground, **changes: object) -> int:
     values = {
         "name": "low Sun",
         "spacecraft_id": 76,
-        "windows": 4,
+        "windows": 2,
         "period_days": 7.0,
         "horizon_days": 1.0,
     } | changes
@@ -127,7 +127,7 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     prepare(either, oem)
     key = request(either)
     done = standing.plan_tick(either, now.utc_ns)
-    assert done == {"failed": 0, "added": 4, "approved": 4, "released": 4}
+    assert done == {"failed": 0, "added": 2, "approved": 2, "released": 2}
     windows = either.read(list_windows, WindowFilter()).items
     assert {one.request_id for one in windows} == {key}
     for one in windows:
@@ -139,9 +139,9 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     )
     left = [one.reason for one in plan.candidates if one.outcome == "rejected"]
     assert left and all(left) and "the number of windows of its period is planned" in left
-    assert either.read(get_request, key).windows == {"approved": 4}
+    assert either.read(get_request, key).windows == {"approved": 2}
     commands = either.read(list_telecommands, TelecommandFilter(state="released"), utc_now_ns()).items
-    assert len(commands) == 12 and all(
+    assert len(commands) == 6 and all(
         get_command(either, one.id).record.send_before_utc_ns for one in commands
     )
     assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [
@@ -185,7 +185,7 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
         if get.window_id == first.id
     } == {"rejected"}
     assert either.read(get_plan, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]
-    assert either.read(get_request, key).windows == {"approved": 4, "failed": 1}
+    assert either.read(get_request, key).windows == {"approved": 2, "failed": 1}
 
 
 def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
@@ -268,7 +268,7 @@ def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: 
 def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem: Path, now: Now) -> None:
     prepare(ground, oem)
     region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
-    key = request(ground, windows=50, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
+    key = request(ground, windows=5, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
     standing.plan_tick(ground, now.utc_ns)
     plan = ground.read(get_plan, key)
     assert plan.reason is not None and plan.reason.startswith("the reference ephemeris ends at 2029-08-10")
@@ -343,8 +343,8 @@ def test_processes_that_plan_at_the_same_time_make_one_plan(
         thread.start()
     for thread in threads:
         thread.join(120)
-    assert sorted(added) == [0, 0, 0, 4]
-    assert grounds[0].read(list_windows, WindowFilter()).total == 4
+    assert sorted(added) == [0, 0, 0, 2]
+    assert grounds[0].read(list_windows, WindowFilter()).total == 2
     with grounds[0].database.reading() as connection:
         assert request_store.get_request_record(connection, key).plans == 1
     for one in grounds:

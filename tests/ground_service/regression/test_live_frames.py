@@ -28,7 +28,7 @@ TERMS = RunTerms(days=0.3, windows_per_day=1, window_s=180.0)
 WORLD = SCENARIO.replace('images = "reduced"', "").replace("degree = 8", 'degree = 8\norientation = "iau"')
 
 
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+@pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.campaign)])
 def flown(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, str | None]:

@@ -98,6 +98,7 @@ def result_of(ground: Ground, key: str, seconds: float = 180.0) -> dict[str, Any
     raise AssertionError(f"job {key} did not end: {job_of(ground, key)}")
 
 
+@pytest.mark.campaign
 def test_upload_report_and_regression_on_hosts_without_a_common_folder(
     server: ObjectServer,
     migrated_postgres: Callable[[], str],

@@ -202,6 +202,7 @@ def test_a_day_on_a_laptop(capsys: pytest.CaptureFixture[str], tmp_path: Path, m
         operate(capsys, where, tmp_path)
 
 
+@pytest.mark.campaign
 def test_a_day_on_postgresql_redis_and_two_workers(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,

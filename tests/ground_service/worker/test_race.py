@@ -13,6 +13,7 @@ from benchmarks.campaigns import race
 from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 
 
+@pytest.mark.campaign
 def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_told_so(
     new_postgres_database: Callable[[], str], tmp_path: Path
 ) -> None:

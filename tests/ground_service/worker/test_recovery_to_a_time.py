@@ -34,6 +34,7 @@ class Server:
         self.user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
         self.url = f"postgresql+psycopg://linna@127.0.0.1:{self.port}/linna"
         self.scripts = folder / "scripts"
+        self.second = 0
         shutil.copytree(DEPLOY, self.scripts)
         self.scripts.chmod(0o755)
 
@@ -90,12 +91,16 @@ class Server:
         return self.run("sh", str(self.scripts / name), *words, check=check)
 
     def base_backup(self) -> str:
+        while int(time.time()) == self.second:  # names of backups have seconds
+            time.sleep(0.02)
+        self.second = int(time.time())
         place = ["--host", "127.0.0.1", "--port", str(self.port), "--username", "linna"]
         return self.script("base-backup.sh", *place).stdout.strip()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
+    """A server for all tests; the last one destroys and restores its database."""
     if not sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
         pytest.skip("PostgreSQL is not installed")
     folder = Path(tempfile.mkdtemp(prefix="linna-recovery-"))
@@ -136,7 +141,7 @@ def next_second(ground: Ground) -> datetime:
     until = time.monotonic() + 60.0
     while server_time(ground) <= chosen:
         assert time.monotonic() < until
-        time.sleep(0.05)
+        time.sleep(0.02)
     return chosen
 
 
@@ -152,6 +157,38 @@ def archive_all(ground: Ground) -> None:
             return
         assert time.monotonic() < until, f"{segment} was not archived; the last is {last}"
         time.sleep(0.1)
+
+
+def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
+    server.base_backup()
+    before = (datetime.now(UTC) - timedelta(hours=1)).strftime("%Y-%m-%d %H:%M:%S+00")
+    refused = server.script("restore-to.sh", str(server.folder / "new"), before, check=False)
+    assert refused.returncode == 2 and "expected a base backup before" in refused.stderr
+    refused = server.script("restore-to.sh", str(server.data), before, check=False)
+    assert refused.returncode == 2 and "expected an empty folder" in refused.stderr
+
+
+def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server) -> None:
+    made = [Path(server.base_backup()) for _ in range(3)]
+    assert sorted(path.name for path in (server.wal / "base").iterdir()) == [one.name for one in made[1:]]
+    (first,) = re.findall(r"\(file (\w+)\)", (made[1] / "backup_label").read_text().splitlines()[0])
+    kept = sorted(path.name for path in server.wal.iterdir() if re.fullmatch("[0-9A-F]{24}", path.name))
+    assert all(name >= first for name in kept)
+
+
+def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "one").write_bytes(b"1")
+    (tmp_path / "two").write_bytes(b"2")
+    (tmp_path / "wal").mkdir()
+    environment = {"PATH": os.environ["PATH"], "LINNA_WAL": str(tmp_path / "wal")}
+
+    def archive(name: str) -> int:
+        command = ["sh", str(DEPLOY / "wal-archive.sh"), str(tmp_path / name), "0001"]
+        return subprocess.run(command, env=environment, check=False).returncode
+
+    assert archive("one") == 0 and archive("one") == 0 and archive("two") != 0
+    assert (tmp_path / "wal/0001").read_bytes() == b"1"
+    assert [path.name for path in (tmp_path / "wal").iterdir()] == ["0001"]
 
 
 def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: Path) -> None:
@@ -179,43 +216,8 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
                 if not connection.execute(text("SELECT pg_is_in_recovery()")).scalar():
                     break
             assert time.monotonic() < until
-            time.sleep(0.1)
+            time.sleep(0.02)
         assert [one.name for one in users.list_users(ground)] == ["before", "in-the-backup"]
         with ground.database.snapshot() as connection:
             assert list(audit.broken_entries(connection)) == []
         users.add_user(ground, "afterwards", "viewer")  # the service continues, on a new timeline
-
-
-def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
-    server.base_backup()
-    before = (datetime.now(UTC) - timedelta(hours=1)).strftime("%Y-%m-%d %H:%M:%S+00")
-    refused = server.script("restore-to.sh", str(server.folder / "new"), before, check=False)
-    assert refused.returncode == 2 and "expected a base backup before" in refused.stderr
-    refused = server.script("restore-to.sh", str(server.data), before, check=False)
-    assert refused.returncode == 2 and "expected an empty folder" in refused.stderr
-
-
-def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server) -> None:
-    made = []
-    for _ in range(3):
-        made.append(Path(server.base_backup()))
-        time.sleep(1.1)  # names of backups have seconds
-    assert sorted(path.name for path in (server.wal / "base").iterdir()) == [one.name for one in made[1:]]
-    (first,) = re.findall(r"\(file (\w+)\)", (made[1] / "backup_label").read_text().splitlines()[0])
-    kept = sorted(path.name for path in server.wal.iterdir() if re.fullmatch("[0-9A-F]{24}", path.name))
-    assert all(name >= first for name in kept)
-
-
-def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "one").write_bytes(b"1")
-    (tmp_path / "two").write_bytes(b"2")
-    (tmp_path / "wal").mkdir()
-    environment = {"PATH": os.environ["PATH"], "LINNA_WAL": str(tmp_path / "wal")}
-
-    def archive(name: str) -> int:
-        command = ["sh", str(DEPLOY / "wal-archive.sh"), str(tmp_path / name), "0001"]
-        return subprocess.run(command, env=environment, check=False).returncode
-
-    assert archive("one") == 0 and archive("one") == 0 and archive("two") != 0
-    assert (tmp_path / "wal/0001").read_bytes() == b"1"
-    assert [path.name for path in (tmp_path / "wal").iterdir()] == ["0001"]
