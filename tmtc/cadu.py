@@ -1,10 +1,11 @@
 """Attached sync markers: bit-level search for channel access data units (CADUs) in a stream of octets.
 
 The synchroniser has the three usual states: *search* for a marker, *check* that another marker follows one period
-later, *lock* while markers follow at that distance. In lock a single damaged marker is accepted (fly-wheel). After two
-consecutive damaged markers the search restarts immediately after the marker of the last frame, so that bits lost or
-inserted by the link affect only the frames in which they occur. If the next marker is a whole number of periods later,
-the frames between are kept as well; their code or checksum decides whether they are valid.
+later, *lock* while markers follow at that distance. In lock a single damaged marker is accepted (fly-wheel), and any
+number of damaged markers while the frames behind them have a valid code or checksum; such frames are also followed
+back from the first marker found. Otherwise the search restarts immediately after the marker of the last frame, so that
+bits lost or inserted by the link affect only the frames in which they occur. If the next marker is a whole number of
+periods later, the frames between are kept as well. A frame with a damaged marker has the polarity of its neighbours.
 
 Markers are searched at every bit, upright and inverted (a receiver may lose bits and may lock with the wrong
 polarity). A station may insert octets between CADUs, as a fixed header or a varying gap. Therefore, the distance of the
@@ -39,6 +40,9 @@ Random data give one false marker in 6e7 bits."""
 
 MOST_BRIDGED = 64
 """Largest number of frames that the fly-wheel fills in between two periods of lock."""
+
+LED_BACK = 8
+"""Number of frames that are tried at once before a marker."""
 
 _ASM_WORD = np.uint64(int.from_bytes(ASM, "big"))
 _SCAN_BITS = 1 << 19
@@ -164,19 +168,21 @@ class _Synchroniser:
         """Return the CADUs of the stream."""
         length = 8 * self.period
         last = 8 * self.octets.size - length
-        spacing = self.usual
+        spacing, end = self.usual, 0
         position = self._search(0, 0, (spacing,))
         while position is not None and position <= last:
             count = self._in_lock(position, spacing)
             if count == 1 and spacing != self.usual:
                 spacing = self.usual
                 count = self._in_lock(position, spacing)
-            self.starts.append(position + spacing * np.arange(count, dtype=np.int64))
+            before = self._led_back(position, spacing, end)
+            self.starts.append(position + spacing * np.arange(-before, count, dtype=np.int64))
             final = position + spacing * (count - 1)
             expected = final + spacing
+            end = final + length
             if expected > last + (spacing - length):
                 break
-            found = self._search(final + 1, final + length, (spacing, self.usual, length))
+            found = self._search(final + 1, end, (spacing, self.usual, length))
             if found is None or found > last:
                 # no other marker follows: keep the frame expected here; its code or checksum decides whether it is
                 # valid
@@ -187,6 +193,7 @@ class _Synchroniser:
                 missing = (found - expected) // spacing
                 if missing <= MOST_BRIDGED and count > 1:
                     self.starts.append(expected + spacing * np.arange(missing, dtype=np.int64))
+                    end = found
             else:
                 distance = found - final
                 spacing = distance if length <= distance < 2 * length else self.usual
@@ -197,25 +204,46 @@ class _Synchroniser:
         none = np.empty(0, dtype=np.int64)
         starts = np.concatenate([none, *self.starts])
         wrong, inverted = _marker_errors(self.octets, starts)
+        damaged = np.flatnonzero(wrong > self.tolerance)
+        sound = np.flatnonzero(wrong <= self.tolerance)
+        turns = np.diff(inverted[sound])
+        alone = sound[1:-1][turns[1:] & turns[:-1]]  # nearly all bits of a marker are wrong, or really inverted
+        alone = alone[self._are_valid(starts[alone], ~inverted[alone])]
+        damaged, sound = np.union1d(damaged, alone), np.setdiff1d(sound, alone)
+        if damaged.size and sound.size:
+            place = np.searchsorted(sound, damaged)
+            polarity = inverted[sound[np.maximum(place - 1, 0)]]
+            later = inverted[sound[np.minimum(place, sound.size - 1)]]
+            doubtful = np.flatnonzero(polarity != later)
+            if doubtful.size and self.verify is not None:
+                valid = self._are_valid(starts[damaged[doubtful]], polarity[doubtful])
+                polarity[doubtful[~valid]] ^= True
+            wrong[damaged] = np.where(
+                inverted[damaged] == polarity, wrong[damaged], MARKER_BITS - wrong[damaged]
+            )
+            inverted[damaged] = polarity
         # a frame that lost bits reaches into the next one
         whole = np.append(np.diff(starts) >= 8 * self.period, True)[: starts.size]
         return CaduSync(starts[whole], inverted[whole], wrong[whole], starts[~whole] >> 3, self.period)
 
     def _in_lock(self, position: int, spacing: int) -> int:
-        """Return the frames from `position` until two consecutive markers are damaged; at least one."""
+        """Return the frames from `position` until two consecutive ones are lost; at least one."""
         last = 8 * self.octets.size - 8 * self.period
         count, block = 0, 4
+        polarity = are_inverted(self.octets, np.array([position]))[0]
         while True:
             starts = position + spacing * np.arange(count, count + block, dtype=np.int64)
             starts = starts[starts <= last]
             if not starts.size:
                 return max(count, 1)
-            wrong, _ = _marker_errors(self.octets, starts)
-            bad = wrong > self.tolerance
-            follower = np.append(bad[1:], self._damaged_or_cut_off(int(starts[-1]) + spacing))
+            stands, polarity = self._stand(starts, polarity)
+            follower = int(starts[-1]) + spacing
+            is_followed = follower + MARKER_BITS <= 8 * self.octets.size and bool(
+                self._stand(np.array([follower]), polarity)[0][0]
+            )
             # a distance that occurred by chance may fit the frame after next
             settled = count + np.arange(starts.size) >= SETTLED
-            lost = bad & (follower | ~settled)
+            lost = ~stands & (~np.append(stands[1:], is_followed) | ~settled)
             if lost.any():
                 return max(count + int(np.argmax(lost)), 1)
             count += starts.size
@@ -223,12 +251,34 @@ class _Synchroniser:
                 return count
             block = min(4 * block, 4096)
 
-    def _damaged_or_cut_off(self, bit: int) -> bool:
-        """Return whether there is no marker at `bit`, or the stream ends before it."""
-        if bit + MARKER_BITS > 8 * self.octets.size:
-            return True
-        wrong, _ = _marker_errors(self.octets, np.array([bit]))
-        return bool(wrong[0] > self.tolerance)
+    def _led_back(self, position: int, spacing: int, end: int) -> int:
+        """Return the number of valid frames with damaged markers that end at `position` and begin at or after `end`."""
+        polarity = are_inverted(self.octets, np.array([position]))[0]
+        count = 0
+        while self.verify is not None:
+            starts = position - spacing * np.arange(count + 1, count + 1 + LED_BACK, dtype=np.int64)
+            starts = starts[starts >= end]
+            valid = self._are_valid(starts, np.full(starts.size, polarity))
+            if not valid.all() or starts.size < LED_BACK:
+                return count + int(np.argmin(np.append(valid, False)))
+            count += starts.size
+        return 0
+
+    def _stand(self, starts: IntArray, polarity: np.bool_) -> tuple[BoolArray, np.bool_]:
+        """Return where a frame stands, by its marker, else by its code or checksum; and the polarity of the last one.
+
+        `polarity` is that of the frame before; a damaged marker does not change it.
+        """
+        wrong, inverted = _marker_errors(self.octets, starts)
+        stands = wrong <= self.tolerance
+        if stands.all():
+            return stands, inverted[-1]
+        sound = np.flatnonzero(stands)
+        place = np.searchsorted(sound, np.arange(starts.size), side="right")
+        inverted = np.append(polarity, inverted[sound])[place]
+        doubtful = np.flatnonzero(~stands & (starts + 8 * self.period <= 8 * self.octets.size))
+        stands[doubtful] = self._are_valid(starts[doubtful], inverted[doubtful])
+        return stands, inverted[-1]
 
     def _search(self, first: int, free: int, distances: tuple[int, ...]) -> int | None:
         """Return the first bit from `first` on at which a CADU probably begins; None if there is none.
@@ -253,7 +303,7 @@ class _Synchroniser:
                     return lone if followed.at is None else followed.at
                 if at + length > total:
                     continue
-                if self._is_valid(candidates[k : k + 1], inverted[k : k + 1], wrong[k : k + 1]):
+                if self._are_valid(candidates[k : k + 1], inverted[k : k + 1])[0]:
                     return at
                 if has_follower[k]:
                     followed.offer(at, int(wrong[k]))
@@ -265,11 +315,12 @@ class _Synchroniser:
             return followed.at
         return cut_off.at if lone is None else lone
 
-    def _is_valid(self, start_bit: IntArray, inverted: BoolArray, wrong: IntArray) -> bool:
-        """Return whether the CADU at a start bit (1,) has a valid code or checksum; False if it has neither."""
-        if self.verify is None:
-            return False
-        return bool(self.verify(CaduSync(start_bit, inverted, wrong, start_bit[:0], self.period))[0])
+    def _are_valid(self, start_bits: IntArray, inverted: BoolArray) -> BoolArray:
+        """Return whether the CADU at each start bit (n,) has a valid code or checksum; False if it has neither."""
+        if self.verify is None or not start_bits.size:
+            return np.zeros(start_bits.size, dtype=np.bool_)
+        unknown = np.zeros(start_bits.size, dtype=np.int64)
+        return self.verify(CaduSync(start_bits, inverted, unknown, start_bits[:0], self.period))
 
     def _followers(
         self, candidates: IntArray, inverted: BoolArray, distances: tuple[int, ...]
