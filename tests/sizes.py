@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "tests" / "sizes.csv"
 PACKAGES = (
-    "ground_service", "payload_emulator", "tmtc", "lunar", "reports", "linna", "studies",
+    "ground_service", "payload_emulator", "tmtc", "lunar", "kernels", "reports", "linna", "studies",
     "benchmarks", "db", "deploy", "tests",
 )  # fmt: skip
 LAYOUT = {
