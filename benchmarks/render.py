@@ -18,10 +18,11 @@ import math
 import os
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import find_data
@@ -34,14 +35,18 @@ from payload_emulator.sim.render.cycles import render_scene
 from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_scene
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.light import paper_light, sun_direction_mcmf
+from payload_emulator.sim.render.renderer import Rendering
 from payload_emulator.sim.render.rims import rim_errors
 from payload_emulator.sim.render.sensor import SensorModel, expose
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.tiles import TiledTerrain
-from studies.renderers import compare_renderings, thinned
 
 REPEATS = 9
 CAMERA = PinholeCamera()
+SHADOW = 0.5
+"""Ground that sees less of the Sun's disc is in shadow."""
+
+FULLY_LIT = 0.95
 SIZES_M = ((5e3, 10e3), (10e3, 15e3), (15e3, 30e3), (5e3, 30e3))
 
 
@@ -57,6 +62,30 @@ class Region:
 PROCEDURAL = Region((-55.0, 55.0), (0.0, 360.0), (10.0, 20.0))
 # Western Procellarum to the southern highlands, away from the edges of the available tiles.
 REAL = Region((-50.0, 50.0), (286.0, 298.0), (-25.0, 295.0))
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Agreement:
+    """Of one renderer with another.
+
+    Attributes
+    ----------
+    shadow_iou
+        Pixels dark in both over pixels dark in either; NaN without any.
+    radiance_rmse
+        Root mean square difference where both see the whole Sun, as a share of the reference's mean there; each view
+        against its own mean.
+    correlation
+        Of radiance over all pixels on the Moon, the mean over views.
+    views, dark_pixels
+        What the figures come from; dark in either.
+    """
+
+    shadow_iou: float
+    radiance_rmse: float
+    correlation: float
+    views: int
+    dark_pixels: int
 
 
 def speed(terrain: TiledTerrain, region: Region, blender: str) -> dict[str, object]:
@@ -165,6 +194,44 @@ def agreement(terrain: TiledTerrain, region: Region, poses: int, every: int) -> 
             f"{low / 1e3:g}-{high / 1e3:g} km": _rims(found, low, high) for low, high in SIZES_M
         },
     }
+
+
+def compare_renderings(reference: Sequence[Rendering], other: Sequence[Rendering]) -> Agreement:
+    """Agreement over views: renderings of the same ones by two renderers, in the same order."""
+    both = either = 0
+    errors, correlations = [], []
+    for one, two in zip(reference, other, strict=True):
+        ground = np.isfinite(one.range_m) & np.isfinite(two.range_m)
+        dark, also = ground & (one.lit < SHADOW), ground & (two.lit < SHADOW)
+        both += int(np.count_nonzero(dark & also))
+        either += int(np.count_nonzero(dark | also))
+        lit = ground & (one.lit > FULLY_LIT) & (two.lit > FULLY_LIT)
+        if lit.any():
+            expected = one.radiance[lit].astype(np.float64)
+            errors.append(float(np.mean((two.radiance[lit] - expected) ** 2)) / float(expected.mean()) ** 2)
+        correlations.append(_correlation(one.radiance[ground], two.radiance[ground]))
+    return Agreement(
+        shadow_iou=both / either if either else math.nan,
+        radiance_rmse=math.sqrt(float(np.mean(errors))) if errors else math.nan,
+        correlation=float(np.mean(correlations)) if correlations else math.nan,
+        views=len(reference),
+        dark_pixels=either,
+    )
+
+
+def thinned(rendering: Rendering, every: int) -> Rendering:
+    """Each so-manieth pixel of each so-manieth row, as `raymarch.render` gives with the same ``every``."""
+    return Rendering(
+        rendering.radiance[::every, ::every],
+        rendering.lit[::every, ::every],
+        rendering.range_m[::every, ::every],
+    )
+
+
+def _correlation(one: NDArray[np.float32], two: NDArray[np.float32]) -> float:
+    if one.size < 2 or one.std() == 0.0 or two.std() == 0.0:
+        return math.nan
+    return float(np.corrcoef(one, two)[0, 1])
 
 
 def _rims(found: np.ndarray, low_m: float, high_m: float) -> dict[str, float]:

@@ -98,7 +98,6 @@ class Rolling:
             "LINNA_DATABASE_URL": self.service_url,
             "LINNA_MIGRATION_DATABASE_URL": self.database.url,
             "LINNA_BROKER_URL": f"redis://127.0.0.1:{broker}/0",
-            "LINNA_RATE_LIMIT_PER_S": "0",
             "LINNA_TRUSTED_PROXIES": "127.0.0.1/32",
             "LINNA_DRAIN_S": str(drain_s),
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -59,88 +59,6 @@ def save_fov_study(
         axes.set_xlabel("full field of view, degrees")
         axes.set_title(f"Probability of craters in the footprint; at least {needed} are needed")
         axes.legend(loc="lower right", bbox_to_anchor=(0.995, 0.02) if selected_fov_deg < 90 else None)
-        _caption(figure, caption)
-
-
-def save_anchoring_study(path: Path, scores: Sequence[Mapping[str, Any]], caption: str) -> None:
-    """Median and 95th percentile of the position error over the number of craters on board, by how they were chosen."""
-    with _sheet(path, 7.2, 4.4) as figure:
-        axes = figure.add_axes((0.11, 0.21, 0.85, 0.68))
-        whole = [
-            score for score in scores if not any(other["craters"] > score["craters"] for other in scores)
-        ]
-        styles = (("random", "sky", "o"), ("largest", "vermillion", "^"), ("spread", "green", "s"))
-        for choice, role, marker in styles:
-            # However they are chosen, all craters are the same craters.
-            mine = [score for score in scores if score["choice"] == choice]
-            mine = sorted(
-                mine + [score for score in whole if score not in mine], key=lambda one: one["craters"]
-            )
-            count = [score["craters"] for score in mine]
-            axes.plot(
-                count, [score["median_m"] for score in mine], "-", color=color(role), marker=marker,
-                markersize=4, label=f"{choice}: median",
-            )  # fmt: skip
-            axes.plot(
-                count, [score["p95_m"] for score in mine], ":", color=color(role), label=f"{choice}: 95 %"
-            )
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("craters in the on-board catalogue")
-        axes.set_ylabel("position error with images, m")
-        axes.set_title("Navigation error over the size of the anchoring catalogue")
-        axes.legend(loc="upper right", ncols=3)
-        _caption(figure, caption)
-
-
-def save_drift_study(
-    path: Path,
-    curves: Mapping[str, tuple[FloatArray, Sequence[FloatArray], Sequence[FloatArray]]],
-    caption: str,
-) -> None:
-    """Median position error over time by condition: with images, then coasting, and without images (dashed).
-
-    `curves` holds times (n,) in seconds, and the errors of every pass with and without images, by name.
-    """
-    factors: dict[str, list[str]] = {}
-    for name in curves:
-        if name != "nominal":
-            factors.setdefault(name.partition(":")[0], []).append(name)
-    columns = min(2, max(len(factors), 1))
-    rows = -(-max(len(factors), 1) // columns)
-    tints = ("vermillion", "green", "purple", "orange")
-    with _sheet(path, 9.0, 0.9 + 2.7 * rows) as figure:
-        grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-        for place, factor in enumerate(factors or {"nominal": []}):
-            axes = grid[place // columns][place % columns]
-            shown = ["nominal", *factors.get(factor, [])] if "nominal" in curves else factors.get(factor, [])
-            for name, tint in zip(shown, ("blue", *tints), strict=False):
-                seconds, vision, propagation = curves[name]
-                axes.plot(
-                    seconds / 60.0, np.median(np.stack(vision), axis=0), color=color(tint), linewidth=1.1,
-                    label=name.partition(": ")[2] or name,
-                )  # fmt: skip
-                axes.plot(
-                    seconds / 60.0, np.median(np.stack(propagation), axis=0), color=color(tint),
-                    linestyle=(0, (4, 2)), linewidth=0.8,
-                )  # fmt: skip
-            axes.set_yscale("log")
-            axes.set_title(factor)
-            axes.legend(fontsize="x-small", loc="upper right")
-        for axes in grid.flat[len(factors) or 1 :]:
-            axes.set_axis_off()
-        for axes in grid[-1]:
-            axes.set_xlabel("minutes from the start")
-        for row in grid:
-            row[0].set_ylabel("position error, m")
-        figure.subplots_adjust(
-            left=0.08,
-            right=0.985,
-            top=1 - 0.3 / figure.get_figheight(),
-            bottom=0.95 / figure.get_figheight(),
-            wspace=0.06,
-            hspace=0.22,
-        )
         _caption(figure, caption)
 
 

@@ -52,7 +52,7 @@ class Laptop:
         self.home = folder / "home"
         self.url: str | None = None
         command = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
-        environment = service_environment(LINNA_HOME=str(self.home), LINNA_RATE_LIMIT_PER_S="0", **settings)
+        environment = service_environment(LINNA_HOME=str(self.home), **settings)
         self.parts = {"api": Part(command, folder / "api.log", lambda: listens(port), env=environment)}
         self.parts["api"].start()
 
@@ -98,7 +98,6 @@ class Deployment:
             LINNA_HOME=str(self.home),
             LINNA_DATABASE_URL=self.url,
             LINNA_BROKER_URL=broker.url,
-            LINNA_RATE_LIMIT_PER_S="0",
             **settings,
         )
         linna = [sys.executable, "-m", "linna"]
@@ -149,7 +148,6 @@ class ManyApis:
                 "LINNA_HOME": str(self.home),
                 "LINNA_DATABASE_URL": url,
                 "LINNA_BROKER_URL": self.broker_url,
-                "LINNA_RATE_LIMIT_PER_S": "0",
             }
             | settings
         )

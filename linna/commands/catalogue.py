@@ -46,18 +46,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(adding)
     adding.set_defaults(handler=run_add)
     from linna.commands._catalogue_landmarks import configure as configure_landmarks
-    from linna.commands._catalogue_minimum import configure as configure_minimum
-    from linna.commands._catalogue_surface import configure as configure_surface
 
     configure_landmarks(
         commands.add_parser("landmarks", help="compare the map made by the payload with a catalogue")
-    )
-
-    configure_minimum(
-        commands.add_parser("minimum", help="how few landmarks keep the error of navigation bounded")
-    )
-    configure_surface(
-        commands.add_parser("surface", help="error of the ground that crater rims give the laser altimeter")
     )
 
 

@@ -16,7 +16,7 @@ from linna.commands._detector_common import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from linna.commands import _detector_domain, _detector_make, _detector_pictures, _detector_studies
+    from linna.commands import _detector_make, _detector_pictures
 
     verbs = parser.add_subparsers(title="verbs", required=True)
 
@@ -25,9 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_calibrate(verbs)
     _add_evaluate(verbs)
     _add_compare(verbs)
-    _detector_studies.configure(verbs)
     _detector_make.configure(verbs)
-    _detector_domain.configure(verbs)
     _detector_pictures.configure(verbs)
     _add_bench_and_info(verbs)
 
@@ -227,6 +225,15 @@ def _add_compare(verbs: Any) -> None:
     add_json_flag(compare)
     compare.set_defaults(handler=_compare)
 
+    choose = verbs.add_parser(
+        "choose",
+        help="which of several models flies, by the validation split alone (shipped: the one that does)",
+    )
+    choose.add_argument("models", nargs="+", metavar="M.onnx", help='files, or "shipped"')
+    choose.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    add_json_flag(choose)
+    choose.set_defaults(handler=_choose)
+
 
 def _add_bench_and_info(verbs: Any) -> None:
     from linna.output import add_json_flag
@@ -251,8 +258,8 @@ def _train(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.vision.preprocess import Preparation
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.data.feeder import TrainParameters
+    from payload_emulator.training.data.landmarks import load_landmarks
     from payload_emulator.training.data.refits import load_refitted
-    from payload_emulator.training.evaluate.landmarks import load_landmarks
     from payload_emulator.training.model.train import train
 
     restart_for_training()
@@ -382,6 +389,20 @@ def _compare(arguments: argparse.Namespace) -> int:
     if arguments.picture is not None:
         draw_comparison(pair, arguments.picture)
     emit(arguments, document, format_comparison(document))
+    return 0
+
+
+def _choose(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, progress
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.evaluate.choice import choose, format_choice
+
+    document = choose(
+        {name: model_octets(None if name == "shipped" else Path(name)) for name in arguments.models},
+        [Dataset(folder) for folder in arguments.dataset],
+        lambda frames: progress(frames, len(frames), "validate", "frames"),
+    )
+    emit(arguments, document, format_choice(document))
     return 0
 
 

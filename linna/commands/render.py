@@ -1,4 +1,4 @@
-"""`linna render`: frames of a scenario as a picture, a labelled contact sheet, or renderers side by side."""
+"""`linna render`: a frame of a scenario as a picture, or several on a labelled contact sheet."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ SHEET_COLUMNS = 3
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Render one frame; with --sheet several frames on one picture; with --compare the same frames by every "
-        "renderer, side by side with figures of how they agree. Sheets take the epochs named, or --views frames "
-        "spread over the scenario's observation windows."
+        "Render one frame; with --sheet several frames on one picture. Sheets take the epochs named, or --views "
+        "frames spread over the scenario's observation windows."
     )
     parser.add_argument(
         "scenario", type=Path, metavar="SCENARIO", help="scenario file, or the name of a shipped one"
@@ -35,9 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="F.png", help="RGB picture to write")
     parser.add_argument("--renderer", choices=RENDERERS, default="fast", help="default: fast")
     parser.add_argument("--sheet", action="store_true", help="a contact sheet of several frames")
-    parser.add_argument(
-        "--compare", action="store_true", help="all renderers side by side on several frames, with figures"
-    )
     parser.add_argument(
         "--views",
         type=int,
@@ -84,10 +80,6 @@ def run_render(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--views: expected 1 to 60 frames, found {arguments.views}")
     if arguments.tilt is not None and not abs(arguments.tilt) <= 60.0:
         raise UsageError(f"--tilt: expected -60 to 60 degrees, found {arguments.tilt:g}")
-    if arguments.sheet and arguments.compare:
-        raise UsageError("--sheet and --compare: expected one of them, found both")
-    if arguments.compare:
-        return _run_compare(arguments)
     if arguments.sheet:
         return _run_sheet(arguments)
     if len(arguments.epoch) != 1:
@@ -158,41 +150,6 @@ def _run_sheet(arguments: argparse.Namespace) -> int:
         "data": list(world.data_names),
     }
     text = f"{arguments.out}: {len(frames)} frames; craters of classes 0, 1, 2: {', '.join(map(str, counts))}"
-    emit(arguments, figures, text)
-    return 0
-
-
-def _run_compare(arguments: argparse.Namespace) -> int:
-    from linna.data import blender_python
-    from payload_emulator.session.frame import blender_at_hand, view_at
-    from payload_emulator.training.evaluate.sheets import comparison_sheet, save_png
-    from studies.renderers import compare_on_views
-
-    world, epochs = _views(arguments)
-    views = [view_at(world, utc_ns) for utc_ns in epochs]
-    python = blender_python()
-    names = RENDERERS if blender_at_hand(python) else RENDERERS[:2]
-    if "cycles" not in names:
-        log("cycles is left out: name an interpreter that has Blender's bpy in LINNA_BLENDER_PYTHON")
-    made, agreements = compare_on_views(
-        world, views, names, python, lambda jobs, total: progress(jobs, total, "render", "pictures")
-    )
-    captions = [_caption(world, view) for view in views]
-    save_png(comparison_sheet(made, captions, world.scenario.sensor, world.scenario.seed), arguments.out)
-    figures: dict[str, Any] = {
-        "image": str(arguments.out),
-        "renderers": list(names),
-        "views": captions,
-        **{name: dataclasses.asdict(row) for name, row in agreements.items()},
-        "terrain": world.terrain.name,
-        "data": list(world.data_names),
-    }
-    lines = [
-        f"{name.replace('_', ' ')}: shadow IoU {row.shadow_iou:.3f}, radiance RMSE of lit pixels "
-        f"{100.0 * row.radiance_rmse:.1f} %, correlation {row.correlation:.3f}"
-        for name, row in agreements.items()
-    ]
-    text = "\n".join([f"{arguments.out}: {len(views)} views over {world.terrain.name}", *lines])
     emit(arguments, figures, text)
     return 0
 

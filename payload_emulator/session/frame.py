@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import sys
 from collections.abc import Sequence
@@ -99,11 +98,6 @@ def require_renderer(name: str) -> None:
         raise ScenarioError(f"renderer: expected one of {', '.join(RENDERERS)}, found {name!r}")
 
 
-def blender_at_hand(blender_python: str) -> bool:
-    """Whether another interpreter was named for Blender, or this one can import it."""
-    return blender_python != sys.executable or importlib.util.find_spec("bpy") is not None
-
-
 def world_at(scenario: Scenario, data: DataFolder, epochs_utc_ns: Sequence[int]) -> World:
     """The scenario's world, flown as far as the last of the epochs.
 
@@ -160,28 +154,6 @@ def view_at(world: World, utc_ns: int) -> View:
     return View(utc_ns, position, world.camera_from_mcmf(position), sun)
 
 
-def render_view(
-    world: World,
-    view: View,
-    renderer_name: str,
-    blender_python: str = sys.executable,
-    photometry: Photometry | None = None,
-    settings: CyclesSettings | None = None,
-) -> tuple[Rendering, bytes]:
-    """The picture before the sensor, and Cycles' Filmic PNG (empty from other renderers).
-
-    ``photometry`` stands in for the scenario's, ``settings`` for the paper's in Cycles.
-    """
-    pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
-    law = photometry or Photometry(world.scenario.light.photometry)
-    if renderer_name == "cycles":
-        from payload_emulator.sim.render.cycles import render_scene
-
-        picture = render_scene(describe_scene(*pose, law), settings or CyclesSettings(), blender_python)
-        return picture.rendering, picture.filmic_png
-    return {"fast": renderer.render, "raymarch": raymarch.render}[renderer_name](*pose, law), b""
-
-
 def take_frame(
     world: World,
     view: View,
@@ -196,7 +168,15 @@ def take_frame(
     ScenarioError
         The paper's labels were asked for of a camera that does not look straight down, image up to the north.
     """
-    rendering, filmic_png = render_view(world, view, renderer_name, blender_python)
+    pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
+    law, filmic_png = Photometry(world.scenario.light.photometry), b""
+    if renderer_name == "cycles":
+        from payload_emulator.sim.render.cycles import render_scene
+
+        picture = render_scene(describe_scene(*pose, law), CyclesSettings(), blender_python)
+        rendering, filmic_png = picture.rendering, picture.filmic_png
+    else:
+        rendering = {"fast": renderer.render, "raymarch": raymarch.render}[renderer_name](*pose, law)
     # The noise is drawn from a separate stream: light and noise of a view do not depend on each other.
     rng = np.random.default_rng((world.scenario.seed, view.utc_ns, 1))
     metadata = metadata_of(world, view) | {"renderer": renderer_name, "label_rule": label_rule}

@@ -119,7 +119,6 @@ class DistributedGround(MissionGround):
             "LINNA_DATABASE_URL": url,
             "LINNA_BROKER_URL": broker,
             "LINNA_CLOCK_FILE": str(clock_file.absolute()),
-            "LINNA_RATE_LIMIT_PER_S": "0",
             "LINNA_LINKS": "false",
             "LINNA_PLAN_HOURLY": "false",
             "LINNA_ALLOW_DATABASE_OWNER": "false" if servers.database_url is None else "true",

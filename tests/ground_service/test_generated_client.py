@@ -28,7 +28,7 @@ PACKAGE = "linna_generated_client"
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api"), rate_limit_per_s=0))) as opened:
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api")))) as opened:
         yield opened
 
 

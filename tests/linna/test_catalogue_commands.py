@@ -127,8 +127,6 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
         (["catalogue", "register", "none.csv"], "--terrain: expected height rasters"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
-        (["catalogue", "minimum", "--shares", "2"], "--shares"),
-        (["catalogue", "minimum", "--hours", "0"], "--hours"),
         (["identify", "tracking", "--recall", "2"], "--recall"),
         (["identify", "lost", "--frames", "0"], "--frames"),
         (["identify", "lost", "--hostile"], "--hostile: expected --scenario"),

@@ -150,14 +150,6 @@ def test_a_camera_that_cannot_be_is_refused(write_image, capsys, extra, words):
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("hide", "words"), [("1.5", "--hide: expected a share"), ("-0.1", "--hide: expected a share")]
-)
-def test_a_share_to_hide_outside_its_bounds_is_refused(tmp_path, capsys, hide, words):
-    assert run(["detector", "landmarks", "--dataset", str(tmp_path), f"--hide={hide}"]) == 2
-    assert words in capsys.readouterr().err
-
-
 def test_a_black_picture_is_a_verdict_not_an_error(write_image, capsys):
     assert (
         run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"])
@@ -204,13 +196,6 @@ def test_bench_reports_latency_memory_and_size(capsys):
     figures = json.loads(capsys.readouterr().out)
     assert {"median_ms", "p99_ms", "peak_rss_mb", "model_bytes"} <= set(figures)
     assert figures["model_bytes"] <= 6_000_000
-
-
-def test_a_variant_that_there_is_not_is_refused(tmp_path, capsys):
-    assert (
-        run(["detector", "ablate", str(tmp_path), "--out", str(tmp_path), "--only", "recipe", "magic"]) == 2
-    )
-    assert "--only: expected names among recipe, one-strip" in capsys.readouterr().err
 
 
 def test_a_run_without_its_data_set_is_refused(tmp_path, capsys):

@@ -90,19 +90,6 @@ def test_a_sheet_holds_the_epochs_named(scenario, tmp_path, capsys):
     assert cv2.imread(str(out)).shape[1] > 2 * 96
 
 
-def test_renderers_are_compared_with_figures(scenario, tmp_path, capsys, monkeypatch):
-    monkeypatch.delenv("LINNA_BLENDER_PYTHON", raising=False)
-    monkeypatch.setattr("payload_emulator.session.frame.blender_at_hand", lambda python: False)
-    out = tmp_path / "e.png"
-    status, figures, log = run(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out), "--compare")
-    assert status == 0 and figures["renderers"] == ["fast", "raymarch"]
-    assert "cycles is left out" in log
-    row = figures["fast_vs_raymarch"]
-    assert row["views"] == 1 and row["radiance_rmse"] <= 0.03 and row["correlation"] > 0.95
-    # Two pictures and the map of their shadows, one under another.
-    assert cv2.imread(str(out)).shape[0] > 3 * 96
-
-
 def test_cycles_without_blender_is_one_line(scenario, tmp_path, capsys, monkeypatch):
     (tmp_path / "bpy.py").write_text("raise ImportError('none')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -122,7 +109,6 @@ def test_cycles_without_blender_is_one_line(scenario, tmp_path, capsys, monkeypa
         (("--epoch", "2029-08-06T00:00:00Z", "--out", "x.png"), "at or after the scenario's 2029-08-07"),
         (("--epoch", EPOCHS[0], "--out", "x.png", "--tilt", "75"), "expected -60 to 60 degrees, found 75"),
         (("--epoch", EPOCHS[0], "--out", "x.png", "--views", "0"), "expected 1 to 60 frames, found 0"),
-        (("--sheet", "--compare", "--out", "x.png"), "expected one of them, found both"),
         (("--epoch", EPOCHS[0], "--out", "x.png", "--tilt", "3", "--label-rule", "paper"), "nadir camera"),
         (("--epoch", EPOCHS[0], "--out", "x.png", "--terrain", "raster"), "height rasters"),
     ],

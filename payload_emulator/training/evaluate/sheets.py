@@ -1,18 +1,16 @@
-"""Pictures for people: labels drawn on frames as in the paper's Fig. 5, contact sheets, renderers side by side."""
+"""Pictures for people: labels drawn on frames as in the paper's Fig. 5, contact sheets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lunar.arrays import OctetArray
-from payload_emulator.sim.render.renderer import Rendering
-from payload_emulator.sim.render.sensor import Picture, SensorModel, auto_exposure, take_picture
+from payload_emulator.sim.render.sensor import Picture
 
 Rgb = OctetArray
 
@@ -68,41 +66,6 @@ def contact_sheet(pictures: Sequence[Rgb], captions: Sequence[str], columns: int
         top = GAP_PX + number // columns * (high + GAP_PX)
         left = GAP_PX + number % columns * (wide + GAP_PX)
         sheet[top : top + high, left : left + wide] = cell
-    return sheet
-
-
-def comparison_sheet(
-    renderings: Mapping[str, Sequence[Rendering]], captions: Sequence[str], sensor: SensorModel, seed: int
-) -> Rgb:
-    """A row of pictures per renderer, a column per view, then where their shadows differ from the first renderer's.
-
-    All pictures of a view are exposed with one exposure, the first renderer's, and one draw of noise.
-    """
-    names = list(renderings)
-    first = renderings[names[0]]
-    exposures = [sensor.exposure or auto_exposure(one.radiance, sensor) / sensor.gain for one in first]
-    cells, texts = [], []
-    for name in names:
-        for number, one in enumerate(renderings[name]):
-            set_sensor = replace(sensor, exposure=exposures[number])
-            rng = np.random.default_rng((seed, number))
-            cells.append(eight_bits(take_picture(one.radiance, set_sensor, rng)))
-            texts.append(f"{name}  {captions[number]}")
-    for name in names[1:]:
-        cells += [shadow_map(one, other) for one, other in zip(first, renderings[name], strict=True)]
-        texts += [f"shadow: red {name} only, blue {names[0]} only"] * len(first)
-    return contact_sheet(cells, texts, len(first))
-
-
-def shadow_map(reference: Rendering, other: Rendering) -> Rgb:
-    """Where two renderings agree on shadow (dark) and Sun (light); red where only ``other`` is dark, blue where only
-    ``reference`` is.
-    """
-    dark, also = reference.lit < 0.5, other.lit < 0.5
-    sheet = np.full((*dark.shape, 3), 215, np.uint8)
-    sheet[dark & also] = 60
-    sheet[~dark & also] = (230, 40, 40)
-    sheet[dark & ~also] = (40, 80, 240)
     return sheet
 
 

@@ -29,8 +29,8 @@ from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
+from payload_emulator.training.data.landmarks import Landmarks, with_landmarks
 from payload_emulator.training.data.refits import RefittedRims, refitted_frame
-from payload_emulator.training.evaluate.landmarks import Landmarks, with_landmarks
 from payload_emulator.training.model.curves import append_curve, draw_curves
 
 if TYPE_CHECKING:

@@ -64,7 +64,7 @@ OCTETS = (
 @pytest.fixture(scope="module")
 def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service with one of everything; errors are answered, not raised, as they are in operation."""
-    settings = Settings(home=tmp_path_factory.mktemp("nasty"), upload_limit_mib=1, rate_limit_per_s=0.0)
+    settings = Settings(home=tmp_path_factory.mktemp("nasty"), upload_limit_mib=1)
     with TestClient(create_app(settings, inline_jobs=True), raise_server_exceptions=False) as opened:
         ground = opened.app.state.ground
         import_archive(ground, synthetic_pass.folder)

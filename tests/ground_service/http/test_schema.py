@@ -74,7 +74,7 @@ class Queue:
 def client(
     request: pytest.FixtureRequest, synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[TestClient]:
-    deployment = Settings(home=tmp_path_factory.mktemp("fuzz"), rate_limit_per_s=0)
+    deployment = Settings(home=tmp_path_factory.mktemp("fuzz"))
     if request.param == "postgresql":
         url = request.getfixturevalue("new_postgres_database")()
         prepare_database(url, upgrade=True).engine.dispose()

@@ -25,7 +25,7 @@ from lunar.datafolder import DataFolder
 from payload_emulator.session.replay import FlightBuild, replay_archive
 from payload_emulator.session.suite import suite_scenarios, write_suite
 from payload_emulator.training.data.feeder import TrainParameters
-from payload_emulator.training.evaluate.landmarks import load_landmarks
+from payload_emulator.training.data.landmarks import load_landmarks
 from payload_emulator.training.model.export import export
 from payload_emulator.training.model.train import train
 from tests.ground_service.conftest import write_manifest

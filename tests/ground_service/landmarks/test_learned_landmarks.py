@@ -30,7 +30,7 @@ from ground_service.landmarks.store import list_landmarks
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.training.evaluate.landmarks import load_landmarks
+from payload_emulator.training.data.landmarks import load_landmarks
 from tests.ground_service.conftest import SyntheticPass, write_manifest
 from tmtc.dictionary import DICTIONARY
 from tmtc.large_data import LargeDataReceiver

@@ -100,7 +100,6 @@ def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> I
             database_url=server_url,
             broker_url=processes.broker_url,
             links=False,
-            rate_limit_per_s=0.0,
         )
         with TestClient(create_app(settings)) as client:
             yield processes, client

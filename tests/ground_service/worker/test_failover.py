@@ -67,7 +67,7 @@ def test_a_killed_primary_is_replaced_and_no_acknowledged_upload_is_lost(
         token = add_user(ground, "ann", "operator")
     port = free_port()
     environment = bare_environment(
-        LINNA_HOME=str(tmp_path / "home"), LINNA_DATABASE_URL=cluster.url, LINNA_RATE_LIMIT_PER_S="0"
+        LINNA_HOME=str(tmp_path / "home"), LINNA_DATABASE_URL=cluster.url
     )
     serve = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
     api = Part(serve, tmp_path / "api.log", functools.partial(listens, port), env=environment)

@@ -11,7 +11,6 @@ from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.training.data.feeder import TrainParameters
 from payload_emulator.training.evaluate.evaluate import evaluate
 from payload_emulator.training.model.export import PARITY_LIMIT, export
-from payload_emulator.training.model.quantise import quantise
 from payload_emulator.training.model.train import train
 
 ONE_STEP = TrainParameters(
@@ -55,14 +54,3 @@ def test_a_network_without_class_heatmaps_is_no_papers_variant(blob_dataset, tmp
     train([blob_dataset], tmp_path, replace(ONE_STEP, paper_classes=False, depth=False))
     with pytest.raises(ModelError, match="expected a network with the paper's class heatmaps"):
         export(tmp_path / "checkpoint.pt", tmp_path / "p.onnx", [], paper_classes=True)
-
-
-def test_eight_bits_make_the_network_smaller_and_keep_its_answers_near(exported, blob_dataset):
-    octets, _ = exported
-    small = quantise(octets, [blob_dataset], frames=2)
-    assert len(small) < 0.5 * len(octets)
-    image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
-    full, coarse = (OnnxDetector(part).run_network(image)[1] for part in (octets, small))
-    # Eight bits through sixty layers of an untrained net: the maps must still be alike.
-    assert np.corrcoef(full[0, 2].ravel(), coarse[0, 2].ravel())[0, 1] > 0.8
-    assert OnnxDetector(small).metadata["score_threshold"] == OnnxDetector(octets).metadata["score_threshold"]

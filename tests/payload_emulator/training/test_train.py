@@ -13,8 +13,8 @@ import torch
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
+from payload_emulator.training.data.landmarks import Landmarks
 from payload_emulator.training.data.refits import RefittedRims
-from payload_emulator.training.evaluate.landmarks import Landmarks
 from payload_emulator.training.model import train as training
 from payload_emulator.training.model.export import load_network
 from payload_emulator.training.model.train import train
