@@ -225,7 +225,7 @@ def _propagations(model: ForceModel) -> None:
         ),
         2,
     )
-    for name in ("rkn86", "dop853", "rkf78"):
+    for name in ("rkn86", "dop853"):
         propagate(epoch_s, state[:3], state[3:], 60.0, model, integrator=name)
         ours_s = _best(
             lambda name=name: propagate(epoch_s, state[:3], state[3:], duration_s, model, integrator=name), 3

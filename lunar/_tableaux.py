@@ -3,7 +3,6 @@
 References
 ----------
 DOP853: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (2nd ed. 1993), section II.10, 8(5,3).
-RKF7(8): Fehlberg, NASA TR R-287 (1968), table X; 13 stages, the eighth-order solution is carried on.
 RKN8(6): Dormand, El-Mikkawy, Prince, IMA J. Numer. Anal. 7:235 (1987), RKN8(6)9FM, for accelerations that do not depend
 on velocity; 9 stages of which the last is the first of the next step.
 """
@@ -200,24 +199,6 @@ _DOP853_ERROR_3 = np.array(
     ]
 )
 
-_RKF78_C = np.array([0, 2 / 27, 1 / 9, 1 / 6, 5 / 12, 1 / 2, 5 / 6, 1 / 6, 2 / 3, 1 / 3, 1, 0, 1])
-_RKF78_A = _lower_triangle(
-    (2 / 27,),
-    (1 / 36, 1 / 12),
-    (1 / 24, 0, 1 / 8),
-    (5 / 12, 0, -25 / 16, 25 / 16),
-    (1 / 20, 0, 0, 1 / 4, 1 / 5),
-    (-25 / 108, 0, 0, 125 / 108, -65 / 27, 125 / 54),
-    (31 / 300, 0, 0, 0, 61 / 225, -2 / 9, 13 / 900),
-    (2, 0, 0, -53 / 6, 704 / 45, -107 / 9, 67 / 90, 3),
-    (-91 / 108, 0, 0, 23 / 108, -976 / 135, 311 / 54, -19 / 60, 17 / 6, -1 / 12),
-    (2383 / 4100, 0, 0, -341 / 164, 4496 / 1025, -301 / 82, 2133 / 4100, 45 / 82, 45 / 164, 18 / 41),
-    (3 / 205, 0, 0, 0, 0, -6 / 41, -3 / 205, -3 / 41, 3 / 41, 6 / 41, 0),
-    (-1777 / 4100, 0, 0, -341 / 164, 4496 / 1025, -289 / 82, 2193 / 4100, 51 / 82, 33 / 164, 12 / 41, 0, 1),
-)
-_RKF78_B = np.array([0, 0, 0, 0, 0, 34 / 105, 9 / 35, 9 / 35, 9 / 280, 9 / 280, 0, 41 / 840, 41 / 840])
-_RKF78_ERROR = np.array([1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, -1, -1]) * (41 / 840)
-
 _RKN86_C = np.array([0, 1 / 20, 1 / 10, 3 / 10, 1 / 2, 7 / 10, 9 / 10, 1, 1])
 _RKN86_A = _lower_triangle(
     (1 / 800,),
@@ -269,7 +250,4 @@ DOP853 = Tableau(
     *("dop853", False, _DOP853_C, _DOP853_A, _TWICE * _DOP853_B),
     *(_TWICE * _DOP853_ERROR_5, _DOP853_ERROR_3, 8, 1e-10, 30.0),
 )
-RKF78 = Tableau(
-    "rkf78", False, _RKF78_C, _RKF78_A, _TWICE * _RKF78_B, _TWICE * _RKF78_ERROR, np.zeros(13), 8, 1e-10, 30.0
-)
-TABLEAUX = {tableau.name: tableau for tableau in (RKN86, DOP853, RKF78)}
+TABLEAUX = {tableau.name: tableau for tableau in (RKN86, DOP853)}

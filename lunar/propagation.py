@@ -5,7 +5,7 @@ Forces: gravity field to any degree in principal axes, tides of Earth and Sun, o
 the shadows of Moon and Earth.
 
 An adaptive method of order 8 takes the steps: the Runge-Kutta-Nystrom pair 8(6) of Dormand et al. (default: it uses
-that no force here depends on velocity), DOP853 of Hairer et al., or Fehlberg's 7(8).  Every accepted step is kept, and
+that no force here depends on velocity) or DOP853 of Hairer et al.  Every accepted step is kept, and
 between steps a quintic through position, velocity and acceleration at both ends is read, within 1 mm and 1e-4 m/s.
 On a low orbit at degree 100 the longest step of a method rules nearly always: the errors of equal steps cancel better
 than those of steps that follow the terrain.
@@ -13,7 +13,6 @@ than those of steps that follow the terrain.
 References
 ----------
 Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (1993), sections II.4 (step size) and II.10.
-Fehlberg, NASA TR R-287 (1968).
 """
 
 from __future__ import annotations
@@ -158,7 +157,7 @@ def propagate(
 ) -> Trajectory:
     """Return the orbit from a state at ``epoch_tdb_s`` over ``duration_s`` (negative: backwards).
 
-    ``integrator`` is "rkn86", "dop853" or "rkf78"; ``rtol`` (per step, of position and velocity) and ``max_step_s``
+    ``integrator`` is "rkn86" or "dop853"; ``rtol`` (per step, of position and velocity) and ``max_step_s``
     are by default what suits the method on a low orbit: 0.5 m or better over 30 days at degree 100.
 
     Raises

@@ -102,29 +102,6 @@ def test_an_untrained_network_fails_for_what_it_takes_for_craters(
     assert all(one["state"] == "judged" for one in figures["passes"])
 
 
-def test_bisecting_names_the_parameter_that_moved_a_figure(suite, home, capsys, tmp_path: Path) -> None:
-    """Three parameters are changed, one of which decides what is detected."""
-    (tmp_path / "good.toml").write_text('name = "good"\n')
-    (tmp_path / "bad.toml").write_text('name = "bad"\nparameters = "p.toml"\n')
-    (tmp_path / "p.toml").write_text(
-        "detector.score_threshold = 0.9\nflight.housekeeping_interval_s = 30.0\nflight.odometry.time_gap_s = 61.0\n"
-    )
-    builds = ("--good", str(tmp_path / "good.toml"), "--bad", str(tmp_path / "bad.toml"))
-    archive = str(suite / "suite-paper-light")
-    options = ("--figure", "detector.recall", "--home", str(home), "--json")
-    status = cli.run(["regress", "bisect", "--archive", archive, *builds, *options])
-    found = json.loads(capsys.readouterr().out)
-    assert status == 0
-    assert len(found["changes"]) == 3
-    assert [item["changes"] for item in found["culprits"]] == [["detector.score_threshold"]]
-    assert found["bad"] == found["culprits"][0]["value"] < found["good"]
-    same = ("--good", str(tmp_path / "good.toml"), "--bad", str(tmp_path / "good.toml"))
-    assert (
-        cli.run(["regress", "bisect", "--archive", archive, *same, "--figure", "x", "--home", str(home)]) == 2
-    )
-    assert "expected two that differ in model or parameters" in capsys.readouterr().err
-
-
 OPERATIONS = """
 name = "operations"
 seed = 7

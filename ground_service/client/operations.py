@@ -724,7 +724,7 @@ class Client(Connection):
         return self._post(Job, "/regressions", request, key=key or new_key())
 
     def start_analysis(self, request: Body, *, key: str | None = None) -> Job:
-        """Start the job that analyses builds without a verdict; its result is that of the analysis."""
+        """Start the job that computes the metrics of one build; its result has no verdict."""
         return self._post(Job, "/analyses", request, key=key or new_key())
 
     def list_regressions(self) -> Listing[RegressionSummary]:

@@ -35,9 +35,7 @@ class Format:
 _ALL = (
     Format("oem", "oem", "CCSDS OEM 2.0 (text) of the reference or of the navigation filter", states=True),
     Format("oem-xml", "xml", "CCSDS OEM 2.0 in XML", states=True),
-    Format("opm", "opm", "CCSDS OPM 2.0: one state at the start of the pass", states=True),
     Format("aem", "aem", "CCSDS AEM 1.0: attitude of the camera in each frame"),
-    Format("tdm", "tdm", "CCSDS TDM 2.0: directions to the craters that the payload identified", states=True),
     Format("spk", "bsp", "SPICE SPK: orbit", "spiceypy", "spice", states=True),
     Format("ck", "bc", "SPICE CK: attitude of the camera", "spiceypy", "spice"),
     Format("sclk", "tsc", "SPICE SCLK: on-board clock with the time correlations"),

@@ -1,4 +1,4 @@
-"""Orbit, attitude, sightings and SPICE kernels of a pass."""
+"""Orbit, attitude and SPICE kernels of a pass."""
 
 from __future__ import annotations
 
@@ -9,17 +9,14 @@ import numpy as np
 
 from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
-from ground_service.evaluation.detection.landmarks import FIRST_LANDMARK_ID
 from ground_service.exports.formats import REFERENCE
-from ground_service.exports.poses import Poses, no_such_states, states_names
-from ground_service.exports.tables import identified_craters
+from ground_service.exports.poses import no_such_states, states_names
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
 from lunar.aem import AttitudeSegment, format_aem
 from lunar.arrays import IntArray
 from lunar.ephemeris import Covariance, Ephemeris, clipped, ephemeris_from_states
 from lunar.oem import format_oem
 from lunar.oem_xml import format_oem_xml
-from lunar.opm import format_opm
 from lunar.spice import (
     ClockLine,
     ck_octets,
@@ -29,7 +26,6 @@ from lunar.spice import (
     spacecraft_id,
     spk_octets,
 )
-from lunar.tdm import Sightings, format_tdm
 from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
 
 FILTER = "anchored"
@@ -91,12 +87,10 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
 
 
 def orbit_octets(inputs: PassInputs, craft: Craft, kind: str, states: str) -> bytes:
-    """Return the orbit of a pass as `oem`, `oem-xml`, `opm` or `spk`."""
+    """Return the orbit of a pass as `oem`, `oem-xml` or `spk`."""
     ephemeris = ephemeris_of(inputs, states, craft)
     if kind == "spk":
         return spk_octets(ephemeris, spacecraft_id(craft.number))
-    if kind == "opm":
-        return format_opm(ephemeris, ephemeris.start_utc_ns).encode()
     return (format_oem_xml(ephemeris) if kind == "oem-xml" else format_oem(ephemeris)).encode()
 
 
@@ -117,43 +111,6 @@ def attitude_octets(inputs: PassInputs, craft: Craft, kind: str) -> bytes:
         return ck_octets(ticks, q_wxyz, spacecraft_id(craft.number), gap_ticks=int(GAP_STEPS * step))
     segment = AttitudeSegment(utc_ns, q_wxyz, object_name=craft.name, object_id=craft.name)
     return format_aem((segment,)).encode()
-
-
-def sightings_text(inputs: PassInputs, poses: Poses, craft: Craft) -> str:
-    """Return the directions to identified craters as TDM.
-
-    Raises
-    ------
-    EvaluationError
-        If the payload reported no identification.
-    """
-    samples, craters = inputs.detections, identified_craters(inputs)
-    frame = np.searchsorted(samples.offsets, np.arange(len(craters)), side="right") - 1
-    place = np.full(len(samples), -1, dtype=np.int64)
-    place[poses.row] = np.arange(len(poses.row))
-    chosen = (
-        np.flatnonzero((craters >= 0) & (place[frame] >= 0)) if len(craters) else np.zeros(0, dtype=np.int64)
-    )
-    if not len(chosen):
-        raise EvaluationError(
-            f"pass {inputs.pass_id}: expected craters that the payload identified, found none in its telemetry"
-        )
-    rays = inputs.viewing.camera.rays(np.column_stack([samples.u_px[chosen], samples.v_px[chosen]]))
-    where = place[frame[chosen]]
-    directions = np.einsum("nji,nj->ni", poses.camera_from_icrf[where], rays)
-    utc_ns = poses.utc_ns[where]
-    sightings = []
-    for crater in np.unique(craters[chosen]).tolist():
-        rows = np.flatnonzero(craters[chosen] == crater)
-        name = f"LANDMARK_{crater}" if crater >= FIRST_LANDMARK_ID else f"CRATER_{crater}"
-        sightings.append(Sightings(name, utc_ns[rows], directions[rows]))
-    known = inputs.viewing.known(poses.utc_ns)
-    attitude = "telemetered" if known.all() else "declared" if not known.any() else "telemetered or declared"
-    comments = [
-        "lines of sight of detected craters that the payload identified; times of exposure on board",
-        f"attitude of the camera: {attitude}",
-    ]
-    return format_tdm(sightings, craft.name, comments=comments)
 
 
 def clock_lines(correlations: Sequence[TimeCorrelation], ticks: IntArray) -> list[ClockLine]:

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, WithJsonSchema
 
+from ground_service.exports.formats import FORMATS
 from ground_service.http.model import Entity, Given
 
-FormatName = Literal[
-    "oem",
-    "oem-xml",
-    "opm",
-    "aem",
-    "tdm",
-    "spk",
-    "ck",
-    "sclk",
-    "fk",
-    "ik",
-    "geojson",
-    "gpkg",
-    "czml",
-    "parquet",
-    "netcdf",
-    "csv",
-    "tum",
-    "images",
-]
+
+def _known(name: str) -> str:
+    if name not in FORMATS:
+        raise ValueError(f"expected one of {', '.join(FORMATS)}, found {name!r}")
+    return name
+
+
+FormatName = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "string", "enum": list(FORMATS)})]
 
 
 class ExportRequest(Given):

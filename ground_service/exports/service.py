@@ -42,9 +42,8 @@ from ground_service.store.files import INCOMING, unfinished_prefix
 from lunar.frames import mcmf_from_spherical
 from tmtc.errors import MissingLibrary
 
-ORBITS = ("oem", "oem-xml", "opm", "spk")
+ORBITS = ("oem", "oem-xml", "spk")
 ATTITUDES = ("aem", "ck")
-TEXT_KERNELS = ("sclk", "fk", "ik")
 MAPS = ("geojson", "gpkg", "czml")
 SPOOLED_OCTETS = 8 << 20
 """A zip archive up to this size stays in memory."""
@@ -123,9 +122,7 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
         return messages.orbit_octets(inputs, craft, kind, request.states)
     if kind in ATTITUDES:
         return messages.attitude_octets(inputs, craft, kind)
-    if kind in TEXT_KERNELS:
-        return messages.text_kernel(inputs, craft, kind).encode()
-    return messages.sightings_text(inputs, poses_of(inputs, request.states), craft).encode()
+    return messages.text_kernel(inputs, craft, kind).encode()
 
 
 def _map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:

@@ -44,7 +44,7 @@ IDENTITY = {
     "replay": ("archive", "build"),
     "rendering": ("digest",),
     "regression": ("candidate", "baseline"),
-    "analysis": ("candidate", "baseline", "analysis"),
+    "analysis": ("candidate", "baseline"),
     "redecode": ("vehicle_id",),
     "re-evaluation": ("pass_id",),
     "automation": ("event",),

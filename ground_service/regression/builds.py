@@ -16,7 +16,7 @@ import stat
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -201,6 +201,35 @@ def load_build(given: str | Path) -> Build:
         flight_code=code,
         parameters=own["parameters"],
     )
+
+
+def changes(baseline: Build, candidate: Build) -> list[str]:
+    """Return what differs between two builds on the flight code; nothing is known of the inside of a program."""
+    if baseline.command or candidate.command:
+        return []
+    (old_network, old), (new_network, new) = _contents(baseline), _contents(candidate)
+    found = ["flight code"] if baseline.flight_code != candidate.flight_code else []
+    found += ["network"] if old_network != new_network else []
+    return found + [
+        f"{name} = {new.get(name, 'not set')} (baseline: {old.get(name, 'not set')})"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name)
+    ]
+
+
+def _contents(build: Build) -> tuple[str | None, dict[str, Any]]:
+    """Return the SHA-256 of the network of a build (None: the shipped one) and its parameters by dotted name."""
+    network = _read(build.file).get("model") if build.folder_needed else None
+
+    def flat(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+        for key, value in table.items():
+            if isinstance(value, dict):
+                yield from flat(value, f"{path}{key}.")
+            else:
+                yield f"{path}{key}", value
+
+    table = _read(build.folder / build.parameters) if build.parameters else {}
+    return dict(build.files).get(str(network)), dict(flat(table, ""))
 
 
 def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Build:

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
 from ground_service.jobs.store import set_progress
 from ground_service.regression.archives import kept_archives
@@ -23,7 +21,6 @@ from ground_service.regression.model import Comparison
 from ground_service.regression.outcome import PassVerdict, RegressionOutcome
 from ground_service.regression.pass_archives import archive_of_pass
 from ground_service.regression.rendering import settle_archive
-from ground_service.regression.search import bisect, differences
 from ground_service.regression.service import (
     do_replay,
     find_replay,
@@ -119,26 +116,8 @@ def regression_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) ->
 
 
 def analysis_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    """Run an analysis of builds (`AnalysisRequest`) and return what it found."""
-    policy = load_policy()
-    if arguments["analysis"] == "bisection":
-        for one in arguments["unusable"]:
-            raise InvalidInput("archives", "", "passes that both builds can fly", one["detail"])
-        found = bisect(
-            ground,
-            list(arguments["archives"]),
-            registered_build(ground, str(arguments["baseline"])),
-            registered_build(ground, str(arguments["candidate"])),
-            str(arguments["figure"]),
-            policy,
-            workers=arguments["workers"],
-            tell=lambda text: log.info("job %s: %s", job_id, text),
-        )
-        return asdict(found)
-    outcome = _outcome(ground, arguments, job_id, policy)
-    if arguments["analysis"] == "baseline":
-        return baseline_figures(outcome)
-    return {"passes": plain([asdict(one) for one in differences(outcome)])}
+    """Return the metrics of one build over archives."""
+    return baseline_figures(_outcome(ground, arguments, job_id, load_policy()))
 
 
 def _outcome(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
@@ -126,16 +126,6 @@ class RegressionRequest(Comparison):
         default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
     )
     policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
-
-
-class AnalysisRequest(Comparison):
-    """Builds to analyse without a verdict."""
-
-    analysis: Literal["baseline", "differences", "bisection"] = Field(
-        description="baseline: metrics of one build; differences: passes ordered by the difference of the builds; "
-        "bisection: the changes from baseline to candidate that changed a metric"
-    )
-    figure: str = Field(default="", max_length=100, description="Metric of a bisection")
 
 
 class JudgedBuild(Entity):

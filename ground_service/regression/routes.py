@@ -36,9 +36,9 @@ from ground_service.regression.builds import (
 from ground_service.regression.gates.policy import read_policy
 from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import (
-    AnalysisRequest,
     ArchiveChange,
     Build,
+    Comparison,
     KeptArchive,
     Pruned,
     Regression,
@@ -163,13 +163,12 @@ def start_analysis(
     ground: GroundOf,
     caller: Operator,
     dispatcher: DispatcherOf,
-    given: AnalysisRequest,
+    given: Comparison,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
-    """Run an analysis of builds as a job; its result has no verdict."""
-    arguments = {**compared(ground, given), "analysis": given.analysis, "figure": given.figure}
+    """Return the metrics of one build (candidate and baseline alike) as a job, without a verdict."""
     job_id = idempotent_id("analysis", caller, idempotency_key)
-    job = dispatcher.submit("analysis", arguments, job_id=job_id)
+    job = dispatcher.submit("analysis", compared(ground, given), job_id=job_id)
     response.headers["Location"] = f"{API_PREFIX}/jobs/{job}"
     return get_job(ground, job)
 

@@ -33,7 +33,7 @@ from ground_service.regression.archives import (
     working_folder,
 )
 from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
-from ground_service.regression.builds import Build
+from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
 from ground_service.regression.gates.core import (
     NOT_JUDGED,
@@ -227,7 +227,8 @@ def judge_regression(
         for one in kept
     )
     judged = [one for one in passes if one.baseline_read is not None and one.candidate_read is not None]
-    remarks = []
+    changed = changes(baseline, candidate)
+    remarks = [f"changed from baseline to candidate: {', '.join(changed)}"] if changed else []
     names = _unique_names(judged)
     before: dict[str, PassFrames] = {}
     after: dict[str, PassFrames] = {}

@@ -34,7 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     propagate.add_argument("--gravity", metavar="FILE", help="coefficient file, or 'builtin'")
     propagate.add_argument("--degree", type=int, metavar="N", help="degree of the gravity field")
     propagate.add_argument(
-        "--integrator", choices=("rkn86", "dop853", "rkf78"), help="another one than the scenario's"
+        "--integrator", choices=("rkn86", "dop853"), help="another one than the scenario's"
     )
     propagate.add_argument("--no-maneuvers", action="store_true", help="let the orbit drift freely")
     propagate.add_argument(

@@ -57,20 +57,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_json_flag(suite)
     suite.set_defaults(handler=_suite)
-    bisect = commands.add_parser(
-        "bisect", help="find the change of network or parameters that changed a metric"
-    )
-    _archives(bisect)
-    bisect.add_argument("--good", required=True, metavar="BUILD")
-    bisect.add_argument("--bad", required=True, metavar="BUILD")
-    bisect.add_argument("--figure", required=True, metavar="NAME", help="such as detector.recall")
-    _finish(bisect, _bisect)
-    search = commands.add_parser("search", help="find the passes in which two builds differ most")
-    _archives(search)
-    search.add_argument("--build", required=True, metavar="BUILD")
-    search.add_argument("--baseline", default="current", metavar="BUILD")
-    search.add_argument("--top", type=int, default=10, metavar="N")
-    _finish(search, _search)
     archive = commands.add_parser(
         "archive", help="list, add, render, pin, pack or remove the archives kept for replays"
     )
@@ -188,7 +174,7 @@ def _baseline(arguments: argparse.Namespace) -> int:
 
     with ground_client(arguments, background=True) as service:
         request = _comparison(service, arguments, arguments.build, arguments.build)
-        figures = _analysed(service, {**request, "analysis": "baseline"})
+        figures = service.wait(service.start_analysis(request).id, progress=_percent()).result or {}
     emit(arguments, figures, text=baseline_text(figures))
     return 2 if figures["not_flown"] else 0
 
@@ -218,32 +204,6 @@ def _suite(arguments: argparse.Namespace) -> int:
         for row, one in zip(rows, written, strict=True)
     ]
     emit(arguments, {"passes": rows}, text="\n".join(lines))
-    return 0
-
-
-def _bisect(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments, background=True) as service:
-        request = _comparison(service, arguments, arguments.bad, arguments.good)
-        found = _analysed(service, {**request, "analysis": "bisection", "figure": arguments.figure})
-    lines = [
-        f"{found['figure']}: {found['good']:.6g} -> {found['bad']:.6g}, {len(found['changes'])} changes, "
-        f"{found['runs']} builds"
-    ]
-    lines += [f"  {' + '.join(item['changes'])}: {item['value']:.6g}" for item in found["culprits"]]
-    emit(arguments, found, text="\n".join(lines))
-    return 0
-
-
-def _search(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments, background=True) as service:
-        request = _comparison(service, arguments, arguments.build, arguments.baseline)
-        found = _analysed(service, {**request, "analysis": "differences"})["passes"][: arguments.top]
-    lines = [
-        f"{item['name']}: {item['frames_changed']} of {item['frames']} frames changed, "
-        f"{item['craters_changed']} craters, position error changed by {_metres(item['error_m'])}"
-        for item in found
-    ]
-    emit(arguments, {"passes": found}, text="\n".join(lines) or "no pass was processed by both builds")
     return 0
 
 
@@ -319,10 +279,6 @@ def _upload(service: Client, path: Path, known: set[str]) -> str:
         return digest
 
 
-def _analysed(service: Client, request: dict[str, Any]) -> dict[str, Any]:
-    return service.wait(service.start_analysis(request).id, progress=_percent()).result or {}
-
-
 def _percent() -> Callable[[Job], None]:
     """Return a function that logs the progress of a job when it has changed."""
     shown = 0.0
@@ -334,10 +290,6 @@ def _percent() -> Callable[[Job], None]:
             log(f"replays: {100 * shown:.0f} %")
 
     return show
-
-
-def _metres(value: float | None) -> str:
-    return "an unknown distance" if value is None else f"{value:.1f} m"
 
 
 def _archive(arguments: argparse.Namespace) -> int:

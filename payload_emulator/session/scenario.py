@@ -59,7 +59,7 @@ class DynamicsSection:
     orientation: Literal["auto", "iau", "de421"] = "auto"
     earth: bool = True
     sun: bool = True
-    integrator: Literal["rkn86", "dop853", "rkf78"] = "rkn86"
+    integrator: Literal["rkn86", "dop853"] = "rkn86"
     solar_area_to_mass_m2_kg: float = 0.0
     solar_reflection: float = 1.3
 

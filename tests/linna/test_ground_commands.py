@@ -383,18 +383,6 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("regress", "run", "--pass", 99, "--build", "current")
             ask("regress", "run", "--build", "current")
             ask("regress", "baseline", *archives)
-            ask(
-                "regress",
-                "bisect",
-                *archives,
-                "--good",
-                build,
-                "--bad",
-                "current",
-                "--figure",
-                "detector.recall",
-            )
-            ask("regress", "search", *archives, "--build", "current")
             do("user", "add", "bob", "--role", "viewer")
             ask("user", "add", "bob", "--role", "viewer")
             ask("user", "add", "b/b", "--role", "viewer")

@@ -1,4 +1,4 @@
-"""CCSDS AEM, OPM, TDM and OEM in XML; and ephemerides of Horizons and in compressed files."""
+"""CCSDS AEM and OEM in XML; and ephemerides of Horizons and in compressed files."""
 
 import gzip
 import io
@@ -20,8 +20,6 @@ from lunar.errors import DataFileError, EphemerisError, TimeFormatError, Unknown
 from lunar.frames import matrix_from_quaternion
 from lunar.oem import format_oem
 from lunar.oem_xml import format_oem_xml, parse_oem_xml
-from lunar.opm import format_opm
-from lunar.tdm import Sightings, format_tdm
 from lunar.timescales import NS, from_utc_ns, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
@@ -311,40 +309,6 @@ def test_faults_of_an_aem_are_named_with_their_line(old: str, new: str, message:
 def test_an_empty_attitude_segment_is_refused() -> None:
     with pytest.raises(EphemerisError, match="expected at least one attitude, found none"):
         AttitudeSegment(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
-
-
-# OPM and TDM
-
-
-def test_opm_holds_the_state_at_the_epoch() -> None:
-    expected = ephemeris()
-    epoch = START + 60 * NS
-    text = format_opm(expected, epoch)
-    pairs = dict(line.split(" = ") for line in text.splitlines() if line)
-    assert pairs["CCSDS_OPM_VERS"] == "2.0"
-    assert (pairs["CENTER_NAME"], pairs["REF_FRAME"], pairs["TIME_SYSTEM"]) == ("MOON", "ICRF", "UTC")
-    assert pairs["EPOCH"] == "2029-08-07T00:01:00.000"
-    position = [float(pairs[key].removesuffix(" [km]")) for key in ("X", "Y", "Z")]
-    velocity = [float(pairs[key].removesuffix(" [km/s]")) for key in ("X_DOT", "Y_DOT", "Z_DOT")]
-    np.testing.assert_allclose(1e3 * np.array(position), expected.at(epoch)[0], atol=1e-6)
-    np.testing.assert_allclose(1e3 * np.array(velocity), expected.at(epoch)[1], atol=1e-9)
-
-
-def test_tdm_gives_right_ascension_and_declination() -> None:
-    directions = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [1.0, 1.0, np.sqrt(2.0)]])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    text = format_tdm([Sightings("CRATER_17", START + np.arange(3) * NS, directions)], "SELENITA")
-    assert "PARTICIPANT_1 = SELENITA\nPARTICIPANT_2 = CRATER_17\nMODE = SEQUENTIAL\nPATH = 2,1\n" in text
-    rows = [
-        line.split() for line in text.splitlines() if line.startswith("ANGLE_") and "T" in line.split()[2]
-    ]
-    assert [row[0] for row in rows] == ["ANGLE_1", "ANGLE_2"] * 3
-    assert [float(row[3]) for row in rows] == pytest.approx([0.0, 0.0, 270.0, 0.0, 45.0, 45.0])
-
-
-def test_a_tdm_without_sightings_is_refused() -> None:
-    with pytest.raises(EphemerisError, match="expected at least one sighting, found none"):
-        format_tdm([], "SELENITA")
 
 
 # Horizons

@@ -92,11 +92,11 @@ def test_the_server_gives_the_file_with_its_name(rich_pass: RichPass, tmp_path: 
         ground = client.app.state.ground
         import_archive(ground, rich_pass.folder)
         headers = {"Authorization": f"Bearer {add_user(ground, 'viewer', 'viewer')}"}
-        assert client.post("/api/v1/exports", json={"pass_id": 1, "format": "opm"}).status_code == 401
-        answer = client.post("/api/v1/exports", json={"pass_id": 1, "format": "opm"}, headers=headers)
+        assert client.post("/api/v1/exports", json={"pass_id": 1, "format": "aem"}).status_code == 401
+        answer = client.post("/api/v1/exports", json={"pass_id": 1, "format": "aem"}, headers=headers)
         assert answer.status_code == 200
-        assert answer.headers["Content-Disposition"] == 'attachment; filename="pass-1.opm"'
-        assert answer.content.startswith(b"CCSDS_OPM_VERS = 2.0")
-        for wrong in ({"pass_id": 1, "format": "doc"}, {"pass_id": 1}, {"pass_id": "1", "format": "opm"}):
+        assert answer.headers["Content-Disposition"] == 'attachment; filename="pass-1.aem"'
+        assert answer.content.startswith(b"CCSDS_AEM_VERS = 1.0")
+        for wrong in ({"pass_id": 1, "format": "doc"}, {"pass_id": 1}, {"pass_id": "1", "format": "aem"}):
             assert client.post("/api/v1/exports", json=wrong, headers=headers).status_code == 422
         assert client.get("/api/v1/exports/formats", headers=headers).json()[0]["name"] == "oem"

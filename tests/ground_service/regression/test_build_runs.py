@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable
@@ -11,7 +12,7 @@ import pytest
 
 from ground_service.errors import InvalidInput
 from ground_service.regression.build_runs import BuildRun, run_build
-from ground_service.regression.builds import load_build
+from ground_service.regression.builds import Build, changes, load_build
 
 LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
 
@@ -196,3 +197,29 @@ def test_nothing_of_the_environment_gets_to_a_program(fly, monkeypatch: pytest.M
     run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_text(' '.join(os.environ))")
     assert run.downlink is not None
     assert not {"LINNA_DATABASE_URL", "HTTPS_PROXY"} & set(run.downlink.read_text().split())
+
+
+def test_what_differs_between_two_builds_on_the_flight_code_is_named(
+    tmp_path: Path, make_build: Callable[..., Path]
+) -> None:
+    def build(name: str, text: str, parameters: str = "") -> Build:
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "p.toml").write_text(parameters)
+        (folder / "m.onnx").write_bytes(name.encode())
+        (folder / "build.toml").write_text(f'name = "{name}"\n{text}')
+        return load_build(folder)
+
+    own = 'parameters = "p.toml"\n'
+    good = build("good", own, "flight.odometry.time_gap_s = 61.0\ndetector.score_threshold = 0.5\n")
+    bad = build("bad", own, "detector.score_threshold = 0.9\n[flight]\nhousekeeping_interval_s = 30.0\n")
+    assert changes(good, bad) == [
+        "detector.score_threshold = 0.9 (baseline: 0.5)",
+        "flight.housekeeping_interval_s = 30.0 (baseline: not set)",
+        "flight.odometry.time_gap_s = not set (baseline: 61.0)",
+    ]
+    assert changes(good, good) == changes(load_build("current"), build("same", "")) == []
+    assert changes(load_build("current"), build("other", 'model = "m.onnx"\n')) == ["network"]
+    older = dataclasses.replace(load_build("current"), flight_code="0" * 64)
+    assert changes(older, load_build("current")) == ["flight code"]
+    assert changes(good, load_build(make_build("program", program="pass"))) == []

@@ -37,7 +37,6 @@ from ground_service.regression.documents import (
 from ground_service.regression.gates.core import GatePolicy
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.outcome import RegressionOutcome
-from ground_service.regression.search import differences
 from ground_service.regression.service import (
     find_replay,
     keep_regression,
@@ -333,18 +332,6 @@ def test_the_report_shows_the_frames_that_changed_side_by_side(home, judge, pack
     assert "Left the baseline, right the candidate" in page
     assert "detector.recall" in page
     assert len(keep_regression(home, outcome)) == 32
-
-
-def test_passes_are_ordered_by_how_much_the_builds_differ(judge, packets: Packets) -> None:
-    changed = dict(packets)
-    changed["synthetic pass 42"] = with_detections(
-        {"x": packets["synthetic pass 42"]},
-        lambda items: {name: values[::2] for name, values in items.items()},
-    )["x"]
-    found = differences(judge(changed))
-    assert [item.name for item in found] == ["synthetic pass 42", "synthetic pass 41"]
-    assert found[0].frames_changed == 30
-    assert found[1].frames_changed == 0
 
 
 def test_a_zip_of_an_archive_is_the_archive(passes, tmp_path: Path, ground: Ground) -> None:

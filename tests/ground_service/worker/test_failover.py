@@ -66,9 +66,7 @@ def test_a_killed_primary_is_replaced_and_no_acknowledged_upload_is_lost(
     with open_ground(tmp_path / "home", database_url=cluster.url) as ground:
         token = add_user(ground, "ann", "operator")
     port = free_port()
-    environment = bare_environment(
-        LINNA_HOME=str(tmp_path / "home"), LINNA_DATABASE_URL=cluster.url
-    )
+    environment = bare_environment(LINNA_HOME=str(tmp_path / "home"), LINNA_DATABASE_URL=cluster.url)
     serve = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
     api = Part(serve, tmp_path / "api.log", functools.partial(listens, port), env=environment)
     session = Session((f"http://127.0.0.1:{port}",), token)

@@ -24,9 +24,9 @@ def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks)
     frame = blob_dataset.frames("train")[0]
     bare = replace(frame, craters={key: values[:0] for key, values in frame.craters.items()})
     taught = with_landmarks(blob_dataset, bare, landmarks)
-    # The ground curves away by 100 m, 11 km from the point below: 0.3 % farther.
-    assert taught.craters["u_px"][-1] == pytest.approx(200.0, abs=0.5)
-    assert taught.craters["v_px"][-1] == pytest.approx(150.0, abs=0.5)
+    # 21 and 11 km from the point below, the ground lies 167 m lower: 0.6 % closer to the middle.
+    assert taught.craters["u_px"][-1] == pytest.approx(255.5 - 55.5 * 0.9944, abs=0.05)
+    assert taught.craters["v_px"][-1] == pytest.approx(255.5 - 105.5 * 0.9944, abs=0.05)
     assert taught.craters["diameter_px"][-1] == pytest.approx(40.0, rel=0.02)
     assert taught.craters["id"][-1] > 1_000_000_000
     assert bare.craters["u_px"].size == 0
