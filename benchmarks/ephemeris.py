@@ -15,7 +15,7 @@ import numpy as np
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.ephemeris_files import load_ephemeris
 from lunar.oem import save_oem
-from lunar.stk import save_stk
+from lunar.stk import format_stk
 from lunar.timescales import NS, format_utc, parse_utc
 
 STATES = 86_400
@@ -43,7 +43,7 @@ def bench() -> dict[str, Any]:
         figures: dict[str, Any] = {
             "oem_write_s": _best(lambda: save_oem(month, oem_path)),
             "oem_read_s": _best(lambda: load_ephemeris(oem_path)),
-            "stk_write_s": _best(lambda: save_stk(month, stk_path)),
+            "stk_write_s": _best(lambda: stk_path.write_text(format_stk(month))),
             "stk_read_s": _best(lambda: load_ephemeris(stk_path)),
             "states": STATES,
             "interpolation_epochs_per_s": EPOCHS / _best(lambda: month.at(epochs)),

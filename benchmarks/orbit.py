@@ -98,9 +98,6 @@ def _kernels(field: GravityField) -> None:
     print(f"{'acceleration, one thread':<44} {ours_us:8.2f} us")
     print(f"{'  textbook recursion, numba':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
     print(f"{'  largest relative difference':<44} {difference:8.1e}")
-    vector_us, plain_us = _sums_us(packed, field.degree)
-    print(f"{'sums of the kernel, vector instructions':<44} {vector_us:8.2f} us")
-    print(f"{'  the same sums, plain numba':<44} {plain_us:8.2f} us   {plain_us / vector_us:5.1f} x ours")
     for name, rival in (("brahe, Clenshaw", _brahe), ("heyoka, scalar cfunc", _heyoka)):
         try:
             evaluate = rival(field)
@@ -112,39 +109,6 @@ def _kernels(field: GravityField) -> None:
         theirs_us = _best(lambda evaluate=evaluate: [evaluate(place) for place in few]) / len(few) * 1e6
         print(f"{f'  {name}':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
         print(f"{'  largest relative difference':<44} {difference:8.1e}")
-
-
-@njit
-def _vector_sums(
-    packed: np.ndarray, scratch: np.ndarray, blocks: int, degrees: int, step: float, rounds: int
-) -> None:
-    for _ in range(rounds):
-        _gravity_kernel.sums(packed, 4, scratch, blocks, degrees, 0.6, -0.7, step, step * step)
-
-
-@njit
-def _plain_sums(
-    packed: np.ndarray, scratch: np.ndarray, blocks: int, degrees: int, step: float, rounds: int
-) -> None:
-    for _ in range(rounds):
-        _gravity_kernel.plain_sums(packed, 4, scratch, blocks, degrees, 0.6, -0.7, step, step * step)
-
-
-def _sums_us(packed: np.ndarray, degree: int) -> tuple[float, float]:
-    """Time of one evaluation of the sums with vector instructions and in plain numba, in microseconds."""
-    lanes = _gravity_kernel.LANES
-    blocks, rounds = (degree + 1 + lanes) // lanes, EVALUATIONS // 10
-    scratch = np.zeros(_gravity_kernel.scratch_size(degree))
-    start = np.random.default_rng(1).uniform(-0.5, 0.5, 2 * lanes)
-
-    def time_of(sums: Callable[..., None]) -> float:
-        def run() -> None:
-            scratch[: 2 * lanes] = start  # the sums replace the powers
-            sums(packed, scratch, blocks, degree + 2, 0.3 * 2.0 / degree, rounds)
-
-        return _best(run) / rounds * 1e6
-
-    return time_of(_vector_sums), time_of(_plain_sums)
 
 
 def _brahe(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.rims import rim_errors
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import find_data
 from lunar.errors import LunarError
@@ -36,7 +37,6 @@ from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_sc
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.light import paper_light, sun_direction_mcmf
 from payload_emulator.sim.render.renderer import Rendering
-from payload_emulator.sim.render.rims import rim_errors
 from payload_emulator.sim.render.sensor import SensorModel, expose
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.tiles import TiledTerrain

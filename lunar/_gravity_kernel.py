@@ -281,54 +281,6 @@ def _emit(
         code.store(value, scratch, offset)
 
 
-@njit(error_model="numpy", boundscheck=False)
-def plain_sums(
-    coefficients: FloatArray,
-    start: int,
-    scratch: FloatArray,
-    blocks: int,
-    degrees: int,
-    step_re: float,
-    step_im: float,
-    zeta: float,
-    rho2: float,
-) -> None:
-    """Do as `sums`, without vector instructions: what these are tested against, and about nine times slower.
-
-    Both agree to rounding (relative 1e-14); so do processors of four and of eight lanes.
-    """
-    power_re, power_im = scratch[_POWER_RE:_POWER_IM].copy(), scratch[_POWER_IM:_SUM_X].copy()
-    scratch[_SUM_X:_SCRATCH] = 0.0
-    w = np.zeros((2, LANES))
-    total = np.zeros((6, LANES))
-    head = start
-    for block in range(blocks):
-        first = block * LANES
-        rows, stop = head + _HEAD, max(degrees, first + LANES)
-        w[:], total[:] = 0.0, 0.0
-        for n in range(first, stop):
-            for lane in range(LANES):
-                lower = (coefficients[head + 2 * LANES + lane] - (n - 1.0) ** 2) * rho2
-                new = (2.0 * n - 1.0) * zeta * w[0, lane] + lower * w[1, lane]
-                if n == first + lane:
-                    new = 1.0
-                w[1, lane], w[0, lane] = w[0, lane], new
-                at = rows + (n - first) * _ROW + lane
-                for k in range(3):
-                    total[k, lane] += coefficients[at + k] * new
-                    total[k + 3, lane] += coefficients[at + LANES + 2 + k] * new
-        for lane in range(LANES):
-            below, above = coefficients[head + lane], coefficients[head + LANES + lane]
-            c_down, c_up = below * total[0, lane], above * total[2, lane]
-            s_down, s_up = below * total[3, lane], above * total[5, lane]
-            re, im = power_re[lane], power_im[lane]
-            scratch[_SUM_X + lane] += re * (c_up - c_down) + im * (s_up - s_down)
-            scratch[_SUM_Y + lane] += re * (s_up + s_down) - im * (c_up + c_down)
-            scratch[_SUM_Z + lane] += re * total[1, lane] + im * total[4, lane]
-            power_re[lane], power_im[lane] = re * step_re - im * step_im, re * step_im + im * step_re
-        head = rows + (stop - first) * _ROW
-
-
 @intrinsic  # type: ignore[untyped-decorator]  # numba has no types
 def sums(
     typing_context: Any,

@@ -150,18 +150,8 @@ def ground_arc_m(off_nadir_rad: ArrayLike, altitude_m: ArrayLike) -> FloatArray:
         return np.asarray(MOON_RADIUS_M * (np.arcsin(ratio * np.sin(off_nadir)) - off_nadir))
 
 
-def flat_footprint_m(fov_rad: ArrayLike, altitude_m: ArrayLike) -> FloatArray:
-    """Return the width in m of the footprint on a flat ground, 2 h tan(fov / 2), as the paper states it."""
-    return np.asarray(2.0 * np.asarray(altitude_m, dtype=np.float64) * np.tan(np.asarray(fov_rad) / 2.0))
-
-
 def horizon_arc_m(altitude_m: ArrayLike) -> FloatArray:
     """Return the arc in m on the sphere from the sub-camera point to the horizon."""
     return np.asarray(
         MOON_RADIUS_M * np.arccos(1.0 / (1.0 + np.asarray(altitude_m, dtype=np.float64) / MOON_RADIUS_M))
     )
-
-
-def ground_sample_m(camera: PinholeCamera, altitude_m: ArrayLike) -> FloatArray:
-    """Return the size in m of one pixel on the ground at nadir."""
-    return np.asarray(np.asarray(altitude_m, dtype=np.float64) / camera.focal_px)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 MOON_RADIUS_M = 1_737_400.0
 """Radius of the reference sphere of lunar maps, height models and altitudes (IAU WGCCRE 2009 and 2015)."""
 
@@ -15,9 +13,6 @@ GM_EARTH_M3_S2 = 3.986_004_354_36e14
 
 GM_SUN_M3_S2 = 1.327_124_400_419_394e20
 """Gravitational parameter of the Sun (JPL DE430 and DE431, TDB-compatible)."""
-
-MOON_ROTATION_RATE_RAD_S = math.radians(13.176_358_15) / 86_400.0
-"""Mean sidereal rotation rate of the Moon (IAU WGCCRE 2009: 13.17635815 deg/day)."""
 
 EARTH_RADIUS_M = 6_378_136.6
 """Equatorial radius of the Earth (IERS Conventions 2010, table 1.1)."""

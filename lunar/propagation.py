@@ -181,66 +181,6 @@ def propagate(
     return join(epoch_tdb_s, [arc])
 
 
-def propagate_many(
-    epoch_tdb_s: float,
-    states_icrf: ArrayLike,
-    elapsed_s: ArrayLike,
-    model: ForceModel,
-    integrator: str = DEFAULT_INTEGRATOR,
-    rtol: float | None = None,
-    threads: int = 1,
-) -> FloatArray:
-    """Return states of many orbits, shape ``(n, k, 6)``, from ``(n, 6)`` states at one epoch, at ``(k,)`` later times.
-
-    Times are seconds after the epoch; they ascend from 0 on.  An orbit that meets the ground has NaN from there on.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    from lunar import _dynamics_kernel as kernel
-
-    starts = np.asarray(states_icrf, dtype=np.float64).reshape(-1, 6)
-    times = np.asarray(elapsed_s, dtype=np.float64).reshape(-1)
-    if len(times) and (times[0] < 0.0 or np.any(np.diff(times) < 0.0)):
-        raise OrbitError("propagation times: expected ascending seconds from 0 on, found another order")
-    out = np.full((len(starts), len(times), 6), np.nan)
-    if not len(times) or not len(starts):
-        return out
-    duration = float(times[-1])
-
-    def one(number: int) -> None:
-        if duration == 0.0:
-            out[number] = starts[number]
-            return
-        try:
-            arc = integrate_arc(
-                epoch_tdb_s,
-                0.0,
-                starts[number],
-                duration,
-                model,
-                integrator,
-                rtol,
-                None,
-                constants.MOON_RADIUS_M,
-                stop_at_ground=True,
-            )
-        except OrbitError:
-            return
-        inside = times <= arc.elapsed_s[-1] if arc.status != kernel.GROUND else times < arc.ground_s
-        kernel.evaluate(
-            arc.elapsed_s, arc.states, arc.accelerations, times[inside], out[number, : inside.sum()]
-        )
-
-    force_arrays(model, epoch_tdb_s, 0.0, duration)  # fills the tables once, before threads share them
-    if threads > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(one, range(len(starts))))
-    else:
-        for number in range(len(starts)):
-            one(number)
-    return out
-
-
 def propagate_with_stm(
     epoch_tdb_s: float,
     position_icrf_m: ArrayLike,
@@ -268,19 +208,6 @@ def propagate_with_stm(
         start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.a, DOP853.b[0], DOP853.c
     )
     return y[:3], y[3:6], y[6:].reshape(6, 6)
-
-
-def acceleration_icrf(model: ForceModel, tdb_s: float, position_icrf_m: ArrayLike) -> FloatArray:
-    """Return the acceleration (3,) of the whole model at one place and time, ICRF, m/s^2."""
-    from lunar import _dynamics_kernel as kernel
-
-    gravity, force, table, scratch = force_arrays(model, tdb_s, 0.0, 0.0)
-    x, y, z = np.asarray(position_icrf_m, dtype=np.float64)
-    return np.array(
-        kernel.force_acceleration(
-            0.0, x, y, z, gravity, force, table, np.empty(scratch), np.empty(kernel.COLUMNS)
-        )
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,12 +14,11 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, read_text
+from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers
 from lunar.errors import (
     DataFileError,
     EphemerisError,
@@ -51,16 +50,6 @@ _IGNORED = (
     "MESSAGELEVEL",
     "STKVERSION",
 )
-
-
-def load_stk(path: Path | str) -> Ephemeris:
-    """Return the ephemeris in an STK ``.e`` file; raises as `parse_stk`."""
-    return parse_stk(read_text(path, "an STK .e ephemeris"), source=str(path))
-
-
-def save_stk(ephemeris: Ephemeris, path: Path | str) -> None:
-    """Write an STK ``.e`` file; raises as `format_stk`."""
-    Path(path).write_text(format_stk(ephemeris), encoding="utf-8", newline="\n")
 
 
 def parse_stk(text: str, source: str = "STK text") -> Ephemeris:

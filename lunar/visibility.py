@@ -122,11 +122,6 @@ def limb_clearance_m(position_icrf_m: ArrayLike, target_icrf_m: ArrayLike) -> Fl
     return np.asarray(np.where(along > 0.0, closest - MOON_RADIUS_M, np.inf))
 
 
-def earth_visible(position_icrf_m: ArrayLike, earth_icrf_m: ArrayLike) -> BoolArray:
-    """Return whether the centre of the Earth stands clear of the Moon's limb, ``(...)``."""
-    return np.asarray(limb_clearance_m(position_icrf_m, earth_icrf_m) > 0.0)
-
-
 def station_icrf_m(station: GroundStation, utc_ns: ArrayLike) -> FloatArray:
     """Return the Earth-centred position ``(..., 3)`` of a station in ICRF axes."""
     from pymap3d import geodetic2ecef

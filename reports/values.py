@@ -42,9 +42,6 @@ class HeadlineFigure:
     evidence_level: str = ""
 
 
-REQUIREMENT_STATUSES = ("met", "not met", "unknown", "not judged")
-
-
 @dataclass(frozen=True, slots=True)
 class Requirement:
     """Row of the verdict table.

@@ -44,9 +44,6 @@ from tmtc.sequence import SequenceReport, account
 from tmtc.stream import PacketCut, PrimaryHeaders, cut_packets, primary_headers
 
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
-FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign", "unchecked")
-"""A frame without code and checksum is `unchecked`: its packets are read, but the frame never counts as good."""
-
 _DEFAULT = LinkSettings()
 
 

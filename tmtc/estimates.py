@@ -15,8 +15,6 @@ ESTIMATE_PACKETS = ("filter_state", "filter_estimate")
 """Packets that carry an estimate: in version 2, and from version 3 on."""
 
 STATES = 9
-TRIANGLE = STATES * (STATES + 1) // 2
-"""Number of elements in the upper triangle of the covariance of position, velocity and empirical acceleration."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

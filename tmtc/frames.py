@@ -11,7 +11,6 @@ synchronisation flag, packet order flag (1 each), segment length id 11 (2), firs
 from __future__ import annotations
 
 import functools
-import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,22 +25,6 @@ OCF_LENGTH = 4
 NO_PACKET_BEGINS = 0x7FF
 ONLY_IDLE_DATA = 0x7FE
 IDLE_CHANNEL = 7
-
-_HEADER = struct.Struct(">HBBH")
-
-
-@dataclass(frozen=True, slots=True)
-class TmFrameHeader:
-    """Fields of one TM transfer frame header."""
-
-    spacecraft_id: int
-    virtual_channel: int
-    master_count: int
-    channel_count: int
-    first_header_pointer: int
-    ocf: bool = False
-    secondary_header: bool = False
-    synchronised: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,43 +55,6 @@ class Clcw:
     no_bit_lock: bool = False
     farm_b_counter: int = 0
     status: int = 0
-
-
-def pack_frame_header(header: TmFrameHeader) -> bytes:
-    """Six octets."""
-    for name, value, limit in (
-        ("spacecraft_id", header.spacecraft_id, 1 << 10),
-        ("virtual_channel", header.virtual_channel, 1 << 3),
-        ("master_count", header.master_count, 1 << 8),
-        ("channel_count", header.channel_count, 1 << 8),
-        ("first_header_pointer", header.first_header_pointer, 1 << 11),
-    ):
-        if not 0 <= value < limit:
-            raise ValueRefused("transfer frame", name, value, f"0..{limit - 1}")
-    first = header.spacecraft_id << 4 | header.virtual_channel << 1 | header.ocf
-    status = (
-        header.secondary_header << 15 | header.synchronised << 14 | 0b11 << 11 | header.first_header_pointer
-    )
-    return _HEADER.pack(first, header.master_count, header.channel_count, status)
-
-
-def unpack_frame_header(octets: bytes | memoryview) -> TmFrameHeader:
-    """The header at the start of a TM transfer frame."""
-    if len(octets) < FRAME_HEADER_LENGTH:
-        raise TruncatedPacket("transfer frame header", FRAME_HEADER_LENGTH, len(octets))
-    first, master_count, channel_count, status = _HEADER.unpack_from(octets)
-    if first >> 14:
-        raise FrameError(f"transfer frame: expected version 0, found {first >> 14}")
-    return TmFrameHeader(
-        spacecraft_id=first >> 4 & 0x3FF,
-        virtual_channel=first >> 1 & 7,
-        master_count=master_count,
-        channel_count=channel_count,
-        first_header_pointer=status & 0x7FF,
-        ocf=bool(first & 1),
-        secondary_header=bool(status >> 15),
-        synchronised=bool(status >> 14 & 1),
-    )
 
 
 def frame_headers(frames: OctetArray) -> TmFrameHeaders:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -368,59 +368,6 @@ class _UncheckedCutter:
     def grow(self) -> None:
         """Make room for more rows."""
         self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
-
-
-@dataclass(slots=True)
-class PacketStream:
-    """Packets cut out of octets that arrive piece by piece; the same packets however the pieces are cut.
-
-    Right packets are given as soon as they are whole. After damage the stream waits until enough octets are there
-    to decide as over the whole stream (`look_ahead(longest)`), which also bounds what it keeps.
-    """
-
-    longest: int = PACKET_MAX_LENGTH
-    packet_type: int = TYPE_TELEMETRY
-    packets: int = 0
-    crc_errors: int = 0
-    octets_skipped: int = 0
-    octets_idle: int = 0
-    _pending: bytearray = field(default_factory=bytearray)
-    _needed: int = 1
-
-    def feed(self, octets: Octets) -> list[bytes]:
-        """Packets that have become whole with these octets."""
-        self._pending += as_octets(octets).data
-        if len(self._pending) < self._needed:
-            return []
-        return self._cut(final=False)
-
-    def close(self) -> list[bytes]:
-        """Packets that are still to be had now that nothing more will come."""
-        return self._cut(final=True)
-
-    @property
-    def octets_pending(self) -> int:
-        """Octets kept back for now."""
-        return len(self._pending)
-
-    def _cut(self, final: bool) -> list[bytes]:
-        octets = bytes(self._pending)
-        cut = cut_packets(octets, packet_type=self.packet_type, longest=self.longest, final=final)
-        found = list(cut.packets(octets))
-        self.packets += len(found)
-        self.crc_errors += cut.crc_errors
-        self.octets_skipped += cut.octets_skipped
-        self.octets_idle += cut.octets_idle
-        del self._pending[: cut.consumed]
-        # nothing changes before the packet that begins here is whole, or the damage here can be judged
-        self._needed = 1
-        rest = len(self._pending)
-        if rest >= PRIMARY_HEADER_LENGTH:
-            length = int.from_bytes(self._pending[4:6], "big") + PRIMARY_HEADER_LENGTH + 1
-            plausible = self._pending[0] >> 4 == self.packet_type and rest < length <= self.longest
-            idle = self._pending[0] & 0x0F == 0x07 and self._pending[1] == 0xFF
-            self._needed = length if plausible else rest + 1 if idle else look_ahead(self.longest)
-        return found
 
 
 def look_ahead(longest: int) -> int:

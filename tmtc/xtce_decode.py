@@ -133,13 +133,6 @@ def choose_root(definition: Definition, name: str | None = None) -> Container:
     )
 
 
-def decode_packets(
-    definition: Definition, buffer: Octets, cut: PacketCut, root: str | None = None
-) -> XtceDecode:
-    """Decode all packets of `cut`; the first bit of a packet is the first bit of the container `root`."""
-    return Decoder(definition, root).decode(buffer, cut)
-
-
 class Decoder:
     """A definition with its containers compiled to steps; stateless between calls."""
 

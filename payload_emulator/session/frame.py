@@ -31,7 +31,6 @@ from payload_emulator.sim.render.renderer import Rendering
 from payload_emulator.sim.render.sensor import Picture, take_picture
 
 RENDERERS = ("fast", "raymarch", "cycles")
-LABEL_RULES = ("exact", "paper")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -87,39 +87,6 @@ def parse_parameters(
     return _read(flown, table, source, dropped)
 
 
-def flat_parameters(parameters: BuildParameters) -> dict[str, Any]:
-    """Every parameter under its dotted name, such as ``flight.anchored.gravity_degree``; None where absent."""
-    return _flat(parameters, "")
-
-
-def with_values(
-    flown: BuildParameters, values: dict[str, Any], source: str = "parameters"
-) -> BuildParameters:
-    """`flown` with the parameters of these dotted names set to these values."""
-    table: dict[str, Any] = {}
-    for name, value in values.items():
-        *path, last = name.split(".")
-        here = table
-        for part in path:
-            here = here.setdefault(part, {})
-        here[last] = value
-    return _read(flown, table, source, None)
-
-
-def _flat(value: Any, path: str) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for item in dataclasses.fields(value):
-        inner, name = getattr(value, item.name), f"{path}.{item.name}" if path else item.name
-        if isinstance(inner, Mapping):
-            for key, one in inner.items():
-                found |= _flat(one, f"{name}.{key}")
-        elif dataclasses.is_dataclass(inner):
-            found |= _flat(inner, name)
-        else:
-            found[name] = _plain(inner)
-    return found
-
-
 def _section(value: Any, path: str) -> list[str]:
     lines, sections = [], []
     for item in dataclasses.fields(value):

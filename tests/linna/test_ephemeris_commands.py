@@ -10,7 +10,7 @@ from lunar.catalogue import PAPER_CLASS_COUNTS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
 from lunar.oem import save_oem
-from lunar.stk import save_stk
+from lunar.stk import format_stk
 from lunar.timescales import NS, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
@@ -55,7 +55,7 @@ def error_line(capsys, *arguments):
 
 def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys):
     other = tmp_path / "orbit.e"
-    save_stk(orbit(radius_m=1_768_190.0), other)
+    other.write_text(format_stk(orbit(radius_m=1_768_190.0)))
     plot = tmp_path / "difference.png"
     figures = run_json(capsys, "orbit", "compare", oem_path, other, "--plot", plot)
     assert figures["samples"] == 48 * 60 + 1

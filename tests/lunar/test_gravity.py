@@ -4,14 +4,12 @@ import importlib.util
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import mpmath
 import numpy as np
 import pytest
 
 from lunar import _gravity_kernel as kernel
-from lunar._compile import njit
 from lunar.errors import DataFileError, OrbitError
 from lunar.gravity import (
     GravityField,
@@ -172,37 +170,6 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
     finally:
         del sys.modules["other_width"]
     assert np.allclose(found, acceleration(field, places), rtol=1e-14)
-
-
-@pytest.mark.parametrize("degree", [2, 7, 40, 100])
-def test_the_vector_code_gives_the_sums_of_its_plain_version(degree: int) -> None:
-    field = kaula_field(degree)
-    packed_field = kernel.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m)
-    blocks, degrees = (degree + 1 + kernel.LANES) // kernel.LANES, degree + 2
-    rng = np.random.default_rng(degree)
-    found, expected = np.zeros((2, kernel.scratch_size(degree)))
-    # Powers of the longitude factor by lane, and the step from block to block: within the unit circle.
-    found[: 2 * kernel.LANES] = expected[: 2 * kernel.LANES] = rng.uniform(-0.5, 0.5, 2 * kernel.LANES)
-    rest = (blocks, degrees, 0.6, -0.7, 0.3 * 2.0 / max(degree, 2), (2.0 / max(degree, 2)) ** 2)
-    vector_code(packed_field, 4, found, *rest)
-    kernel.plain_sums(packed_field, 4, expected, *rest)
-    # Rounding of sums of up to 5,000 terms that partly cancel, relative to the largest of the three.
-    assert np.allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
-
-
-@njit
-def vector_code(
-    packed: Any,
-    start: int,
-    scratch: Any,
-    blocks: int,
-    degrees: int,
-    re: float,
-    im: float,
-    zeta: float,
-    rho2: float,
-) -> None:
-    kernel.sums(packed, start, scratch, blocks, degrees, re, im, zeta, rho2)
 
 
 def test_truncation_asks_for_a_degree_the_field_has() -> None:

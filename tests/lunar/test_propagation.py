@@ -5,18 +5,18 @@ import math
 import numpy as np
 import pytest
 
+from lunar import _dynamics_kernel
 from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
 from lunar.elements import Elements, elements_from_state, state_from_elements
-from lunar.errors import ImpactError, OrbitError
+from lunar.errors import ImpactError
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.maneuvers import ManeuverRule, propagate_with_maneuvers
 from lunar.propagation import (
     ForceModel,
     SolarPressure,
-    acceleration_icrf,
+    force_arrays,
     propagate,
-    propagate_many,
     propagate_with_stm,
 )
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
@@ -146,7 +146,15 @@ def sunward() -> np.ndarray:
 def pushed(position_m: np.ndarray) -> np.ndarray:
     """What sunlight adds to the acceleration at a place, m/s^2."""
     dark = ForceModel(builtin_gravity(), IauOrientation(), 0)
-    return acceleration_icrf(SUNLIT, EPOCH_S, position_m) - acceleration_icrf(dark, EPOCH_S, position_m)
+    sunlit, unlit = (acceleration(model, position_m) for model in (SUNLIT, dark))
+    return sunlit - unlit
+
+
+def acceleration(model: ForceModel, position_m: np.ndarray) -> np.ndarray:
+    """Acceleration of a whole model at the epoch, ICRF, m/s^2."""
+    gravity, force, table, scratch = force_arrays(model, EPOCH_S, 0.0, 0.0)
+    work = np.empty(scratch), np.empty(_dynamics_kernel.COLUMNS)
+    return np.array(_dynamics_kernel.force_acceleration(0.0, *position_m, gravity, force, table, *work))
 
 
 def test_sunlight_pushes_away_from_the_sun_with_the_pressure_of_its_flux() -> None:
@@ -185,41 +193,6 @@ def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes() -> No
     expected_m = f / n**2 * math.hypot(1 - math.cos(600 * n), 2 * (600 * n - math.sin(600 * n)))
     # The push turns with the Sun, not with the orbit: 0.57 rad over the ten minutes.
     assert np.linalg.norm(lit[:3] - dark[:3]) == pytest.approx(expected_m, rel=0.1)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_many_orbits_are_those_flown_one_by_one(threads: int) -> None:
-    gm = builtin_gravity().gm_m3_s2
-    nominal = np.concatenate(state_from_elements(TABLE_I, gm))
-    rng = np.random.default_rng(2)
-    starts = nominal + np.concatenate(
-        [1e3 * rng.standard_normal((5, 3)), rng.standard_normal((5, 3))], axis=1
-    )
-    times = np.array([0.0, 61.5, 3_600.0, 7_200.0])
-    together = propagate_many(EPOCH_S, starts, times, FULL, threads=threads)
-    assert together.shape == (5, 4, 6)
-    for start, states in zip(starts, together, strict=True):
-        alone = propagate(EPOCH_S, start[:3], start[3:], 7_200.0, FULL).state_after(times)
-        np.testing.assert_array_equal(states, alone)
-
-
-def test_an_orbit_of_many_that_hits_the_ground_ends_in_nan_and_leaves_the_others_alone() -> None:
-    gm = builtin_gravity().gm_m3_s2
-    falling = Elements(MOON_RADIUS_M - 10_000.0, 0.03, math.radians(89.0), 0.0, 0.0, math.pi)
-    starts = [np.concatenate(state_from_elements(elements, gm)) for elements in (falling, TABLE_I)]
-    times = np.arange(0.0, 7_201.0, 60.0)
-    falls, flies = propagate_many(EPOCH_S, starts, times, KEPLER)
-    with pytest.raises(ImpactError) as end:
-        propagate(EPOCH_S, starts[0][:3], starts[0][3:], 7_200.0, KEPLER)
-    impact_s = float(tdb_s_from_utc_ns(end.value.utc_ns)) - EPOCH_S
-    assert np.array_equal(np.isfinite(falls[:, 0]), times < impact_s)
-    assert np.isfinite(flies).all()
-
-
-def test_times_of_many_orbits_must_ascend() -> None:
-    start = np.concatenate(state_from_elements(TABLE_I, builtin_gravity().gm_m3_s2))
-    with pytest.raises(OrbitError, match="ascending"):
-        propagate_many(EPOCH_S, [start], [10.0, 5.0], KEPLER)
 
 
 @pytest.mark.parametrize("duration_s", [900.0, -900.0])

@@ -8,7 +8,7 @@ from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
 from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, EphemerisError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
-from lunar.stk import format_stk, load_stk, parse_stk, save_stk
+from lunar.stk import format_stk, parse_stk
 from lunar.timescales import NS, format_utc, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
@@ -67,7 +67,7 @@ def test_the_example_is_read_with_units_bias_and_segments():
 
 def test_what_is_written_is_read_back_to_a_micrometre(tmp_path):
     ephemeris = ephemeris_from_states(*states(100))
-    save_stk(ephemeris, tmp_path / "orbit.e")
+    (tmp_path / "orbit.e").write_text(format_stk(ephemeris))
     back = load_ephemeris(tmp_path / "orbit.e")
     assert np.array_equal(back.utc_ns, ephemeris.utc_ns)
     assert compare(ephemeris, back).max_m < 2e-6
@@ -162,7 +162,7 @@ def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, mes
     path = tmp_path / "faulty.e"
     path.write_text(text)
     with pytest.raises(DataFileError) as caught:
-        load_stk(path)
+        load_ephemeris(path)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
 

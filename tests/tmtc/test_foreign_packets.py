@@ -29,7 +29,7 @@ from tmtc.downlink import DownlinkDecode, decode, encode_cadus
 from tmtc.errors import ValueRefused
 from tmtc.packets import idle_packet
 from tmtc.stream import PacketCut, cut_packets
-from tmtc.xtce_decode import decode_packets
+from tmtc.xtce_decode import Decoder
 from tmtc.xtce_import import parse_xtce
 
 
@@ -107,7 +107,7 @@ def test_ccsdspy_reads_the_same_columns():
         {**HEADER_PARAMETERS, **own},
         HEADER_CONTAINER + container("ephemeris", list(own), "CCSDSPacket", comparison("PKT_APID", 11)),
     )
-    ours = decode_packets(parse_xtce(text), octets, cut(octets)).tables["ephemeris"].columns
+    ours = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables["ephemeris"].columns
     for name in own:
         assert np.array_equal(ours[name].to_list(), theirs[name]), name
 
@@ -129,7 +129,7 @@ def test_cuc_times_of_every_width_are_read_through_a_definition(coarse, fine):
     times = [(rng.bytes(coarse), rng.bytes(fine)) for _ in range(20)]
     packets = [space_packet(5, c + f + b"\x2a", k) for k, (c, f) in enumerate(times)]
     octets = b"".join(packets)
-    columns = decode_packets(parse_xtce(text), octets, cut(octets)).tables["P"].columns
+    columns = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables["P"].columns
     assert columns["COARSE"].to_list() == [int.from_bytes(c, "big") for c, _ in times]
     assert columns["N"].to_list() == [42] * 20
     if fine:
@@ -145,7 +145,7 @@ def test_a_cds_header_made_by_spacepackets_is_read():
         HEADER_CONTAINER + container("P", ["P_FIELD", "DAY", "MS"], "CCSDSPacket"),
     )
     octets = b"".join(space_packet(5, data, k) for k in range(3))
-    columns = decode_packets(parse_xtce(text), octets, cut(octets)).tables["P"].columns
+    columns = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables["P"].columns
     assert columns["DAY"].to_list() == [25000] * 3 and columns["MS"].to_list() == [86_399_999] * 3
     assert columns["P_FIELD"].to_list() == [0x40] * 3
 

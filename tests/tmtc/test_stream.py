@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tmtc.crc import append_crc, crc16
 from tmtc.dictionary import DICTIONARY
 from tmtc.packets import PacketSequencer, idle_packet, pack_packet
-from tmtc.stream import PacketStream, cut_packets, look_ahead
+from tmtc.stream import cut_packets
 
 
 def make_packets(count: int, seed: int = 5) -> list[bytes]:
@@ -335,35 +335,3 @@ def test_any_octets_at_all_are_accounted_for(octets):
     assert_every_octet_is_accounted_for(octets)
     for packet in cut.packets(octets):
         assert crc16(packet) == 0
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(INJURIES, max_size=5), st.lists(st.integers(1, 3000), min_size=1, max_size=60))
-def test_a_stream_gives_the_same_packets_however_it_is_split(injuries, pieces):
-    octets, _ = injure(b"".join(PACKETS[:60]), injuries)
-    longest = 400
-    stream = PacketStream(longest=longest)
-    found, at, k = [], 0, 0
-    while at < len(octets):
-        size = pieces[k % len(pieces)]
-        found += stream.feed(octets[at : at + size])
-        assert stream.octets_pending <= look_ahead(longest) + size
-        at, k = at + size, k + 1
-    found += stream.close()
-    whole = cut_packets(octets, longest=longest)
-    assert found == list(whole.packets(octets))
-    assert (stream.crc_errors, stream.octets_skipped) == (whole.crc_errors, whole.octets_skipped)
-
-
-def test_a_live_stream_gives_each_packet_as_soon_as_it_is_whole():
-    stream = PacketStream()
-    for packet in PACKETS[:50]:
-        assert stream.feed(packet[:-1]) == []
-        assert stream.feed(packet[-1:]) == [packet]
-
-
-def test_idle_packets_do_not_hold_up_a_live_stream():
-    stream = PacketStream()
-    assert stream.feed(PACKETS[0] + idle_packet(60)) == [PACKETS[0]]
-    assert stream.feed(PACKETS[1]) == [PACKETS[1]]
-    assert stream.octets_idle == 60

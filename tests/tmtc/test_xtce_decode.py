@@ -32,7 +32,7 @@ from tmtc.errors import DefinitionError
 from tmtc.stream import PacketCut
 from tmtc.xtce import format_xtce
 from tmtc.xtce_columns import ArrayColumn, OptionalColumn, ValueColumn
-from tmtc.xtce_decode import VERDICTS, XtceDecode, decode_packets
+from tmtc.xtce_decode import VERDICTS, Decoder, XtceDecode
 from tmtc.xtce_import import parse_xtce
 
 
@@ -46,7 +46,7 @@ def whole(packets: list[bytes]) -> tuple[bytes, PacketCut]:
 
 
 def decoded(definition: str, packets: list[bytes], root: str | None = None) -> XtceDecode:
-    return decode_packets(parse_xtce(definition), *whole(packets), root)
+    return Decoder(parse_xtce(definition), root).decode(*whole(packets))
 
 
 def verdicts(definition: str, packets: list[bytes]) -> list[str]:
@@ -548,7 +548,7 @@ def test_definitions_may_be_spread_over_documents():
     types = document(integer("u8", 8), {}, "", name="dt")
     packets = document("", {"x": "/dt/u8"}, container("P", ["x"]), name="PUS")
     definition = parse_xtce({"dt.xml": types, "pus.xml": packets})
-    found = decode_packets(definition, *whole([b"\x2a"]))
+    found = Decoder(definition).decode(*whole([b"\x2a"]))
     assert found.tables["P"].columns["x"].to_list() == [42]
 
 
@@ -594,9 +594,8 @@ def test_damaged_packets_are_left_out():
     damaged = PacketCut(
         cut.offsets, cut.lengths, np.array([True, False]), cut.skipped, cut.idle, cut.consumed
     )
-    found = decode_packets(
-        parse_xtce(document(integer("N", 8), {"a": "N"}, container("P", ["a"]))), octets, damaged
-    )
+    definition = parse_xtce(document(integer("N", 8), {"a": "N"}, container("P", ["a"])))
+    found = Decoder(definition).decode(octets, damaged)
     assert found.tables["P"].columns["a"].to_list() == [1] and found.verdict.tolist() == [0, 5]
 
 
@@ -641,7 +640,7 @@ def test_every_truncation_of_every_packet_is_a_verdict():
     definition = parse_xtce(foreign.BUS)
     for packet in foreign.capture(12, 9):
         pieces = [packet[:n] for n in range(1, len(packet))]
-        found = decode_packets(definition, *whole(pieces))
+        found = Decoder(definition).decode(*whole(pieces))
         # an event that is not urgent is whole without the value, and urgent ones are told by what they lack
         assert {VERDICTS[v] for v in found.verdict.tolist()} <= {"too_short", "malformed"}
 
@@ -654,7 +653,7 @@ def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
         space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)
     ]
     mixed = [p for pair in zip(good, noise[:50], strict=True) for p in pair] + noise[50:]
-    found = decode_packets(definition, *whole(mixed))
+    found = Decoder(definition).decode(*whole(mixed))
     assert found.verdict[0:100:2].tolist() == [0] * 50
 
 

@@ -21,7 +21,7 @@ from tests.tmtc.foreign import (
 from tests.tmtc.test_xtce_decode import ARRAY_ENTRY, aggregate, array_type, dimension, text_type, whole
 from tmtc import xtce_xml
 from tmtc.errors import DefinitionError
-from tmtc.xtce_decode import decode_packets
+from tmtc.xtce_decode import Decoder
 from tmtc.xtce_definition import IntegerEncoding, Polynomial, ScalarType
 from tmtc.xtce_import import parse_xtce
 
@@ -189,7 +189,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
         links = "".join(container(f"C{k}", ["a"], f"C{k - 1}") for k in range(1, count))
         return document(U8, {"a": "u8"}, container("C0", ["a"]) + links)
 
-    found = decode_packets(parse_xtce(chain(1500)), *whole([bytes(range(250)) * 6]))
+    found = Decoder(parse_xtce(chain(1500))).decode(*whole([bytes(range(250)) * 6]))
     assert list(found.tables) == ["C1499"] and found.tables["C1499"].columns["a"].to_list() == [249]
     assert "more than 2000 steps" in refused(chain(3000))
 
@@ -347,7 +347,7 @@ def test_conditions_are_joined_and_compared_as_written():
         U8, dict.fromkeys("ab", "u8"), container("P", ["a", "b"]) + container("Q", [], "P", expression)
     )
     pairs = [(a, b) for a in range(8) for b in range(8)]
-    found = decode_packets(parse_xtce(text), *whole([bytes(pair) for pair in pairs]))
+    found = Decoder(parse_xtce(text)).decode(*whole([bytes(pair) for pair in pairs]))
     expected = [k for k, (a, b) in enumerate(pairs) if a != 5 and (a < b or b == 0)]
     assert found.tables["Q"].packet_index.tolist() == expected
     assert len(found.tables["P"]) == 64 - len(expected)
@@ -373,7 +373,7 @@ def test_comparisons_mean_what_they_say(operator, expected, types):
     value, width = ("3", 1) if "<PolynomialCalibrator" not in types else ("1.5", 1)
     width = 8 if 'sizeInBits="64"' in types else width
     text = document(types, {"a": "t"}, PLAIN + container("Q", [], "P", comparison("a", value, operator)))
-    found = decode_packets(parse_xtce(text), *whole([k.to_bytes(width, "big") for k in range(1, 5)]))
+    found = Decoder(parse_xtce(text)).decode(*whole([k.to_bytes(width, "big") for k in range(1, 5)]))
     values = found.tables["Q"].columns["a"].to_list(raw=True)
     assert values == expected
 
@@ -381,14 +381,14 @@ def test_comparisons_mean_what_they_say(operator, expected, types):
 @pytest.mark.parametrize(("operator", "expected"), [("==", [1]), ("!=", [0, 2])])
 def test_names_of_codes_are_compared(operator, expected):
     text = document(MODES, {"a": "m"}, PLAIN + container("Q", [], "P", comparison("a", "ON", operator)))
-    found = decode_packets(parse_xtce(text), *whole([b"\0", b"\1", b"\2"]))
+    found = Decoder(parse_xtce(text)).decode(*whole([b"\0", b"\1", b"\2"]))
     assert found.tables["Q"].packet_index.tolist() == expected
 
 
 @pytest.mark.parametrize("spelling", ["IEEE-754", "IEEE754", "IEEE754_1985"])
 def test_floats_are_known_by_their_older_names(spelling):
     text = document(floating("f", 32, spelling), {"a": "f"}, PLAIN)
-    assert decode_packets(parse_xtce(text), *whole([b"\x3f\xc0\0\0"])).tables["P"].columns["a"].to_list() == [
+    assert Decoder(parse_xtce(text)).decode(*whole([b"\x3f\xc0\0\0"])).tables["P"].columns["a"].to_list() == [
         1.5
     ]
 
@@ -397,11 +397,11 @@ def test_comparisons_hold_over_the_whole_of_64_bits():
     value = 2**64 - 2
     text = document(integer("t", 64), {"a": "t"}, PLAIN + container("Q", [], "P", comparison("a", value)))
     packets = [k.to_bytes(8, "big") for k in (value - 1, value, value + 1, 2**63)]
-    assert decode_packets(parse_xtce(text), *whole(packets)).tables["Q"].packet_index.tolist() == [1]
+    assert Decoder(parse_xtce(text)).decode(*whole(packets)).tables["Q"].packet_index.tolist() == [1]
     beyond = document(
         integer("t", 64), {"a": "t"}, PLAIN + container("Q", [], "P", comparison("a", 2**70, "<"))
     )
-    assert len(decode_packets(parse_xtce(beyond), *whole(packets)).tables["Q"]) == 4
+    assert len(Decoder(parse_xtce(beyond)).decode(*whole(packets)).tables["Q"]) == 4
 
 
 def test_members_of_aggregates_and_booleans_are_compared():
@@ -414,7 +414,7 @@ def test_members_of_aggregates_and_booleans_are_compared():
         + container("Q", [], "P", comparison("a.kind", 3))
         + container("R", [], "P", comparison("a.on", "True", "!=")),
     )
-    found = decode_packets(parse_xtce(text), *whole([b"\x31", b"\x30", b"\x20", b"\x21"]))
+    found = Decoder(parse_xtce(text)).decode(*whole([b"\x31", b"\x30", b"\x20", b"\x21"]))
     assert {name: table.packet_index.tolist() for name, table in found.tables.items()} == {
         "Q": [0],
         "R": [2],
@@ -445,5 +445,5 @@ def test_descriptions_alarms_algorithms_and_commands_change_nothing():
     assert isinstance(parameter.type, ScalarType) and parameter.type.unit == "m"
     assert isinstance(parameter.type.encoding, IntegerEncoding)
     assert parameter.type.encoding.calibration.default == Polynomial(((1.0, 0), (2.0, 1)))
-    column = decode_packets(definition, *whole([b"\x05"])).tables["P"].columns["a"]
+    column = Decoder(definition).decode(*whole([b"\x05"])).tables["P"].columns["a"]
     assert column.to_list() == [11.0] and np.array_equal(column.to_list(raw=True), [5])

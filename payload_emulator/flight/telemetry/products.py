@@ -58,9 +58,3 @@ def map_octets(sightings: Mapping[int, int]) -> bytes:
         [(crater, min(count, 0xFFFF)) for crater, count in sorted(sightings.items())], dtype=_LANDMARK
     )
     return rows.tobytes()
-
-
-def unpack_map(octets: bytes) -> dict[int, int]:
-    """Return the number of frames that used each crater."""
-    rows = np.frombuffer(octets, dtype=_LANDMARK)
-    return dict(zip(rows["crater_id"].tolist(), rows["frames"].tolist(), strict=True))

@@ -12,9 +12,6 @@ from lunar.frames import enu_from_mcmf
 SUN_ANGULAR_RADIUS_RAD = math.radians(0.2666)
 """Half the Sun's apparent diameter at 1 au (nominal solar radius 695 700 km over 149 597 871 km)."""
 
-PAPER_ELEVATION_RAD = (math.radians(5.0), math.radians(15.0))
-PAPER_AZIMUTH_RAD = (math.radians(-45.0), math.radians(45.0))
-
 
 def sun_direction_mcmf(
     elevation_rad: float, azimuth_rad: float, latitude_rad: float, longitude_rad: float
@@ -31,12 +28,3 @@ def sun_angles(sun_mcmf: FloatArray, latitude_rad: float, longitude_rad: float) 
     """Elevation and azimuth (from north, clockwise, -pi..pi) of a unit vector to the Sun at a place."""
     east, north, up = enu_from_mcmf(latitude_rad, longitude_rad) @ sun_mcmf
     return math.asin(min(1.0, max(-1.0, up))), math.atan2(east, north)
-
-
-def paper_light(seed: int, frame_number: int) -> tuple[float, float]:
-    """Elevation and azimuth in radians of the paper's light for one frame: uniform in 5..15 and -45..45 degrees.
-
-    A frame's light depends on the seed and its number alone, not on what was drawn before.
-    """
-    rng = np.random.Generator(np.random.Philox(key=[seed & 0xFFFF_FFFF_FFFF_FFFF, frame_number]))
-    return float(rng.uniform(*PAPER_ELEVATION_RAD)), float(rng.uniform(*PAPER_AZIMUTH_RAD))

@@ -219,11 +219,6 @@ class ExportedCraterNet(nn.Module):
         return torch.sigmoid(out[:, : self.heat_channels]), out[:, self.heat_channels :]
 
 
-def count_parameters(network: nn.Module) -> int:
-    """Number of trained values."""
-    return sum(p.numel() for p in network.parameters())
-
-
 class _SqueezeExcite(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()

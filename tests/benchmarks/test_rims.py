@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.rims import rim_errors
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -13,7 +14,6 @@ from lunar.frames import mcmf_from_spherical
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim.render.labels import label_frame, project_craters
 from payload_emulator.sim.render.raymarch import cast
-from payload_emulator.sim.render.rims import rim_errors
 from payload_emulator.sim.terrain.opening import open_terrain
 
 CAMERA = PinholeCamera()
