@@ -35,7 +35,7 @@ from payload_emulator.sim.render import raymarch, renderer
 from payload_emulator.sim.render.cycles import render_scene
 from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_scene
 from payload_emulator.sim.render.labels import label_frame
-from payload_emulator.sim.render.light import paper_light, sun_direction_mcmf
+from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.renderer import Rendering
 from payload_emulator.sim.render.sensor import SensorModel, expose
 from payload_emulator.sim.terrain.opening import open_terrain
@@ -101,7 +101,9 @@ def _speed_at(
     place = math.radians(region.timed_deg[0]), math.radians(region.timed_deg[1])
     position = mcmf_from_spherical(*place, 1000.0 * altitude_km)
     pose = (terrain, CAMERA, position, nadir_camera_from_mcmf(position))
-    view = (*pose, sun_direction_mcmf(*paper_light(1, number), *place))
+    rng = np.random.default_rng((1, number))
+    light = math.radians(rng.uniform(5.0, 15.0)), math.radians(rng.uniform(-45.0, 45.0))
+    view = (*pose, sun_direction_mcmf(*light, *place))
     first_ms = _cpu_ms(lambda: renderer.render(*view))
     picture = renderer.render(*view)
     label_frame(*pose, lit=picture.lit)
