@@ -30,6 +30,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "data": ("data", "list, fetch and verify the public data products"),
     "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
     "camera": ("camera", "camera studies (field of view)"),
+    "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
     "identify": ("identify", "rates of crater identification and of wrong identifications"),
     "render": ("render", "render one frame of a scenario"),
     "dataset": ("dataset", "build, check and summarise detector data sets"),
