@@ -268,7 +268,7 @@ class Pass:
 
     def export(self, kind: FormatName, target: str | Path, *, states: str = "reference") -> Path:
         """Write the pass in a format of other tools, and return the path."""
-        self._client.export_pass(self.id, kind, Path(target), states=states)
+        self._client.export_pass(self.id, kind, out=Path(target), states=states)
         return Path(target)
 
     def _exported(self, kind: FormatName) -> dict[str, bytes]:

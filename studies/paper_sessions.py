@@ -117,7 +117,7 @@ def fly(shop: Workshop, flight: Flight) -> PaperSession:
         shutil.rmtree(home, ignore_errors=True)  # of an interrupted run, or of another version
         with local_client(open_ground(home, shop.data), ACTOR) as service:
             pass_id = service.import_archive(archive)
-            service.get_report(service.make_report(pass_id), report, kind="json")
+            service.get_report(service.make_report(pass_id), report, format="json")
         return {"pass_id": pass_id}
 
     flown = shop.step(f"flight {flight.key}", made_from, make_flight)

@@ -149,7 +149,7 @@ def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, wi
 
 
 def report_of(api: Client, pass_id: int, out: Path) -> dict[str, Any]:
-    api.get_report(api.make_report(pass_id), out, kind="json")
+    api.get_report(api.make_report(pass_id), out, format="json")
     document: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
     return document
 

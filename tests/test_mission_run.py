@@ -173,7 +173,7 @@ def test_what_a_person_does_after_the_posts_is_an_intervention(tmp_path: Path) -
         posted = (1, ground.audit_head())
         assert ground.interventions([posted]) == []
         assert len(ground.interventions([])) == 1
-        command = ground.client.enter_telecommand("test_connection", {}, spacecraft_id=76)
+        command = ground.client.enter_telecommand("test_connection", 76)
         ground.client.release_telecommand(command.id)
         assert [one["text"].split(":")[0] for one in ground.interventions([posted])] == ["mission-run"] * 2
     finally:

@@ -18,7 +18,7 @@ automation = operations("automation")
 
 @automation.get("/automation/rules")
 def list_automation_rules(ground: GroundOf, _: Viewer) -> PageOf[RuleInForce]:
-    """List the rules in force by spacecraft, and the default rules of spacecraft that have no mission description."""
+    """List the rules in force by spacecraft, and the default rules of spacecraft without a mission description."""
     return PageOf.all_of(service.list_rules(ground))
 
 
@@ -44,7 +44,7 @@ def refuse_automation_action(ground: GroundOf, caller: Operator, action_id: RowI
 
 @automation.post("/automation/actions/{action_id}/repeat", responses=problems(404, 409))
 def repeat_automation_action(ground: GroundOf, caller: Operator, action_id: RowId) -> AutomationAction:
-    """Queue a failed action again, and those of its rule that were skipped after it; it has three attempts again.
+    """Queue a failed action again for three attempts, and those of its rule that were skipped after it.
 
     An action that is queued already stays as it is.
     """

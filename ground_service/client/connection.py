@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Any, Generic, Self, TypeVar, cast, get_args, get_origin, get_type_hints
+from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -30,13 +35,14 @@ RECONNECT_S = 0.5
 PAGE_LIMIT = 1000
 BLOCK_OCTETS = 1 << 18
 
-Model = TypeVar("Model", bound=BaseModel)
+Method = TypeVar("Method", bound=Callable[..., Any])
 Item = TypeVar("Item", bound=BaseModel)
 Result = TypeVar("Result")
 Value = str | int | float | Sequence[str] | None
 """Value of a query key; None leaves the key out."""
 
-Body = Path | bytes | Mapping[str, Any] | BaseModel
+Document = Mapping[str, Any] | BaseModel
+Body = Path | bytes | Document
 
 
 class Connection:
@@ -71,53 +77,30 @@ class Connection:
         """Close the connections."""
         self._http.close()
 
-    # Requests with a typed response
+    def _answer(self, kind: Any, verb: str, path: str, **request: Any) -> Any:
+        """Return the response to a request as an entity, a list of entities, a listing, or nothing."""
+        if kind is type(None):
+            self._send(verb, path, **request)
+            return None
+        item = next(iter(get_args(kind)), None)
+        if get_origin(kind) is list:  # in one response, as a page or not
+            found = self._validated(PageOf[item] | kind, self._send(verb, path, **request))  # type: ignore[valid-type]
+            return found.items if isinstance(found, PageOf) else found
+        if get_origin(kind) is not Listing:
+            return self._validated(kind, self._send(verb, path, **request))
+        query = request.pop("query")
 
-    def _get(self, model: type[Model], path: str, **query: Value) -> Model:
-        return self._call(model, "GET", path, query=query)
-
-    def _post(
-        self,
-        model: type[Model],
-        path: str,
-        body: Body | None = None,
-        *,
-        key: str | None = None,
-        **query: Value,
-    ) -> Model:
-        return self._call(model, "POST", path, query=query, body=body, key=key)
-
-    def _call(self, model: type[Model], method: str, path: str, **request: Any) -> Model:
-        return self._validated(TypeAdapter(model), self._octets(method, path, **request))
-
-    def _items(
-        self, model: type[Item], path: str, body: Mapping[str, Any] | None = None, **query: Value
-    ) -> list[Item]:
-        """Return the items that a POST request yields."""
-        return self._call(_page_type(model), "POST", path, query=query, body=body).items
-
-    def _all(self, model: type[Item], path: str, **query: Value) -> list[Item]:
-        """Return a list that the service sends in one response."""
-        adapter: TypeAdapter[list[Item]] = TypeAdapter(list[model])  # type: ignore[valid-type] # built at run time
-        return self._validated(adapter, self._octets("GET", path, query=query))
-
-    def _list(self, model: type[Item], path: str, *, paged: bool = True, **query: Value) -> Listing[Item]:
-        """Return a list; one that is not paged comes in one response."""
-        page_type = _page_type(model)
-
-        def fetch(limit: int, offset: int) -> PageOf[Item]:
-            span = {"limit": limit, "offset": offset} if paged else {}
-            return self._get(page_type, path, **span, **query)
+        def fetch(limit: int, offset: int) -> PageOf[Any]:
+            span = {"limit": limit, "offset": offset}
+            response = self._send(verb, path, query=query | span, **request)
+            return cast("PageOf[Any]", self._validated(PageOf[item], response))  # type: ignore[valid-type]
 
         return Listing(fetch)
 
-    def _octets(self, method: str, path: str, **request: Any) -> bytes:
-        return self._send(method, path, **request).content
-
-    def _validated(self, adapter: TypeAdapter[Result], octets: bytes) -> Result:
+    def _validated(self, kind: Any, response: httpx.Response) -> Any:
         try:
             # A newer service may send further fields.
-            return adapter.validate_json(octets, extra="ignore")
+            return TypeAdapter(kind).validate_json(response.content, extra="ignore")
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
@@ -126,19 +109,15 @@ class Connection:
                 f"{self._server}: expected JSON of a LINNA service, found other: {where or 'body'}: {first['msg']}",
             ) from None
 
-    # Streams
-
-    def _download(self, path: str, target: Path, *, body: Body | None = None, **query: Value) -> None:
+    def _download(self, verb: str, path: str, target: Path, **request: Any) -> None:
         """Write a response to a file in blocks; the file is complete or absent."""
         partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            self._send("GET" if body is None else "POST", path, query=query, body=body, sink=partial)
+            self._send(verb, path, sink=partial, **request)
             partial.replace(target)
         finally:
             partial.unlink(missing_ok=True)
-
-    # The exchange
 
     def _send(
         self,
@@ -223,8 +202,73 @@ class Listing(Generic[Item]):
         return self._fetch(1, 0).total
 
 
-def _page_type(model: type[Item]) -> type[PageOf[Item]]:
-    return cast("type[PageOf[Item]]", PageOf.__class_getitem__(model))
+def operation(request: str, body: str | tuple[str, ...] = ()) -> Callable[[Method], Method]:
+    """Return a decorator of a method without statements, which then sends the request of an operation.
+
+    Parameters
+    ----------
+    request
+        Verb and path, such as ``GET /passes/{pass_id}``.
+    body
+        Argument that is the JSON body, or arguments that are its fields; None is left out.
+
+    Notes
+    -----
+    Other arguments are parts of the path, the file to send (`file`), the file to write (`out`), headers (`key`,
+    `if_match`) or keys of the query. The annotation of the result states how the response is read.
+    """
+    verb, path = request.split(" ")
+    parts = set(re.findall(r"{(\w+)}", path))
+
+    def decorate(method: Method) -> Method:
+        signature = inspect.signature(method)
+
+        @functools.wraps(method)
+        def send(self: Connection, *given: Any, **named: Any) -> Any:
+            bound = signature.bind(self, *given, **named)
+            bound.apply_defaults()
+            _, *values = bound.arguments.items()
+            arguments = dict(values)
+            where = path.format_map({name: quote(str(arguments.pop(name)), safe="") for name in parts})
+            options: dict[str, Any] = {}
+            if "file" in arguments:
+                options["body"] = file = arguments.pop("file")
+                if "name" in arguments and arguments["name"] is None and isinstance(file, Path):
+                    arguments["name"] = file.name
+            elif isinstance(body, str):
+                options["body"] = arguments.pop(body)
+            elif body:
+                fields = {name: arguments.pop(name) for name in body}
+                options["body"] = {name: value for name, value in fields.items() if value is not None}
+            if "key" in arguments:
+                options["key"] = arguments.pop("key") or new_key()
+            tag = arguments.pop("if_match", None)
+            if tag is not None:
+                options["headers"] = {"If-Match": tag}
+            out = arguments.pop("out", None)
+            if out is not None:
+                return self._download(verb, where, out, query=arguments, **options)
+            return self._answer(get_type_hints(method)["return"], verb, where, query=arguments, **options)
+
+        return cast("Method", send)
+
+    return decorate
+
+
+class Lazy:
+    """Module that is imported when one of its names is used."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self._name), name)
+
+
+def import_lazily(namespace: dict[str, Any], modules: str) -> None:
+    """Add modules of entities under the name of their capability, or of the module if it is not `model`."""
+    for name in modules.split():
+        namespace[name.removesuffix(".model").rpartition(".")[2]] = Lazy(f"ground_service.{name}")
 
 
 def new_key() -> str:

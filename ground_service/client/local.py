@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ground_service.access.service import Caller
 from ground_service.client.connection import API_PREFIX
-from ground_service.client.operations import Client
+from ground_service.client.tasks import Client
 from ground_service.ground import Ground
 from ground_service.http import problems
 from ground_service.http.requests import PlainText

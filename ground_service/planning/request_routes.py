@@ -33,20 +33,20 @@ def add_request(
     response: Response,
     ground: GroundOf,
     caller: Operator,
-    given: StandingRequestIn,
+    request: StandingRequestIn,
     idempotency_key: OnceKey = None,
 ) -> StandingRequest:
     """Add a standing request; the planner fills the coming days from then on."""
 
     def add() -> dict[str, Any]:
-        return standing.add_request(ground, given, actor=caller.name).model_dump(mode="json")
+        return standing.add_request(ground, request, actor=caller.name).model_dump(mode="json")
 
     answer = once(
         ground,
         actor=caller.name,
         operation="request",
         key=idempotency_key,
-        request=given.model_dump(mode="json"),
+        request=request.model_dump(mode="json"),
         work=add,
     )
     added = StandingRequest.model_validate(answer, strict=False)
@@ -62,10 +62,10 @@ def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> StandingRequ
 
 @requests.patch("/requests/{request_id}", responses=problems(409))
 def change_request(
-    ground: GroundOf, caller: Operator, request_id: PassId, given: StandingRequestChange
+    ground: GroundOf, caller: Operator, request_id: PassId, change: StandingRequestChange
 ) -> StandingRequest:
     """Pause or resume a standing request, or replace its terms; planned windows stay."""
-    return standing.change_request(ground, request_id, given, actor=caller.name)
+    return standing.change_request(ground, request_id, change, actor=caller.name)
 
 
 @requests.delete("/requests/{request_id}", status_code=204)

@@ -45,9 +45,9 @@ IfMatch = Annotated[
 
 
 @planning.post("/windows/search", responses=problems(404))
-def search_windows(ground: GroundOf, _: Viewer, given: WindowSearch) -> SearchResult:
+def search_windows(ground: GroundOf, _: Viewer, constraints: WindowSearch) -> SearchResult:
     """Search candidate windows by constraints over a reference ephemeris."""
-    return service.search_windows(ground, given)
+    return service.search_windows(ground, constraints)
 
 
 @planning.get("/windows")
@@ -63,25 +63,25 @@ def add_window(
     response: Response,
     ground: GroundOf,
     caller: Operator,
-    given: WindowIn,
+    window: WindowIn,
     idempotency_key: OnceKey = None,
 ) -> Window:
     """Add a window as a draft; 409 lists the conflicts with committed windows and resources."""
 
     def add() -> dict[str, Any]:
-        return service.add_window(ground, given.entry(), actor=caller.name).model_dump(mode="json")
+        return service.add_window(ground, window.entry(), actor=caller.name).model_dump(mode="json")
 
     answer = once(
         ground,
         actor=caller.name,
         operation="window",
         key=idempotency_key,
-        request=given.model_dump(mode="json"),
+        request=window.model_dump(mode="json"),
         work=add,
     )
-    window = Window.model_validate(answer)
-    response.headers["Location"] = f"{API_PREFIX}/windows/{window.id}"
-    return _tagged(response, window)
+    added = Window.model_validate(answer)
+    response.headers["Location"] = f"{API_PREFIX}/windows/{added.id}"
+    return _tagged(response, added)
 
 
 @planning.get("/windows/{window_id}")
@@ -96,7 +96,7 @@ def change_window(
     ground: GroundOf,
     caller: Operator,
     window_id: PassId,
-    given: WindowChange,
+    change: WindowChange,
     if_match: IfMatch = None,
 ) -> Window:
     """Change a draft, approve a window, make it a draft again, or declare it failed."""
@@ -104,9 +104,9 @@ def change_window(
         ground,
         window_id,
         actor=caller.name,
-        changes=given.changes(),
-        decision=given.state,
-        reason=given.reason,
+        changes=change.changes(),
+        decision=change.state,
+        reason=change.reason,
         expected=lambda found: _expect(found, if_match),
     )
     return _tagged(response, window)
@@ -166,9 +166,9 @@ def get_crater_density(
 
 
 @planning.post("/plan", status_code=201, responses=problems(404, 409))
-def import_plan(ground: GroundOf, caller: Operator, given: Plan) -> Imported:
+def import_plan(ground: GroundOf, caller: Operator, plan: Plan) -> Imported:
     """Import all windows of a plan as drafts, or none of them; existing windows do not change."""
-    return Imported(windows=exchange.import_plan(ground, given.windows, actor=caller.name))
+    return Imported(windows=exchange.import_plan(ground, plan.windows, actor=caller.name))
 
 
 def _tag(window: Window) -> str:

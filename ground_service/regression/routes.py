@@ -137,19 +137,19 @@ def start_regression(
     ground: GroundOf,
     caller: Operator,
     dispatcher: DispatcherOf,
-    given: RegressionRequest,
+    request: RegressionRequest,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
     """Compare a candidate build with a baseline: a job for every missing replay, and one for the verdict."""
     identity = idempotent_id("regression", caller, idempotency_key) or uuid.uuid4().hex
-    if given.policy is not None:
-        read_policy(given.policy.encode(), given.policy_name)
+    if request.policy is not None:
+        read_policy(request.policy.encode(), request.policy_name)
     arguments = {
-        **compared(ground, given),
-        "policy": given.policy,
-        "policy_name": given.policy_name,
+        **compared(ground, request),
+        "policy": request.policy,
+        "policy_name": request.policy_name,
     }
-    missing = missing_replays(ground, arguments) if given.workers is None else []
+    missing = missing_replays(ground, arguments) if request.workers is None else []
     replays = {f"{one['archive']} {one['build']}": one for one in missing}
     for job in enter_jobs(ground, replays, "regression", arguments, identity):
         dispatcher.start(job)
@@ -163,12 +163,12 @@ def start_analysis(
     ground: GroundOf,
     caller: Operator,
     dispatcher: DispatcherOf,
-    given: Comparison,
+    request: Comparison,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
     """Return the metrics of one build (candidate and baseline alike) as a job, without a verdict."""
     job_id = idempotent_id("analysis", caller, idempotency_key)
-    job = dispatcher.submit("analysis", compared(ground, given), job_id=job_id)
+    job = dispatcher.submit("analysis", compared(ground, request), job_id=job_id)
     response.headers["Location"] = f"{API_PREFIX}/jobs/{job}"
     return get_job(ground, job)
 

@@ -45,9 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def list_alarms(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
-        page = service.list_alarms(states=arguments.state or (), severity=arguments.severity).page(
-            arguments.limit
-        )
+        page = service.list_alarms(state=arguments.state, severity=arguments.severity).page(arguments.limit)
     lines = [_line(one) for one in page.items]
     alarms = [one.model_dump(mode="json") for one in page.items]
     emit(arguments, {"alarms": alarms, "total": page.total}, text="\n".join(lines) or "no alarms")

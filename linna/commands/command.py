@@ -66,8 +66,8 @@ def enter(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         telecommand = service.enter_telecommand(
             arguments.name,
-            dict(_argument(text) for text in arguments.arguments),
-            spacecraft_id=arguments.spacecraft_id,
+            arguments.spacecraft_id,
+            arguments=dict(_argument(text) for text in arguments.arguments),
             instance=arguments.instance,
             timeout_s=arguments.timeout_s,
         )

@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
                 spacecraft_id=arguments.spacecraft_id,
                 instance=arguments.instance,
                 stream=arguments.stream,
-                offset=offset,
+                offset=None if arguments.stream is None else offset,
                 station=arguments.station,
                 link=arguments.link,
             )

@@ -102,7 +102,7 @@ def show(arguments: argparse.Namespace) -> int:
 def decide(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         decision = service.accept_landmark if arguments.accept else service.reject_landmark
-        landmark = decision(arguments.landmark_id, arguments.reason)
+        landmark = decision(arguments.landmark_id, reason=arguments.reason)
     emit(arguments, landmark.model_dump(mode="json", exclude={"evidence"}), text=_line(landmark))
     return 0
 
@@ -141,7 +141,7 @@ def upload(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         queued = [
             service.enter_telecommand(
-                name, values, spacecraft_id=arguments.spacecraft_id, instance=arguments.instance
+                name, arguments.spacecraft_id, arguments=values, instance=arguments.instance
             ).id
             for name, values in upload_entries(octets, arguments.transaction)
         ]

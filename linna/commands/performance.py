@@ -112,7 +112,7 @@ def _report(arguments: argparse.Namespace) -> int:
             arguments.spacecraft_id, arguments.month, instance=arguments.instance
         )
         for kind in ("html", "pdf", "json"):
-            service.get_monthly_report(made.id, arguments.out / f"report.{kind}", kind=kind)
+            service.get_monthly_report(made.id, arguments.out / f"report.{kind}", format=kind)
     page = str(arguments.out / "report.html")
     emit(arguments, {"report": page, **made.model_dump(mode="json")}, text=f"{page}\n{made.verdict}")
     return 0

@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         report_id = service.make_report(arguments.pass_id)
         for kind in ("html", "json", "pdf"):
-            service.get_report(report_id, folder / f"report.{kind}", kind=kind)
+            service.get_report(report_id, folder / f"report.{kind}", format=kind)
         summary = service.get_report_summary(report_id).model_dump(mode="json")
     figures: dict[str, Any] = {
         "report": str(folder / "report.html"),

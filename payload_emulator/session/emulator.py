@@ -38,7 +38,7 @@ from payload_emulator.session.recording import (
     step_input,
 )
 from payload_emulator.session.scenario import Scenario, format_scenario
-from payload_emulator.session.scoring import score_navigation
+from payload_emulator.session.scoring import judge_session, score_navigation
 from payload_emulator.session.spacecraft import Spacecraft, new_board
 from payload_emulator.session.world import (
     World,
@@ -177,7 +177,8 @@ def _emulate_into(
     )
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
-    summary |= score_navigation(world, loaded, catalogue, attitudes, b"".join(packets))
+    judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
+    summary |= score_navigation(world, judged)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     (folder / "manifest.json").write_text(json.dumps(_manifest(world, loaded, folder), indent=2) + "\n")
     return summary

@@ -60,6 +60,8 @@ class FlownErrors:
         Number of the frame in the session.
     state_error_rtn
         Estimate minus truth, position (m) and velocity (m/s), shape (n, 6).
+    sigma_rtn_m
+        Standard deviation of the position that the filter states along the axes of the true orbit, shape (n, 3).
     nees
         Normalised estimation error squared, 6 degrees of freedom.
     only_error_m
@@ -70,6 +72,7 @@ class FlownErrors:
 
     frame: IntArray
     state_error_rtn: FloatArray
+    sigma_rtn_m: FloatArray
     nees: FloatArray
     only_error_m: FloatArray
     coast_end_m: FloatArray
@@ -79,14 +82,64 @@ class FlownErrors:
         return np.asarray(np.linalg.norm(self.state_error_rtn[:, :3], axis=1), dtype=np.float64)
 
 
-def score_navigation(
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedSession:
+    """What the anchored estimator did in a session, judged by the truth; a row per frame of the session.
+
+    Attributes
+    ----------
+    errors
+        Errors after the frames that the filter spoke in.
+    outcome, nis, matched
+        Outcome of each frame (-1: none), NIS and number of matched craters of its fix.
+    pairs
+        Right and wrong pairs of the fix, shape (n, 2).
+    detections, findable
+        Detections, and those that are catalogued craters.
+    craters, found
+        Catalogued craters of 5 to 30 km in the image, and those that are detected.
+    arcs
+        First and last frame of each stretch of images.
+    """
+
+    errors: FlownErrors
+    outcome: IntArray
+    nis: FloatArray
+    matched: IntArray
+    pairs: IntArray
+    detections: IntArray
+    findable: IntArray
+    craters: IntArray
+    found: IntArray
+    arcs: tuple[tuple[int, int], ...]
+
+    @property
+    def imaging(self) -> BoolArray:
+        return np.asarray((self.outcome >= 0) & (self.outcome != Outcome.no_image))
+
+    @property
+    def fixed(self) -> BoolArray:
+        return np.asarray(self.outcome == Outcome.fixed)
+
+    @property
+    def wrong_fixes(self) -> int:
+        """Fixes most of whose pairs are wrong."""
+        return int(np.sum(self.fixed & (self.pairs[:, 1] > self.pairs[:, 0])))
+
+    def nis_per_degree(self, chosen: BoolArray) -> float | None:
+        """Return the NIS of the fixes in chosen frames (n,) per degree of freedom; None without any."""
+        used = chosen & self.fixed & np.isfinite(self.nis)
+        return _ratio(float(np.sum(self.nis[used])), float(2 * np.sum(self.matched[used])))
+
+
+def judge_session(
     world: World,
     loaded: LoadedPayload,
     catalogue: CraterCatalogue,
     camera_from_mcmf: FloatArray,
     octets: bytes,
-) -> dict[str, Any]:
-    """The section `navigation` of a summary; nothing where the anchored estimator did not run.
+) -> JudgedSession | None:
+    """Return a session judged by the truth; None where the anchored estimator did not run.
 
     Parameters
     ----------
@@ -100,25 +153,28 @@ def score_navigation(
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=_PACKETS)
     estimates = filter_estimates(tables)
     if not len(estimates):
-        return {}
+        return None
     frame_ticks = np.array([clock_ticks(world, int(utc_ns)) for utc_ns in world.frame_utc_ns])
     outcomes, nis, matched = _outcomes(tables, frame_ticks)
     imaging = (outcomes >= 0) & (outcomes != Outcome.no_image)
     errors = _errors(world, loaded, estimates, frame_ticks, imaging)
-    pairs = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
-    arcs = _arcs(world.frame_utc_ns, imaging)
-    rows = [_arc_row(world, errors, outcomes, arc) for arc in arcs]
+    pairs, seen = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
+    arcs = tuple(_arcs(world.frame_utc_ns, imaging))
+    detections, findable, craters, found = seen.T
+    return JudgedSession(errors, outcomes, nis, matched, pairs, detections, findable, craters, found, arcs)
+
+
+def score_navigation(world: World, judged: JudgedSession | None) -> dict[str, Any]:
+    """Return the section `navigation` of a summary; nothing where the anchored estimator did not run."""
+    if judged is None:
+        return {}
+    errors, arcs, imaging, fixed = judged.errors, judged.arcs, judged.imaging, judged.fixed
+    rows = [_arc_row(world, errors, judged.outcome, arc) for arc in arcs]
     first = arcs[_SETTLED_ARC][0] if len(arcs) > _SETTLED_ARC else _SETTLED_FRAMES
     settled = imaging[errors.frame] & (errors.frame >= first)
-    fixed = outcomes == Outcome.fixed
-    right, findable = pairs
-    wrong_share = np.divide(
-        right[:, 1], right.sum(axis=1), out=np.zeros(len(right)), where=right.sum(axis=1) > 0
-    )
-    off = np.zeros(outcomes.size, dtype=bool)
+    off = np.zeros(fixed.size, dtype=bool)
     off[errors.frame] = errors.position_m > _WRONG_FIX_M
-    rich = imaging & (findable >= 4)
-    tracked = fixed & np.isfinite(nis)
+    rich = imaging & (judged.findable >= 4)
     coast = errors.coast_end_m[errors.frame >= first]
     return {
         "navigation": {
@@ -135,14 +191,14 @@ def score_navigation(
             "median_rtn_m": _absolute_percentiles(errors.state_error_rtn[settled, :3], 50.0),
             "p95_rtn_m": _absolute_percentiles(errors.state_error_rtn[settled, :3], 95.0),
             "nees6": _means(errors.nees[settled, None])[0],
-            "nis_per_degree": _ratio(float(np.sum(nis[tracked])), float(2 * np.sum(matched[tracked]))),
+            "nis_per_degree": judged.nis_per_degree(fixed),
             "fixed_share_imaging": _ratio(float(np.sum(fixed & imaging)), float(np.sum(imaging))),
             "fixed_share_four_findable": _ratio(float(np.sum(fixed & rich)), float(np.sum(rich))),
             "frames_four_findable": int(np.sum(rich)),
-            "pairs": int(right.sum()),
-            "wrong_pairs_share": _ratio(float(right[:, 1].sum()), float(right.sum())),
-            "wrong_fixes": int(np.sum(fixed & (wrong_share > 0.5))),
-            "fixes_off_by_1_km": int(np.sum(fixed & off & (np.arange(outcomes.size) >= first))),
+            "pairs": int(judged.pairs.sum()),
+            "wrong_pairs_share": _ratio(float(judged.pairs[:, 1].sum()), float(judged.pairs.sum())),
+            "wrong_fixes": judged.wrong_fixes,
+            "fixes_off_by_1_km": int(np.sum(fixed & off & (np.arange(fixed.size) >= first))),
             "recovery": _recovery(world, errors, imaging),
             "per_arc": rows,
         }
@@ -197,6 +253,8 @@ def _errors(
     error = rtn_errors(own[:, :6], truth, to_truth, rtn)
     own_error = np.einsum("nji,nkj->nki", to_truth, halves(turned(own[:, :6], to_truth) - truth))
     nees = normalised_squares(own_error.reshape(-1, 6), covariance[:, :6, :6])
+    axes = rtn @ to_truth
+    sigma = np.sqrt(np.einsum("nij,njk,nik->ni", axes, covariance[:, :3, :3], axes))
     only = _propagated(loaded, model, burns, ticks)
     only_error = np.linalg.norm(rtn_errors(only, truth, to_truth, rtn)[:, :3], axis=1)
     coast_end = np.full(frame.size, np.nan)
@@ -209,7 +267,7 @@ def _errors(
                 coast_end[at] = np.linalg.norm(
                     rtn_errors(prior[None, :6], truth[here], to_truth[here], rtn[here])[0, :3]
                 )
-    return FlownErrors(frame, error, nees, only_error, coast_end)
+    return FlownErrors(frame, error, sigma, nees, only_error, coast_end)
 
 
 def turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
@@ -262,12 +320,14 @@ def _judged_pairs(
     tables: dict[str, Table],
     frame_ticks: IntArray,
 ) -> tuple[IntArray, IntArray]:
-    """Right and wrong pairs of each frame's fix, shape (n, 2), and detections that are catalogued craters (n,).
+    """Right and wrong pairs of each frame's fix, shape (n, 2), and the counts of detections and craters (n, 4).
 
     Landmarks that the payload mapped itself are in no catalogue and are not judged.
     """
     frames = world.frame_utc_ns.size
-    judged, findable = np.zeros((frames, 2), dtype=np.int64), np.zeros(frames, dtype=np.int64)
+    judged, counts = np.zeros((frames, 2), dtype=np.int64), np.zeros((frames, 4), dtype=np.int64)
+    corner = np.array([world.camera.width_px, world.camera.height_px]) - 1.0
+    sized = (catalogue.diameter_m >= 5e3) & (catalogue.diameter_m <= 30e3)
     seen = tables["detections"]
     places = np.stack([seen.items["u_px"], seen.items["v_px"], seen.items["diameter_px"]], axis=1)
     position = world.truth.positions_mcmf(world.frame_utc_ns)
@@ -282,8 +342,6 @@ def _judged_pairs(
     latitude, longitude, altitude = spherical_from_mcmf(position)
     for row, number in zip(*_first_of_each(seen.columns["image_ticks"], frame_ticks), strict=True):
         mine = places[_rows_of(seen.item_owner, row)]
-        if not len(mine):
-            continue
         reach = 4.0 * altitude[number] + 50_000.0
         near = catalogue.near(float(latitude[number]), float(longitude[number]), float(reach))
         uv, diameter = _seen(world, camera_from_mcmf[number], position[number], rim, catalogue, near)
@@ -291,7 +349,9 @@ def _judged_pairs(
         with np.errstate(divide="ignore", invalid="ignore"):
             alike = np.abs(np.log(mine[:, None, 2] / diameter[None])) < _LOG_DIAMETER_GATE
         limit = np.maximum(_RIGHT_PX, _RIGHT_OF_DIAMETER * mine[:, 2])
-        findable[number] = np.count_nonzero(np.any(alike & (away < limit[:, None]), axis=1))
+        same = alike & (away < limit[:, None])
+        wanted = sized[near] & np.all((uv >= 0.0) & (uv <= corner), axis=1)
+        counts[number] = len(mine), same.any(axis=1).sum(), wanted.sum(), (wanted & same.any(axis=0)).sum()
         if used is None or number not in used_row:
             continue
         pairs = _rows_of(used.item_owner, used_row[number])
@@ -302,7 +362,7 @@ def _judged_pairs(
         at, _ = _seen(world, camera_from_mcmf[number], position[number], rim, catalogue, crater)
         right = np.linalg.norm(mine[detection, :2] - at, axis=1) < limit[detection]
         judged[number] = np.count_nonzero(right), np.count_nonzero(~right)
-    return judged, findable
+    return judged, counts
 
 
 def _rows_of(owner: IntArray, value: int) -> slice:

@@ -18,7 +18,7 @@ from pathlib import Path
 from pydantic import SecretStr
 
 from ground_service.access.service import add_user, renew_token
-from ground_service.client.operations import Client
+from ground_service.client import Client
 from ground_service.clock import ClockFile, set_mission_clock
 from ground_service.errors import Conflict, GroundError
 from ground_service.ground import Ground, open_ground

@@ -383,7 +383,7 @@ class MissionRun:
             ("set_time_report_rate", {"rate_exponent": TIME_RATE_EXPONENT}),
             ("set_parameter", {"parameter_id": SCRUB_PARAMETER, "value": SCRUB_INTERVAL_S}),
         ):
-            command = ground.client.enter_telecommand(name, arguments, spacecraft_id=SPACECRAFT_ID)
+            command = ground.client.enter_telecommand(name, SPACECRAFT_ID, arguments=arguments)
             ground.client.release_telecommand(command.id)
 
     def _deliver_reference(self, ground: MissionGround, dynamics: FlightDynamics, now: int) -> None:

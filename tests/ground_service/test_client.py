@@ -32,6 +32,7 @@ from ground_service.client.problems import (
 from ground_service.ground import open_ground
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tests.ground_service import client_generator
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -173,7 +174,7 @@ def test_what_is_no_invitation_to_come_again_is_told_at_once(
     ("call", "attempts"),
     [
         (lambda client: client.evaluate_pass(1), ATTEMPTS),
-        (lambda client: client.enter_telecommand("test_connection", {}, spacecraft_id=76), ATTEMPTS),
+        (lambda client: client.enter_telecommand("test_connection", 76), ATTEMPTS),
         (lambda client: client.release_telecommand(1), 1),
         (lambda client: client.change_window(1, {"state": "approved"}), 1),
         (lambda client: client.delete_window(1), 1),
@@ -326,7 +327,7 @@ def test_large_files_are_sent_and_received_in_blocks(service: Service, tmp_path:
         assert peak_of(lambda: client.add_ephemeris(large)) < 8 * MIB
         assert service.octets_received == 64 * MIB
         target = tmp_path / "reports" / "report.pdf"
-        assert peak_of(lambda: client.get_report("0" * 32, target, kind="pdf")) < 8 * MIB
+        assert peak_of(lambda: client.get_report("0" * 32, target, format="pdf")) < 8 * MIB
     assert target.stat().st_size == 64 * MIB
 
 
@@ -344,11 +345,14 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path: Path, clock: Clock) -> 
 
 
 ARGUMENTS: dict[str, Any] = {
-    "file": b"octets", "definition": {"a": 1}, "constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
-    "plan": {"a": 1}, "request": {"a": 1}, "points": [{"a": 1}], "receptions": [{"a": 1}], "arguments": {"a": 1},
-    "parameter": "temperature_c", "report_id": "0" * 32, "regression_id": "0" * 32, "job_id": "0" * 32,
-    "revision": "0" * 64, "display": {"a": 1}, "key": "0", "role": "viewer", "name": "ann", "reason": "wrong cadence",
+    "file": b"octets", "constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1}, "plan": {"a": 1},
+    "request": {"a": 1}, "points": [{"a": 1}], "receptions": [{"a": 1}], "document": {"a": 1}, "version": 1,
+    "pinned": True, "format": "csv",
 }  # fmt: skip
+
+
+def test_the_operations_are_generated_from_the_routes() -> None:
+    assert client_generator.TARGET.read_text() == client_generator.generate()
 
 
 def operations_of(tmp_path: Path) -> list[Any]:
@@ -377,8 +381,8 @@ def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_
         given = inspect.signature(method).parameters.values()
         known = {item["name"] for item in operation.get("parameters", []) if item["in"] == "query"}
         values = {
-            one.name: tmp_path / "target"
-            if one.name == "target"
+            one.name: tmp_path / "out"
+            if one.name == "out"
             else ARGUMENTS.get(one.name, 1 if one.name.endswith("_id") else "x")
             for one in given
             if one.default is one.empty or one.name in known or one.name in ("if_match", "key")
@@ -412,6 +416,20 @@ def test_a_client_that_is_not_closed_lets_python_end(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "0\n", "")
 
 
+def test_lists_in_one_response_are_lists_of_entities(tmp_path: Path) -> None:
+    with local_client(open_ground(tmp_path / "home"), "ann") as ground:
+        packet = DICTIONARY.pack(
+            "event_info",
+            {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
+            ticks=1,
+            sequence_count=0,
+        )
+        ground.ingest_file(encode_cadus([packet], spacecraft_id=76))
+        assert [(one.spacecraft_id, one.instance) for one in ground.list_spacecraft()] == [(76, "flight")]
+        assert {one.spacecraft_id for one in ground.list_automation_rules()} == {None}
+        assert "oem" in [one.name for one in ground.list_export_formats()]
+
+
 def test_the_example_of_the_documentation_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -432,7 +450,7 @@ def test_the_example_of_the_documentation_runs(
     with local_client(open_ground(tmp_path / "home"), "ann") as ground:
         ground.ingest_file(downlink)
         span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:10:00Z"}
-        ground.define_pass({"name": "evening pass", "spacecraft_id": 76, **span})
+        ground.define_pass("evening pass", spacecraft_id=76, **span)
 
     class OnThisMachine(Client):
         """Client that ignores the address of the example."""

@@ -69,6 +69,8 @@ def test_every_operation_has_a_function(service: TestClient, generated: Path) ->
     }
     found = {f"{file.parent.name}.{file.stem}" for file in (generated / "api").glob("*/*.py")}
     assert wanted <= found
+    for file in generated.rglob("*.py"):
+        compile(file.read_text(), str(file), "exec")  # a warning is an error
 
 
 def test_a_pass_is_defined_listed_and_shown_with_its_types(client: Any) -> None:

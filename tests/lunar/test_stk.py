@@ -162,7 +162,7 @@ def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, mes
     path = tmp_path / "faulty.e"
     path.write_text(text)
     with pytest.raises(DataFileError) as caught:
-        load_ephemeris(path)
+        parse_stk(path.read_text(), source=str(path))
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
 

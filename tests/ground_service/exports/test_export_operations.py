@@ -83,7 +83,7 @@ def test_the_client_lists_formats_and_names_a_fault(rich_ground: Ground, tmp_pat
     with local_client(open_ground(rich_ground.home), "test") as client:
         assert {"oem", "gpkg", "netcdf"} <= {one.name for one in client.list_export_formats()}
         with pytest.raises(ServiceProblem, match=r"expected .*reference"):
-            client.export_pass(1, "oem", tmp_path / "pass.oem", states="truth")
+            client.export_pass(1, "oem", out=tmp_path / "pass.oem", states="truth")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -369,7 +369,7 @@ def test_operations_and_commands_give_the_same_report(
         assert [one.id for one in client.list_monthly_reports(spacecraft_id=SPACECRAFT)] == [made.id]
         assert list(client.list_monthly_reports(spacecraft_id=1)) == []
         for kind in ("html", "pdf", "json"):
-            client.get_monthly_report(made.id, tmp_path / f"api.{kind}", kind=kind)
+            client.get_monthly_report(made.id, tmp_path / f"api.{kind}", format=kind)
         found = client.get_performance(SPACECRAFT, start=str(UtcTime(FIRST)), window_days=3.0)
         assert (len(found.passes), found.window_days) == (14, 3.0)
     page = (tmp_path / "api.html").read_text()

@@ -171,12 +171,7 @@ def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
     spacecraft.report("event_high", event_id=20, frame_number=7)
     wait_until(lambda: api.list_alarms().total > 0, "no alarm was raised")
     live = api.define_pass(
-        {
-            "name": "live pass",
-            "spacecraft_id": SPACECRAFT,
-            "start": format_utc(START - 600 * NS),
-            "stop": format_utc(START + 1200 * NS),
-        }
+        "live pass", format_utc(START - 600 * NS), format_utc(START + 1200 * NS), SPACECRAFT
     ).id
     window = api.add_window(
         {

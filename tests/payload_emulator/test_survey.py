@@ -1,0 +1,153 @@
+"""The survey of a region: what it flies, what it counts, how it resumes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from linna.cli import run
+from payload_emulator.errors import ScenarioError
+from studies import survey
+from studies.survey import SurveySession, SurveyWindow, format_survey, summary
+
+SCENARIO = """
+name = "plain"
+seed = 5
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[terrain]
+source = "procedural"
+[camera]
+images = "reduced"
+frame_interval_s = 30.0
+[navigation]
+estimators = ["anchored"]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+
+
+def window(seed: int = 1, **changed: object) -> SurveyWindow:
+    values = {
+        "seed": seed,
+        "longitude_deg": 10.0,
+        "altitude_km": (20.0, 30.0),
+        "frames": 4,
+        "fixed": 3,
+        "median_m": 25.0,
+        "p95_m": 40.0,
+        "bias_rtn_m": (1.0, 2.0, 3.0),
+        "inside_2_sigma": (1.0, 0.5, 0.0),
+        "nees": 6.0,
+        "nis": 1.0,
+        "coast_end_m": 100.0,
+        "position_m": (10.0, 20.0, 30.0, 40.0),
+    }
+    return SurveyWindow.model_validate(values | changed)
+
+
+def session(*windows: SurveyWindow) -> SurveySession:
+    return SurveySession(
+        windows=windows,
+        detections=200,
+        findable=50,
+        craters=40,
+        found=30,
+        pairs=20,
+        wrong_pairs=1,
+        wrong_fixes=0,
+        registered_share=0.5,
+        level="3",
+        data=("terrain",),
+    )
+
+
+def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
+    longer = window(
+        2, frames=12, fixed=12, nees=12.8, nis=2.0, bias_rtn_m=(5.0, 2.0, -1.0), inside_2_sigma=(0.6, 0.5, 1.0),
+        coast_end_m=None, position_m=tuple(np.linspace(50.0, 60.0, 12)),
+    )  # fmt: skip
+    figures = summary([session(window(), window(nees=8.0)), session(longer)])
+    assert figures["frames"] == 20
+    assert figures["median_m"] == np.median([10, 20, 30, 40] * 2 + np.linspace(50, 60, 12).tolist())
+    assert figures["max_m"] == 60.0
+    assert figures["nees_mean"] == pytest.approx((6.0 + 8.0 + 12.8) / 3.0)
+    # Chi-square with 18 degrees of freedom (Abramowitz and Stegun, table 26.8): 8.23075 and 31.5264.
+    assert figures["bounds"] == pytest.approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
+    assert figures["nees_above_12_6_share"] == pytest.approx(1.0 / 3.0)
+    assert figures["nees_trend"] == pytest.approx(8.0 - (6.0 + 12.8) / 2.0)
+    assert figures["bias_rtn_m"] == pytest.approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])
+    assert figures["inside_2_sigma"] == pytest.approx({"r": 0.76, "t": 0.5, "n": 0.6})
+    assert figures["nis"] == pytest.approx((3 + 3 + 2 * 12) / 18)
+    assert figures["coast_end_p95_m"] == 100.0
+    assert figures["fixed_share"] == 18 / 20
+    assert (figures["catalogued_share"], figures["recall_5_30_km"]) == (0.25, 0.75)
+    assert figures["wrong_pairs_share"] == 0.05
+    assert "position_m" not in figures["windows"][0]
+    assert "registered in 50 % of the frames" in format_survey(figures)
+
+
+def test_a_list_that_is_not_registered_is_stated_and_what_is_unknown_has_no_figure() -> None:
+    lone = session(window(nis=None, coast_end_m=None)).model_copy(update={"registered_share": 0.0})
+    figures = summary([lone])
+    assert figures["nis"] is None and figures["nees_trend"] is None and figures["coast_end_p95_m"] is None
+    text = format_survey(figures)
+    assert "not registered" in text and "NIS unknown" in text
+
+
+def test_a_session_without_settled_windows_is_refused() -> None:
+    with pytest.raises(ScenarioError, match="expected windows with more than 20 frames"):
+        summary([session()])
+
+
+@pytest.fixture
+def survey_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
+    scenario = tmp_path / "plain.toml"
+    scenario.write_text(SCENARIO)
+
+    def flown(*words: str, status: int = 0):
+        options = ("--scenario", str(scenario), "--windows", "2", "--json", *words)
+        assert run(["navigation", "survey", *options]) == status
+        captured = capsys.readouterr()
+        return json.loads(captured.out) if status == 0 else captured.err
+
+    return flown
+
+
+def test_windows_over_the_region_are_flown_and_a_finished_seed_is_not_flown_again(
+    survey_of, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--region", "300,330,-30,30", "--out", str(tmp_path / "kept"))
+    figures = survey_of(*words, "--seeds", "1")
+    assert figures["seeds"] == [5] and len(figures["windows"]) == 2
+    assert figures["frames"] == sum(row["frames"] for row in figures["windows"]) > 40
+    assert all(300.0 <= row["longitude_deg"] <= 330.0 for row in figures["windows"])
+    # Simulated detections: recall of 0.7, all of them craters.
+    assert 0.5 < figures["recall_5_30_km"] < 0.8
+    assert figures["windows"][0]["coast_end_m"] is None and figures["windows"][1]["coast_end_m"] > 0.0
+    assert figures["level"].startswith("2") and figures["registered_share"] == 0.0
+    with monkeypatch.context() as forbidden:
+        forbidden.setattr(survey, "build_world", None)
+        assert survey_of(*words, "--seeds", "1") == figures
+    (kept,) = (tmp_path / "kept").iterdir()
+    kept.write_text("{}")
+    assert "expected a session of a survey" in survey_of(*words, "--seeds", "1", status=2)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--region", "5"), "--region: expected four numbers"),
+        (("--region", "0,10,0,10", "--seeds", "0"), "--seeds: expected 1 or more, found 0"),
+        (("--region", "0,10,0,10", "--windows", "0"), "--windows: expected 1 or more, found 0"),
+    ],
+)
+def test_bad_options_are_one_line(survey_of, words: tuple[str, ...], expected: str) -> None:
+    assert expected in survey_of(*words, status=2)
