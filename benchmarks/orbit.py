@@ -10,12 +10,13 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from benchmarks._rows import Row
 from kernels.compiled import njit
 from lunar import _dynamics_kernel, _gravity_kernel
 from lunar.datafolder import default_gravity, default_orientation, find_data
@@ -71,44 +72,49 @@ def textbook(c, s, gm, radius, positions, out):
         out[k, 0], out[k, 1], out[k, 2] = scale * ax, scale * ay, scale * az
 
 
-def main() -> None:
-    """Print the table."""
+def rows() -> Iterator[Row]:
+    """Yield acceleration and propagation beside their rivals: processor time, best of some rounds."""
     named = os.environ.get("LINNA_DATA")
     data = find_data(Path(named) if named else None)
     field, orientation = default_gravity(data), default_orientation(data)
     field = field.truncated(min(DEGREE, field.degree))
-    print(f"field {field.name} to degree {field.degree}; processor time, best of 5")
-    _kernels(field)
-    _propagations(ForceModel(field, orientation, field.degree))
+    yield from _kernels(field)
+    yield from _propagations(ForceModel(field, orientation, field.degree))
 
 
-def _kernels(field: GravityField) -> None:
+def _kernels(field: GravityField) -> Iterator[Row]:
     rng = np.random.default_rng(1)
     positions = rng.standard_normal((EVALUATIONS, 3))
     positions *= 1_768_000.0 / np.linalg.norm(positions, axis=1, keepdims=True)
-    packed = _gravity_kernel.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m)
-    c, s = _unnormalised(field)
-    theirs = np.empty_like(positions)
     few = positions[: EVALUATIONS // 10]
-    ours = _gravity_kernel.accelerations(packed, positions)
-    textbook(c, s, field.gm_m3_s2, field.radius_m, positions, theirs)
-    difference = float(np.max(np.abs(ours - theirs)) / np.max(np.abs(ours)))
+    packed = _gravity_kernel.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m)
+    ours = _gravity_kernel.accelerations(packed, few)
     ours_us = _best(lambda: _gravity_kernel.accelerations(packed, positions)) / EVALUATIONS * 1e6
-    theirs_us = _best(lambda: textbook(c, s, field.gm_m3_s2, field.radius_m, few, theirs)) / len(few) * 1e6
-    print(f"{'acceleration, one thread':<44} {ours_us:8.2f} us")
-    print(f"{'  textbook recursion, numba':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
-    print(f"{'  largest relative difference':<44} {difference:8.1e}")
-    for name, rival in (("brahe, Clenshaw", _brahe), ("heyoka, scalar cfunc", _heyoka)):
+    for name, rival in (
+        ("textbook recursion, numba", _textbook),
+        ("brahe, Clenshaw", _brahe),
+        ("heyoka, scalar cfunc", _heyoka),
+    ):
         try:
             evaluate = rival(field)
         except ImportError as missing:
-            print(f"{f'  {name}':<44} not installed ({missing.name}): pip install -r requirements/bench.txt")
+            yield Row(f"acceleration: {missing.name} is not installed", ours_us, "us")
             continue
-        theirs = np.array([evaluate(place) for place in few])
-        difference = float(np.max(np.abs(ours[: len(few)] - theirs)) / np.max(np.abs(ours)))
-        theirs_us = _best(lambda evaluate=evaluate: [evaluate(place) for place in few]) / len(few) * 1e6
-        print(f"{f'  {name}':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
-        print(f"{'  largest relative difference':<44} {difference:8.1e}")
+        difference = float(np.max(np.abs(ours - evaluate(few))) / np.max(np.abs(ours)))
+        wrong = f"relative difference {difference:.1e}" if difference > 1e-9 else ""
+        theirs_us = _best(lambda evaluate=evaluate: evaluate(few)) / len(few) * 1e6
+        yield Row(f"acceleration, degree {field.degree}", ours_us, "us", name, theirs_us, wrong)
+
+
+def _textbook(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
+    c, s = _unnormalised(field)
+
+    def evaluate(places: np.ndarray) -> np.ndarray:
+        found = np.empty_like(places)
+        textbook(c, s, field.gm_m3_s2, field.radius_m, places, found)
+        return found
+
+    return evaluate
 
 
 def _brahe(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
@@ -137,7 +143,9 @@ def _brahe(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
         file.write("\n".join([*head, *rows, ""]))
         file.flush()
         model = brahe.GravityModel.from_file(file.name)
-    return lambda place: model.compute_spherical_harmonics_clenshaw(place, degree, degree)
+    return lambda places: np.array(
+        [model.compute_spherical_harmonics_clenshaw(place, degree, degree) for place in places]
+    )
 
 
 def _heyoka(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
@@ -158,10 +166,11 @@ def _heyoka(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
         max_degree=field.degree,
         max_order=field.degree,
     )
-    return heyoka.cfunc(formula, list(place), compact_mode=True, batch_size=1)
+    compiled = heyoka.cfunc(formula, list(place), compact_mode=True, batch_size=1)
+    return lambda places: np.array([compiled(place) for place in places])
 
 
-def _propagations(model: ForceModel) -> None:
+def _propagations(model: ForceModel) -> Iterator[Row]:
     epoch_s = float(tdb_s_from_utc_ns(parse_utc("2029-08-07T00:00:00Z")))
     elements = Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882]))
     state = np.concatenate(icrf_state_from_elements(elements, epoch_s, model.gravity.gm_m3_s2))
@@ -173,7 +182,7 @@ def _propagations(model: ForceModel) -> None:
         trajectory.state(epoch_s + np.arange(0.0, 30 * 86_400.0, 30.0))
 
     propagate(epoch_s, state[:3], state[3:], 60.0, model)
-    print(f"{'30 days with burns, a state each 30 s':<44} {_best(month, 2):8.2f} s")
+    yield Row("30 days with burns, a state each 30 s", _best(month, 2), "s")
     duration_s = SCIPY_DAYS * 86_400.0
     gravity, force, table, scratch = force_arrays(model, epoch_s, 0.0, duration_s)
     work, columns = np.empty(scratch), np.empty(_dynamics_kernel.COLUMNS)
@@ -194,11 +203,9 @@ def _propagations(model: ForceModel) -> None:
         ours_s = _best(
             lambda name=name: propagate(epoch_s, state[:3], state[3:], duration_s, model, integrator=name), 3
         )
-        print(f"{f'{SCIPY_DAYS * 24:.0f} h, {name}':<44} {ours_s:8.4f} s")
-        if name == "dop853":
-            print(
-                f"{'  SciPy DOP853, same right-hand side':<44} {scipy_s:8.4f} s   {scipy_s / ours_s:5.1f} x ours"
-            )
+        yield Row(
+            f"{SCIPY_DAYS * 24:.0f} h, {name}", ours_s, "s", "SciPy DOP853, same right-hand side", scipy_s
+        )
 
 
 def _unnormalised(field: GravityField) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +226,3 @@ def _best(run: Callable[[], object], rounds: int = 5) -> float:
         run()
         times.append(time.process_time() - begin)
     return min(times)
-
-
-if __name__ == "__main__":
-    main()

@@ -18,12 +18,13 @@ import math
 import os
 import resource
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks._rows import Row
 from benchmarks.rims import rim_errors
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import find_data
@@ -258,6 +259,18 @@ def _cpu_ms(work: Callable[[], Any]) -> float:
     began = time.thread_time()
     work()
     return 1e3 * (time.thread_time() - began)
+
+
+def rows() -> Iterator[Row]:
+    """Yield the fast renderer beside the ray march on the procedural Moon; pictures that disagree are an error."""
+    terrain = open_terrain("procedural", find_data(None), 3)
+    found: Any = agreement(terrain, PROCEDURAL, poses=6, every=16)["fast_vs_raymarch"]
+    wrong = "" if found["correlation"] > 0.99 and found["median_range_error_m"] < 5.0 else f"{found}"
+    for altitude, stages in speed(terrain, PROCEDURAL, "").items():
+        one: Any = stages
+        yield Row(f"frame from {altitude}", one["render_ms"], "ms", "ray march", one["raymarch_ms"], wrong)
+        first = one["first_frame_with_tiles_ms"]
+        yield Row(f"first frame of a place from {altitude}", first, "ms", "later frames", one["render_ms"])
 
 
 def main() -> None:

@@ -207,7 +207,9 @@ class _Synchroniser:
         damaged = np.flatnonzero(wrong > self.tolerance)
         sound = np.flatnonzero(wrong <= self.tolerance)
         turns = np.diff(inverted[sound])
-        alone = sound[1:-1][turns[1:] & turns[:-1]]  # nearly all bits of a marker are wrong, or really inverted
+        alone = sound[1:-1][
+            turns[1:] & turns[:-1]
+        ]  # nearly all bits of a marker are wrong, or really inverted
         alone = alone[self._are_valid(starts[alone], ~inverted[alone])]
         damaged, sound = np.union1d(damaged, alone), np.setdiff1d(sound, alone)
         if damaged.size and sound.size:
