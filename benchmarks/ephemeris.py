@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmarks._rows import Row
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
-from lunar.ephemeris_files import load_ephemeris
-from lunar.oem import save_oem
-from lunar.stk import format_stk
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import save_oem
+from lunar.messages.stk import format_stk
 from lunar.timescales import NS, format_utc, parse_utc
 
 STATES = 86_400

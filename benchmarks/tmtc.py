@@ -26,7 +26,7 @@ from tmtc import reed_solomon
 from tmtc.downlink import LinkSettings, decode, encode_cadus
 from tmtc.schema import Dictionary, Field, Group, PacketDefinition
 from tmtc.stream import cut_packets
-from tmtc.xtce import format_xtce
+from tmtc.xtce.export import format_xtce
 
 PACKETS = 200_000
 TYPES = ("u8", "i8", "u8", "u8", "i16", "u16", "u8", "f32", "u16", "u8", "u16", "u16") * 2

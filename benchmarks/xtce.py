@@ -27,9 +27,9 @@ from benchmarks._rows import Row
 from benchmarks.tmtc import DICTIONARY, fixed_packets
 from tests.tmtc import foreign
 from tmtc.stream import PacketCut, cut_packets
-from tmtc.xtce import format_xtce
-from tmtc.xtce_decode import Decoder, XtceDecode
-from tmtc.xtce_import import parse_xtce
+from tmtc.xtce.decode import Decoder, XtceDecode
+from tmtc.xtce.export import format_xtce
+from tmtc.xtce.importing import parse_xtce
 
 PACKETS = 100_000
 INTERPRETED = 1_000

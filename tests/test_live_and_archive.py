@@ -33,7 +33,7 @@ from ground_service.settings import Settings
 from ground_service.store import repository
 from linna.cli import run
 from lunar.datafolder import find_data
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
 from payload_emulator.session.flying import SPACECRAFT_ID

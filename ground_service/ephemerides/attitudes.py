@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
-from lunar.aem import parse_aem
 from lunar.errors import LunarError
 from lunar.frames import ICRF_NAMES
+from lunar.messages.aem import parse_aem
 
 ATTITUDE_FILES = ("attitude.csv", "attitude.aem")
 CAMERA_NAMES = ("INSTRUMENT", "CAMERA")

@@ -16,8 +16,8 @@ from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
 from lunar.ephemeris import Ephemeris as States
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
+from lunar.messages.ephemeris_files import load_ephemeris
 
 
 def add_ephemeris(

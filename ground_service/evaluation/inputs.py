@@ -44,8 +44,8 @@ from ground_service.timekeeping.model import Correlation
 from ground_service.timekeeping.store import correlations_in_force
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
-from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import Orientation
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import format_utc, parse_utc
 from reports.values import (
     HousekeepingParameter,

@@ -26,8 +26,8 @@ from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue, format_catalogue
 from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris
-from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import Orientation, spherical_from_mcmf
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import tdb_s_from_utc_ns
 
 TRACK_STEP_S = 15.0

@@ -12,12 +12,12 @@ from ground_service.evaluation.core import PassInputs
 from ground_service.exports.formats import REFERENCE
 from ground_service.exports.poses import no_such_states, states_names
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
-from lunar.aem import AttitudeSegment, format_aem
 from lunar.arrays import IntArray
 from lunar.ephemeris import Covariance, Ephemeris, clipped, ephemeris_from_states
-from lunar.oem import format_oem
-from lunar.oem_xml import format_oem_xml
-from lunar.spice import (
+from lunar.messages.aem import AttitudeSegment, format_aem
+from lunar.messages.oem import format_oem
+from lunar.messages.oem_xml import format_oem_xml
+from lunar.messages.spice import (
     ClockLine,
     ck_octets,
     format_fk,

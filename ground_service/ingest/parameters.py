@@ -32,8 +32,8 @@ from tmtc.arrays import Octets
 from tmtc.cuc import NO_TICKS, TICKS_LIMIT
 from tmtc.packet_times import TimeCode, elapsed
 from tmtc.stream import PacketCut, whole_packets
-from tmtc.xtce_decode import VERDICTS
-from tmtc.xtce_series import series_matrix
+from tmtc.xtce.decode import VERDICTS
+from tmtc.xtce.series import series_matrix
 
 BLOCK_PACKETS = 20_000
 _DAY_NS = 86_400 * NS

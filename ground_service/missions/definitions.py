@@ -17,10 +17,10 @@ from pathlib import Path
 from ground_service.errors import InvalidInput
 from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketSource, format_toml
 from tmtc.errors import DefinitionError
-from tmtc.xtce_decode import Decoder
-from tmtc.xtce_import import parse_xtce
-from tmtc.xtce_series import SeriesValue, packet_layouts
-from tmtc.xtce_xml import MAX_OCTETS
+from tmtc.xtce.decode import Decoder
+from tmtc.xtce.importing import parse_xtce
+from tmtc.xtce.nodes import MAX_OCTETS
+from tmtc.xtce.series import SeriesValue, packet_layouts
 
 EMBEDDED_AS_TEXT_OCTETS = 64 << 10
 """Longer XTCE files are embedded compressed, since a mission description has a limited length."""

@@ -27,8 +27,8 @@ from ground_service.store.vehicles import SPACECRAFT_ID_MAX, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.recorrelation import enter_receptions, read_receptions
 from lunar.catalogue import load_catalogue
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import parse_utc
 
 SCHEMA_VERSION = 1

@@ -30,8 +30,8 @@ from tmtc.export import Record, format_records, packet_records
 from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
 from tmtc.schema import Field
 from tmtc.stream import cut_packets, whole_packets
-from tmtc.xtce_records import format_xtce_records, xtce_records
-from tmtc.xtce_series import SeriesValue
+from tmtc.xtce.records import format_xtce_records, xtce_records
+from tmtc.xtce.series import SeriesValue
 
 OWN_PACKET = "housekeeping"
 INSTRUMENT_FIELDS = {

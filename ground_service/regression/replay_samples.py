@@ -26,8 +26,8 @@ from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
-from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import Orientation
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.definitions import parse_dictionary
 from tmtc.downlink import DownlinkDecode, decode

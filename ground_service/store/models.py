@@ -436,7 +436,7 @@ PARAMETER_SAMPLES = Table(
 """Values of a packet decoded with a definition of the mission description.
 
 `container` is the number of its container in the definition, `values` float64 numbers (little-endian) in the order
-of `tmtc.xtce_series.packet_layouts`; `ticks` is the time in its secondary header.
+of `tmtc.xtce.series.packet_layouts`; `ticks` is the time in its secondary header.
 """
 
 

@@ -36,8 +36,8 @@ from ground_service.timekeeping.model import Correlation, TimeReport
 from lunar.arrays import IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris as States
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
 from lunar.visibility import GroundStation, link

@@ -78,7 +78,7 @@ def configure_convert(commands: Any) -> None:
 
 def run_compare(arguments: argparse.Namespace) -> int:
     from lunar.comparison import compare
-    from lunar.ephemeris_files import load_ephemeris
+    from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     first, second = load_ephemeris(arguments.a), load_ephemeris(arguments.b)
@@ -116,8 +116,8 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
 
     from linna.data import data_folder
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris_files import load_ephemeris
     from lunar.ground_track import ground_track
+    from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     ephemeris = load_ephemeris(arguments.ephemeris)
@@ -166,8 +166,8 @@ def run_stats(arguments: argparse.Namespace) -> int:
 
     from linna.data import data_folder
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris_files import load_ephemeris
     from lunar.ground_track import ground_track, track_statistics
+    from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     ephemeris = load_ephemeris(arguments.ephemeris)
@@ -223,12 +223,12 @@ def run_convert(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
     from lunar.ephemeris import ephemeris_from_states
-    from lunar.ephemeris_files import is_spk, load_ephemeris
-    from lunar.oem import format_oem
-    from lunar.oem_xml import format_oem_xml
-    from lunar.spice import READ_STEP_S, load_spk, spk_octets
-    from lunar.stk import format_stk
-    from lunar.tabular import format_csv, format_tum
+    from lunar.messages.ephemeris_files import is_spk, load_ephemeris
+    from lunar.messages.oem import format_oem
+    from lunar.messages.oem_xml import format_oem_xml
+    from lunar.messages.spice import READ_STEP_S, load_spk, spk_octets
+    from lunar.messages.stk import format_stk
+    from lunar.messages.tabular import format_csv, format_tum
 
     writers: dict[str, Callable[[Ephemeris], str | bytes]] = {
         ".oem": format_oem,

@@ -36,7 +36,7 @@ def run_visibility(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from lunar.contacts import visibility_spans
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris_files import load_ephemeris
+    from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     if not arguments.step > 0.0:

@@ -46,10 +46,10 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris_files import load_ephemeris
     from lunar.fov_study import PAPER_COUNTS, study_field_of_view
     from lunar.frames import mcmf_from_spherical
     from lunar.ground_track import even_epochs, ground_track
+    from lunar.messages.ephemeris_files import load_ephemeris
 
     if not 0.0 < arguments.fov_step <= 150.0:
         raise UsageError(f"--fov-step: expected a step of 0 to 150 degrees, found {arguments.fov_step:g}")

@@ -62,7 +62,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run_propagate(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
-    from lunar.oem import save_oem
+    from lunar.messages.oem import save_oem
     from payload_emulator.session.orbit import force_model, free_impact, propagate_scenario, sample
     from payload_emulator.session.scenario import load_scenario
 

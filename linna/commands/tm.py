@@ -13,7 +13,7 @@ from linna.output import add_json_flag, emit
 if TYPE_CHECKING:
     from tmtc.downlink import DownlinkDecode
     from tmtc.schema import Dictionary
-    from tmtc.xtce_decode import XtceDecode
+    from tmtc.xtce.decode import XtceDecode
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -84,7 +84,7 @@ def run_decode(arguments: argparse.Namespace) -> int:
 def _decode_foreign(arguments: argparse.Namespace) -> int:
     """Decode packets of another mission through its XTCE."""
     from linna.errors import UsageError
-    from tmtc.xtce_records import format_xtce_records, xtce_records
+    from tmtc.xtce.records import format_xtce_records, xtce_records
 
     decoded, found, known = _read_foreign(arguments)
     wanted = set(arguments.packet or ())
@@ -130,8 +130,8 @@ def run_check(arguments: argparse.Namespace) -> int:
 def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDecode, set[str]]:
     """The downlink, its packets through the definition, and the names of the containers."""
     from tmtc.schema import Dictionary
-    from tmtc.xtce_decode import DECODED, Decoder
-    from tmtc.xtce_import import parse_xtce
+    from tmtc.xtce.decode import DECODED, Decoder
+    from tmtc.xtce.importing import parse_xtce
 
     definition = parse_xtce({str(path): path.read_bytes() for path in arguments.xtce})
     decoder = Decoder(definition, arguments.container)
@@ -157,7 +157,7 @@ def run_icd(arguments: argparse.Namespace) -> int:
 
 
 def run_xtce(arguments: argparse.Namespace) -> int:
-    from tmtc.xtce import format_xtce
+    from tmtc.xtce.export import format_xtce
 
     return _document(arguments, format_xtce(unrolled=arguments.unrolled))
 

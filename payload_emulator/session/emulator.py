@@ -21,7 +21,7 @@ from lunar.catalogue import CraterCatalogue, save_catalogue
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import spherical_from_mcmf
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.ports import ResetCause

@@ -14,10 +14,10 @@ from typing import Literal
 
 import numpy as np
 
-from lunar.aem import AttitudeSegment, parse_aem
 from lunar.arrays import FloatArray, IntArray
 from lunar.errors import LunarError
 from lunar.frames import matrix_from_quaternion
+from lunar.messages.aem import AttitudeSegment, parse_aem
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import DatasetError, ScenarioError
 from payload_emulator.session.picture_files import read_picture

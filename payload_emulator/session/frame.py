@@ -16,7 +16,7 @@ from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from lunar.lens import BrownCamera
-from lunar.oem import load_oem
+from lunar.messages.oem import load_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import Scenario

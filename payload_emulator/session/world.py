@@ -23,7 +23,7 @@ from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
-from lunar.oem import load_oem
+from lunar.messages.oem import load_oem
 from lunar.propagation import ForceModel
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import (

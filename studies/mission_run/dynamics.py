@@ -13,7 +13,7 @@ import numpy as np
 from lunar.catalogue import save_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from payload_emulator.session.continuous import CHUNK_S, pruned
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world import (

@@ -11,6 +11,6 @@ def test_all_values_of_all_captures_are_compared_and_equal():
 
 
 def test_a_value_that_differs_is_noticed(monkeypatch):
-    monkeypatch.setattr("tmtc.xtce_decode._floats", lambda records, bit, encoding: records[:, 0] * 0.5)
+    monkeypatch.setattr("tmtc.xtce.decode._floats", lambda records, bit, encoding: records[:, 0] * 0.5)
     figures = xtce.bench(packets=60, interpreted=60)
     assert not any(capture["values_equal"] for capture in figures.values())

@@ -35,7 +35,7 @@ from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, siz
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus

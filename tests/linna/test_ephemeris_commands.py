@@ -9,8 +9,8 @@ from linna import cli
 from lunar.catalogue import PAPER_CLASS_COUNTS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
-from lunar.oem import save_oem
-from lunar.stk import format_stk
+from lunar.messages.oem import save_oem
+from lunar.messages.stk import format_stk
 from lunar.timescales import NS, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")

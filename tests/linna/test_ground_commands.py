@@ -25,7 +25,7 @@ from ground_service.settings import Settings
 from linna.cli import GROUPS, run
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus

@@ -259,7 +259,7 @@ def test_options_of_a_definition_need_one(downlink, capsys):
 
 def test_arrays_and_aggregates_are_lists_and_mappings_and_columns_of_a_table(tmp_path, capsys):
     from tests.tmtc.foreign import container, document, integer
-    from tests.tmtc.test_xtce_decode import ARRAY_ENTRY, aggregate, array_type, dimension
+    from tests.tmtc.xtce.test_decode import ARRAY_ENTRY, aggregate, array_type, dimension
 
     types = (
         integer("u8", 8)

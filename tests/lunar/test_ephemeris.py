@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 
 from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import NS, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")

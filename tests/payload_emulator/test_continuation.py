@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import find_data
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
 from payload_emulator.session.live import LivePayload
 from payload_emulator.session.scenario import parse_scenario

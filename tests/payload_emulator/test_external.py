@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lunar.aem import AttitudeSegment, format_aem
 from lunar.datafolder import DataFolder
+from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.emulator import emulate

@@ -29,8 +29,8 @@ from tmtc.downlink import DownlinkDecode, decode, encode_cadus
 from tmtc.errors import ValueRefused
 from tmtc.packets import idle_packet
 from tmtc.stream import PacketCut, cut_packets
-from tmtc.xtce_decode import Decoder
-from tmtc.xtce_import import parse_xtce
+from tmtc.xtce.decode import Decoder
+from tmtc.xtce.importing import parse_xtce
 
 
 def ephemeris(count: int) -> bytes:

@@ -120,7 +120,7 @@ def _can_look(source: Source, camera: PinholeCamera, terrain: Any, position: Flo
 def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
     """Epochs (n,) every `step_s` and places (n, 3) in MCMF m of an ephemeris file or a scenario's orbit."""
     if source.ephemeris.endswith((".oem", ".e")):
-        from lunar.ephemeris_files import load_ephemeris
+        from lunar.messages.ephemeris_files import load_ephemeris
 
         ephemeris, orientation = load_ephemeris(Path(source.ephemeris)), default_orientation(data)
     else:

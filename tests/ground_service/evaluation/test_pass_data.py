@@ -26,12 +26,12 @@ from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
-from lunar.aem import AttitudeSegment, format_aem
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.lens import BrownCamera
+from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import to_json
 from tests.ground_service.conftest import write_manifest

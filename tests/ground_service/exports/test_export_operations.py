@@ -15,7 +15,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from linna.cli import run
-from lunar.oem import parse_oem
+from lunar.messages.oem import parse_oem
 from tests.ground_service.exports.conftest import FRAMES, RichPass
 
 with warnings.catch_warnings():

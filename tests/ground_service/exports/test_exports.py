@@ -22,14 +22,14 @@ from ground_service.exports.formats import FORMATS
 from ground_service.exports.model import ExportRequest
 from ground_service.exports.service import export_pass, list_formats
 from ground_service.ground import Ground
-from lunar.aem import parse_aem
 from lunar.camera import PinholeCamera
 from lunar.catalogue import load_catalogue
-from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import IauOrientation, mcmf_from_spherical
-from lunar.oem import parse_oem
-from lunar.oem_xml import parse_oem_xml
-from lunar.spice import camera_id, et_from_utc_ns, spacecraft_id
+from lunar.messages.aem import parse_aem
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import parse_oem
+from lunar.messages.oem_xml import parse_oem_xml
+from lunar.messages.spice import camera_id, et_from_utc_ns, spacecraft_id
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import SPACECRAFT, SPHERICAL_ERROR_RTN_M
 from tests.ground_service.exports.conftest import FILTER_OFFSET_M, FRAMES, RichPass

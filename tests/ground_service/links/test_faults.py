@@ -27,7 +27,7 @@ from ground_service.links.stream import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Conne
 from ground_service.links.supervisor import LinkSupervisor
 from ground_service.store import repository
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
 from tests.ground_service.links.conftest import Station, declare, operated, until
 from tests.ground_service.links.test_links import (

@@ -14,7 +14,7 @@ from ground_service.links import service
 from ground_service.timekeeping import recorrelation
 from ground_service.timekeeping.service import spacecraft_correlations, spacecraft_time_reports
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states

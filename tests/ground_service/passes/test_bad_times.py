@@ -14,8 +14,8 @@ from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.passes.service import completeness, define_pass
 from lunar.ephemeris import ephemeris_from_states
-from lunar.ephemeris_files import load_ephemeris
-from lunar.oem import save_oem
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus

@@ -41,7 +41,7 @@ DIAGONAL = 1.5**2 + 0.8**2 + 1.0
 def anchored_packets(made: Any, version: int) -> list[bytes]:
     """States and estimates of an anchored filter on the orbit of the synthetic pass, erring by `ERROR_RTN_M`."""
     from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
-    from lunar.oem import load_oem
+    from lunar.messages.oem import load_oem
     from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 
     reference = load_oem(made.folder / "reference.oem")

@@ -100,7 +100,7 @@ def test_long_spans_are_cut_and_short_ones_left_out() -> None:
 
 def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> None:
     from lunar.catalogue import load_catalogue
-    from lunar.ephemeris_files import load_ephemeris
+    from lunar.messages.ephemeris_files import load_ephemeris
 
     folder = make_pass(frames=6, seed=3).folder
     ephemeris, catalogue = load_ephemeris(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")

@@ -30,7 +30,7 @@ from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
 from ground_service.worker.follow_up import follow_in_process
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"

@@ -32,7 +32,7 @@ from ground_service.worker.integrity import verify
 from linna.cli import run
 from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY

@@ -26,7 +26,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import format_oem
+from lunar.messages.oem import format_oem
 from lunar.timescales import parse_utc
 
 CHROMIUM = "/usr/bin/chromium"

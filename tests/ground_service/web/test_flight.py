@@ -24,7 +24,7 @@ from ground_service.planning.model import WindowEntry
 from ground_service.planning.service import add_window
 from lunar.datafolder import find_data
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc
 from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
 from payload_emulator.session.live import LivePayload

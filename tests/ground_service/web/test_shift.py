@@ -28,7 +28,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.regression.archives import keep_archive
 from ground_service.regression.builds import load_build, register_build
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, Pictures, end_socket, wait_until

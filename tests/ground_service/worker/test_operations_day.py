@@ -28,7 +28,7 @@ from ground_service.settings import Settings
 from linna.cli import run
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
 from payload_emulator.flight.vision.detections import Detections

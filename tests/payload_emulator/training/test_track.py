@@ -11,7 +11,7 @@ from lunar.camera import PinholeCamera
 from lunar.datafolder import find_data
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, mcmf_from_spherical, spherical_from_mcmf
-from lunar.oem import save_oem
+from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.recipe import PAPER_SPLIT, Box, Source, load_recipe

@@ -5,10 +5,10 @@ import pytest
 
 from lunar.comparison import compare
 from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, EphemerisError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
-from lunar.stk import format_stk, parse_stk
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.stk import format_stk, parse_stk
 from lunar.timescales import NS, format_utc, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")

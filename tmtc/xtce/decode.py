@@ -24,7 +24,7 @@ from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as
 from tmtc.errors import DefinitionError
 from tmtc.schema import gather
 from tmtc.stream import PacketCut
-from tmtc.xtce_columns import (
+from tmtc.xtce.columns import (
     ArrayColumn,
     Column,
     OptionalColumn,
@@ -32,7 +32,7 @@ from tmtc.xtce_columns import (
     ValueColumn,
     concatenated,
 )
-from tmtc.xtce_definition import (
+from tmtc.xtce.definition import (
     AggregateType,
     AllOf,
     AnyOf,

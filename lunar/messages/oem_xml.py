@@ -1,6 +1,6 @@
 """CCSDS Orbit Ephemeris Message in XML: reads versions 1.0, 2.0 and 3.0, writes 2.0.
 
-The elements are brought into keyword notation, line by line, and read by `lunar.oem`: both notations pass the
+The elements are brought into keyword notation, line by line, and read by `lunar.messages.oem`: both notations pass the
 same checks, and errors name the line of the XML file.  Document type definitions are refused, so entities
 cannot expand or refer to files.
 
@@ -19,8 +19,8 @@ import numpy as np
 
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError
-from lunar.kvn import Lines, epoch_texts
-from lunar.oem import parse_oem_lines
+from lunar.messages.kvn import Lines, epoch_texts
+from lunar.messages.oem import parse_oem_lines
 from lunar.timescales import format_utc, from_utc_ns
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")

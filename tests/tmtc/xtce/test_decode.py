@@ -26,14 +26,14 @@ from tests.tmtc.foreign import (
     integer,
     space_packet,
 )
-from tests.tmtc.test_xtce import random_packet
+from tests.tmtc.xtce.test_export import random_packet
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import DefinitionError
 from tmtc.stream import PacketCut
-from tmtc.xtce import format_xtce
-from tmtc.xtce_columns import ArrayColumn, OptionalColumn, ValueColumn
-from tmtc.xtce_decode import VERDICTS, Decoder, XtceDecode
-from tmtc.xtce_import import parse_xtce
+from tmtc.xtce.columns import ArrayColumn, OptionalColumn, ValueColumn
+from tmtc.xtce.decode import VERDICTS, Decoder, XtceDecode
+from tmtc.xtce.export import format_xtce
+from tmtc.xtce.importing import parse_xtce
 
 
 def whole(packets: list[bytes]) -> tuple[bytes, PacketCut]:
@@ -658,7 +658,7 @@ def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
 
 
 def test_chunks_of_packets_are_joined(monkeypatch):
-    monkeypatch.setattr("tmtc.xtce_decode._CHUNK", 7)
+    monkeypatch.setattr("tmtc.xtce.decode._CHUNK", 7)
     packets = foreign.capture(100, 8)
     small = rows_of(decoded(foreign.BUS, packets), 100)
     monkeypatch.undo()

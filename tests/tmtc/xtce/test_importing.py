@@ -18,12 +18,12 @@ from tests.tmtc.foreign import (
     integer,
     polynomial,
 )
-from tests.tmtc.test_xtce_decode import ARRAY_ENTRY, aggregate, array_type, dimension, text_type, whole
-from tmtc import xtce_xml
+from tests.tmtc.xtce.test_decode import ARRAY_ENTRY, aggregate, array_type, dimension, text_type, whole
 from tmtc.errors import DefinitionError
-from tmtc.xtce_decode import Decoder
-from tmtc.xtce_definition import IntegerEncoding, Polynomial, ScalarType
-from tmtc.xtce_import import parse_xtce
+from tmtc.xtce import nodes
+from tmtc.xtce.decode import Decoder
+from tmtc.xtce.definition import IntegerEncoding, Polynomial, ScalarType
+from tmtc.xtce.importing import parse_xtce
 
 U8 = integer("u8", 8)
 PLAIN = container("P", ["a"])
@@ -76,9 +76,9 @@ def test_elements_of_another_namespace_are_not_passed_over():
 
 def test_documents_are_bounded_in_depth_number_and_size(monkeypatch):
     assert "deep" in refused(document("", {}, "<a>" * 200 + "</a>" * 200))
-    monkeypatch.setattr(xtce_xml, "MAX_ELEMENTS", 100)
+    monkeypatch.setattr(nodes, "MAX_ELEMENTS", 100)
     assert "at most 100 elements" in refused(foreign.BUS)
-    monkeypatch.setattr(xtce_xml, "MAX_OCTETS", 1000)
+    monkeypatch.setattr(nodes, "MAX_OCTETS", 1000)
     assert "at most 1000 octets" in refused(foreign.BUS)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.errors import EphemerisError, UnknownTimeSystemError
-from lunar.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
+from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
 from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns
 
 VERSIONS = ("1.0", "2.0")

@@ -5,10 +5,10 @@ import oem as independent
 import pytest
 
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
-from lunar.oem import format_oem, load_oem, parse_oem, save_oem
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import format_oem, load_oem, parse_oem, save_oem
 from lunar.timescales import NS, format_utc, parse_utc
 
 # The independent package keeps time with ERFA, which warns of UTC more than five years after its own release.

@@ -29,7 +29,7 @@ from lunar.ephemeris import (
 )
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
+from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
 from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns, to_utc_ns
 
 VERSIONS = ("1.0", "2.0", "3.0")

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.xtce_columns import Column, OptionalColumn, RecordColumn, ValueColumn
-from tmtc.xtce_decode import XtceTable
-from tmtc.xtce_definition import (
+from tmtc.xtce.columns import Column, OptionalColumn, RecordColumn, ValueColumn
+from tmtc.xtce.decode import XtceTable
+from tmtc.xtce.definition import (
     AggregateType,
     ArrayType,
     BinaryEncoding,

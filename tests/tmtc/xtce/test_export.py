@@ -11,9 +11,9 @@ from space_packet_parser.xtce.validation import validate_xtce
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Field, PacketDefinition
 from tmtc.stream import whole_packets
-from tmtc.xtce import format_xtce, parameter_name
-from tmtc.xtce_decode import Decoder
-from tmtc.xtce_import import parse_xtce
+from tmtc.xtce.decode import Decoder
+from tmtc.xtce.export import format_xtce, parameter_name
+from tmtc.xtce.importing import parse_xtce
 
 
 @pytest.fixture(scope="module")

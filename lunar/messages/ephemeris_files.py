@@ -1,6 +1,6 @@
 """Ephemeris files: CCSDS OEM (keyword notation or XML), STK, or Horizons tables, also compressed.
 
-SPICE kernels are binary and read by `lunar.spice`, outside of the server.
+SPICE kernels are binary and read by `lunar.messages.spice`, outside of the server.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from pathlib import Path
 from lunar.compressed import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
-from lunar.horizons import is_horizons, parse_horizons
-from lunar.oem import parse_oem
-from lunar.oem_xml import parse_oem_xml
-from lunar.stk import parse_stk
+from lunar.messages.horizons import is_horizons, parse_horizons
+from lunar.messages.oem import parse_oem
+from lunar.messages.oem_xml import parse_oem_xml
+from lunar.messages.stk import parse_stk
 
 EXPECTED = "a CCSDS OEM, STK .e or Horizons ephemeris"
 SPK_MARK = b"DAF/SPK"

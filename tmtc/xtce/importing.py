@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from tmtc.errors import DefinitionError
 from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.xtce_definition import (
+from tmtc.xtce.definition import (
     AggregateType,
     AllOf,
     AnyOf,
@@ -48,7 +48,7 @@ from tmtc.xtce_definition import (
     Spline,
     StringEncoding,
 )
-from tmtc.xtce_xml import Node, parse_xml
+from tmtc.xtce.nodes import Node, parse_xml
 
 MAX_BITS = PACKET_MAX_LENGTH * 8
 """Bits of the longest packet: no size and no position is greater."""

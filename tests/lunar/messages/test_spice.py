@@ -11,7 +11,7 @@ from lunar.camera import PinholeCamera
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, MissingLibrary
 from lunar.frames import matrix_from_quaternion
-from lunar.spice import (
+from lunar.messages.spice import (
     ClockLine,
     camera_id,
     ck_octets,

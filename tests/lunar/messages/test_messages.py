@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
-from lunar.aem import AttitudeSegment, format_aem, parse_aem
 from lunar.compressed import read_expanded
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
-from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError
 from lunar.frames import matrix_from_quaternion
-from lunar.oem import format_oem
-from lunar.oem_xml import format_oem_xml, parse_oem_xml
+from lunar.messages.aem import AttitudeSegment, format_aem, parse_aem
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import format_oem
+from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
 from lunar.timescales import NS, from_utc_ns, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")

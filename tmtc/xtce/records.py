@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from tmtc.export import Record, format_records
-from tmtc.xtce_decode import XtceDecode
+from tmtc.xtce.decode import XtceDecode
 
 _CONTAINER = "packet"
 

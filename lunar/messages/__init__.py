@@ -1,0 +1,1 @@
+"""Files of ephemerides and attitudes: CCSDS OEM and AEM, STK, SPICE kernels, Horizons tables."""
