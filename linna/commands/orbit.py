@@ -15,7 +15,6 @@ from linna.commands._orbit_ephemeris import (
     configure_interpolate,
     configure_stats,
 )
-from linna.commands._orbit_omission import configure_omission
 from linna.commands._orbit_visibility import configure_visibility
 from linna.output import add_json_flag, emit, log
 
@@ -57,7 +56,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     configure_stats(commands)
     configure_convert(commands)
     configure_visibility(commands)
-    configure_omission(commands)
 
 
 def run_propagate(arguments: argparse.Namespace) -> int:

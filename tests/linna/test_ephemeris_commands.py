@@ -216,19 +216,3 @@ def test_a_station_that_cannot_be_read_is_one_line(oem_path, capsys, station):
     assert "expected NAME=LATITUDE,LONGITUDE" in error_line(
         capsys, "orbit", "visibility", oem_path, "--station", station
     )
-
-
-@pytest.mark.real_data
-def test_omission_of_a_cut_field(data_path, monkeypatch, capsys):
-    monkeypatch.setenv("LINNA_DATA", str(data_path))
-    assert cli.run(["orbit", "omission", "--degree", "70", "--revolutions", "3", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["flown"]["degree"] == 70
-    assert figures["far_rms_mgal"][0] > figures["near_rms_mgal"][0]
-
-
-def test_omission_says_what_it_lacks(capsys):
-    assert cli.run(["orbit", "omission", "--degree", "0"]) == 2
-    assert "--degree: expected a number from 1, found 0" in capsys.readouterr().err
-    assert cli.run(["orbit", "omission"]) == 2
-    assert "--truth: expected a coefficient file" in capsys.readouterr().err
