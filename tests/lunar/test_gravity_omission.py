@@ -25,8 +25,8 @@ PIECES = 12
 class Omission:
     """Differences of two fields along low orbits: R, T, N, shapes (3,).
 
-    Two-sided spectral density over 1 to 30 waves a revolution (transverse over 16 to 30), the same over the far side from
-    means over a twelfth of a revolution, and root mean square of all waves.
+    Two-sided spectral density over 1 to 30 waves a revolution (transverse over 16 to 30), the same over the far side
+    from means over a twelfth of a revolution, and root mean square of all waves.
     """
 
     psd_m2_s3: FloatArray
