@@ -1,4 +1,4 @@
-"""Sign-in with an OpenID provider: addresses and keys of the provider, requests to it, and checks of its tokens.
+"""Sign-in with an OpenID provider: requests by authlib's client, and checks of its tokens.
 
 Authorization code flow with PKCE, state and nonce. A sign-in that has begun is remembered by the browser alone, in a
 cookie for ten minutes, so that strangers cannot fill the database and every API process can complete it.
@@ -11,10 +11,14 @@ OpenID Connect Core 1.0 section 3.1, Discovery 1.0 section 4, Back-Channel Logou
 from __future__ import annotations
 
 import asyncio
+import base64
 import hmac
+import math
 import secrets
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import quote, unquote, urlencode, urlsplit
@@ -43,7 +47,6 @@ CONFIGURATION_S = 3600.0
 KEYS_AGAIN_S = 30.0
 """Shortest time between two requests for keys because of a token with an unknown key."""
 
-ANSWER_OCTETS = 1 << 20
 NEXT_LENGTH = 1000
 SECRET_OCTETS = 32
 LOGOUT_EVENT = "http://schemas.openid.net/event/backchannel-logout"
@@ -87,18 +90,6 @@ class Begun:
         return cls(words[0], words[1], words[2], own_page(unquote(words[3])))
 
 
-@dataclass(frozen=True, slots=True)
-class Configuration:
-    """Addresses of the provider and its keys."""
-
-    authorization: str
-    token: str
-    end_session: str | None
-    states_issuer: bool
-    keys: dict[str, Any]
-    read_s: float
-
-
 @dataclass(slots=True)
 class Provider:
     """OpenID provider of a deployment. One per process; keeps its configuration for an hour."""
@@ -110,25 +101,17 @@ class Provider:
     name_claim: str
     role_claim: str
     roles: Mapping[str, Role]
-    _known: Configuration | None = None
+    _client: Any = None
+    _read_s: float = 0.0
     _reading: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def begin(self, begun: Begun, redirect_uri: str) -> str:
         """Return the address of the provider to send the browser to."""
-        from authlib.oauth2.rfc7636 import create_s256_code_challenge
-
-        found = await self._configuration()
-        query = {
-            "response_type": "code",
-            "client_id": self.client_id,
-            "redirect_uri": redirect_uri,
-            "scope": " ".join(self.scopes),
-            "state": begun.state,
-            "nonce": begun.nonce,
-            "code_challenge": create_s256_code_challenge(begun.verifier),
-            "code_challenge_method": "S256",
-        }
-        return f"{found.authorization}{'&' if urlsplit(found.authorization).query else '?'}{urlencode(query)}"
+        client = await self._configured()
+        found = await client.create_authorization_url(
+            redirect_uri, state=begun.state, nonce=begun.nonce, code_verifier=begun.verifier
+        )
+        return str(found["url"])
 
     async def complete(
         self, begun: Begun, code: str, redirect_uri: str, issuer: str | None = None
@@ -147,10 +130,19 @@ class Provider:
         ProviderUnavailable
             If the provider cannot be reached.
         """
-        found = await self._configuration()
-        if issuer != self.issuer and (issuer is not None or found.states_issuer):
+        from authlib.integrations.base_client import OAuthError
+
+        client = await self._configured()
+        stated = client.server_metadata.get("authorization_response_iss_parameter_supported") is True
+        if issuer != self.issuer and (issuer is not None or stated):
             raise SignInRefused("iss of the answer", self.issuer, issuer or "none")
-        answer = await self._exchange(found, begun, code, redirect_uri)
+        try:
+            with _unavailable(client.server_metadata["token_endpoint"]):
+                answer = await client.fetch_access_token(
+                    redirect_uri, code=code, code_verifier=begun.verifier
+                )
+        except OAuthError as error:
+            raise SignInRefused("code", "one that the provider accepts", _word(error.error)) from None
         token = answer.get("id_token")
         if not isinstance(token, str):
             raise SignInRefused("answer to the code", "an ID token", "none")
@@ -161,13 +153,13 @@ class Provider:
     async def sign_out_address(self, redirect_uri: str) -> str | None:
         """Return the address that ends the session at the provider; None if it has none or cannot be reached."""
         try:
-            found = await self._configuration()
+            place = (await self._configured()).server_metadata.get("end_session_endpoint")
         except ProviderUnavailable:
             return None
-        if found.end_session is None:
+        if not isinstance(place, str):
             return None
         query = urlencode({"client_id": self.client_id, "post_logout_redirect_uri": redirect_uri})
-        return f"{found.end_session}{'&' if urlsplit(found.end_session).query else '?'}{query}"
+        return f"{place}{'&' if urlsplit(place).query else '?'}{query}"
 
     async def signed_out(self, token: str) -> tuple[str | None, str | None, str]:
         """Return subject, session and identity of a logout token; one of the first two may be None.
@@ -192,18 +184,34 @@ class Provider:
             raise SignInRefused("logout token", "jti, and sub or sid", "none")
         return subject, session, identity
 
-    async def _configuration(self) -> Configuration:
+    async def _configured(self) -> Any:
+        """Return authlib's client with addresses and keys of the provider that are at most an hour old."""
         async with self._reading:
-            if self._known is None or time.monotonic() - self._known.read_s > CONFIGURATION_S:
-                self._known = await self._read()
-            return self._known
+            if self._client is None or time.monotonic() - self._read_s > CONFIGURATION_S:
+                self._client = await self._read()
+                self._read_s = time.monotonic()
+            return self._client
 
-    async def _read(self) -> Configuration:
+    async def _read(self) -> Any:
         """Read addresses and keys (OpenID Connect Discovery 1.0)."""
+        from authlib.integrations.starlette_client import StarletteOAuth2App
         from authlib.oidc.discovery import OpenIDProviderMetadata
 
         place = f"{self.issuer.rstrip('/')}/.well-known/openid-configuration"
-        stated = OpenIDProviderMetadata(await self._get(place))
+        client = StarletteOAuth2App(
+            None,
+            client_id=self.client_id,
+            client_secret=self.client_secret,
+            server_metadata_url=place,
+            client_kwargs={
+                "scope": " ".join(self.scopes),
+                "code_challenge_method": "S256",
+                "token_endpoint_auth_method": "none" if self.client_secret is None else _basic_login,
+                "timeout": TIMEOUT_S,
+            },
+        )
+        with _unavailable(place):
+            stated = OpenIDProviderMetadata(await client.load_server_metadata())
         if stated.get("issuer") != self.issuer:
             raise ProviderUnavailable(place, f"issuer {self.issuer}", str(stated.get("issuer"))[:200])
         try:
@@ -216,85 +224,23 @@ class Provider:
         for name in ("authorization_endpoint", "token_endpoint", "jwks_uri"):
             if not isinstance(stated.get(name), str):
                 raise ProviderUnavailable(place, name, "none")
-        end_session = stated.get("end_session_endpoint")
-        return Configuration(
-            authorization=stated["authorization_endpoint"],
-            token=stated["token_endpoint"],
-            end_session=end_session if isinstance(end_session, str) else None,
-            states_issuer=stated.get("authorization_response_iss_parameter_supported") is True,
-            keys=await self._get(stated["jwks_uri"]),
-            read_s=time.monotonic(),
-        )
-
-    async def _exchange(
-        self, found: Configuration, begun: Begun, code: str, redirect_uri: str
-    ) -> dict[str, Any]:
-        form = {
-            "grant_type": "authorization_code",
-            "code": code,
-            "redirect_uri": redirect_uri,
-            "code_verifier": begun.verifier,
-            "client_id": self.client_id,
-        }
-        login = None
-        if self.client_secret is not None:
-            # RFC 6749 section 2.3.1: both are form-encoded before they are joined
-            login = (quote(self.client_id, safe=""), quote(self.client_secret, safe=""))
-        status, answer = await self._ask("POST", found.token, form, login)
-        if status != 200:
-            raise SignInRefused("code", "one that the provider accepts", _word(answer.get("error")))
-        return answer
-
-    async def _get(self, place: str) -> dict[str, Any]:
-        status, answer = await self._ask("GET", place)
-        if status != 200:
-            raise ProviderUnavailable(place, "status 200", str(status))
-        return answer
-
-    async def _ask(
-        self,
-        method: str,
-        place: str,
-        form: dict[str, str] | None = None,
-        login: tuple[str, str] | None = None,
-    ) -> tuple[int, dict[str, Any]]:
-        """Return status and JSON object of an answer of the provider; redirects are not followed."""
-        try:
-            async with (
-                httpx.AsyncClient(timeout=TIMEOUT_S) as client,
-                client.stream(method, place, data=form, auth=login) as answer,
-            ):
-                octets = b""
-                async for block in answer.aiter_bytes():
-                    octets += block
-                    if len(octets) > ANSWER_OCTETS:
-                        raise ProviderUnavailable(place, f"at most {ANSWER_OCTETS} octets", "more")
-        except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
-            raise ProviderUnavailable(
-                place, f"an answer within {TIMEOUT_S:.0f} s", str(error) or type(error).__name__
-            ) from None
-        try:
-            found = httpx.Response(200, content=octets).json()
-        except ValueError:
-            found = None
-        if not isinstance(found, dict):
-            raise ProviderUnavailable(place, "a JSON object", f"status {answer.status_code} without one")
-        return answer.status_code, found
+        with _unavailable(stated["jwks_uri"]):
+            await client.fetch_jwk_set()
+        return client
 
     async def _verified(self, token: str) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return header and claims of a token whose signature is that of a key of the provider.
 
         A provider may have new keys since they were read; they are then read again, once in `KEYS_AGAIN_S`.
         """
-        found = await self._configuration()
+        client = await self._configured()
         try:
-            return _decoded(token, found.keys)
+            return _decoded(token, client.server_metadata["jwks"])
         except SignInRefused:
-            if time.monotonic() - found.read_s < KEYS_AGAIN_S:
+            if time.monotonic() - self._read_s < KEYS_AGAIN_S:
                 raise
-        async with self._reading:
-            self._known = await self._read()
-        return _decoded(token, self._known.keys)
+        self._read_s = -math.inf
+        return _decoded(token, (await self._configured()).server_metadata["jwks"])
 
     def _check(self, decoded: tuple[dict[str, Any], dict[str, Any]], params: dict[str, Any]) -> None:
         """Check issuer, audience, times, nonce and hash of a token."""
@@ -355,7 +301,12 @@ def provider_of(settings: Settings) -> Provider | None:
     if settings.oidc_issuer is None:
         return None
     try:
-        import authlib.oidc.core  # noqa: F401  fail at the start, not at the first sign-in
+        from authlib.deprecate import AuthlibDeprecationWarning
+
+        with warnings.catch_warnings():
+            # It recommends another HTTP library than the installed one; both serve it.
+            warnings.simplefilter("ignore", AuthlibDeprecationWarning)
+            import authlib.integrations.starlette_client  # noqa: F401  fail now, not at the first sign-in
     except ImportError as error:
         raise SettingsError("LINNA_OIDC_ISSUER", "the extra 'oidc' to be installed", str(error)) from None
     if settings.oidc_client_id is None:
@@ -386,6 +337,23 @@ def own_page(text: str) -> str:
     if not printable or "\\" in text or not text.startswith("/") or len(text) > NEXT_LENGTH:
         return "/"
     return "/" if text.startswith("//") else text
+
+
+@contextmanager
+def _unavailable(place: str) -> Iterator[None]:
+    """Translate errors of a request to the provider, and answers that are no JSON objects."""
+    try:
+        yield
+    except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError, TypeError, AttributeError) as error:
+        expected = f"a JSON object within {TIMEOUT_S:.0f} s"
+        raise ProviderUnavailable(place, expected, str(error) or type(error).__name__) from None
+
+
+def _basic_login(client: Any, _method: str, uri: str, headers: Any, body: Any) -> tuple[str, Any, Any]:
+    """Add the login of the service; both parts are form-encoded before they are joined (RFC 6749 section 2.3.1)."""
+    login = ":".join(quote(part, safe="") for part in (client.client_id, client.client_secret))
+    headers["Authorization"] = f"Basic {base64.b64encode(login.encode()).decode()}"
+    return uri, headers, body
 
 
 def _decoded(token: str, keys: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

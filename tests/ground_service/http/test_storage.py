@@ -19,6 +19,7 @@ from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker.jobs import run_job
 from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.conftest import wait_for
 
 with warnings.catch_warnings():
     # The test client's next version wants another HTTP library.
@@ -90,8 +91,8 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
     stopped = client.get(f"{V1}/jobs/{job}").json()
     assert (stopped["state"], stopped["attempts"]) == ("queued", 0)
     assert client.get(f"{V1}/ingests/1").json()["state"] == "running"
-    client.app.state.dispatcher.resume()
-    assert client.get(f"{V1}/jobs/{job}").json()["state"] == "done"
+    client.app.state.dispatcher.resume()  # the thread of the recurring work may have resumed it already
+    wait_for(lambda: client.get(f"{V1}/jobs/{job}").json()["state"] == "done", "the ingest", 60.0)
     with ground.database.reading() as connection:
         found = archive_hash(connection, 1)
         packets = repository.newest(connection, repository.PACKETS, Paging(limit=1))[1]
