@@ -89,7 +89,7 @@ def test_a_terminated_server_drains_before_it_ends(tmp_path: Path) -> None:
     listener = bind("127.0.0.1", 0)
     url = "http://{}:{}".format(*listener.getsockname())
     listener.listen()
-    server = _server(uvicorn.Config(app, log_level="error"), listener, app.state, drain_s=1.0)
+    server = _server(uvicorn.Config(app, log_level="error"), app.state, drain_s=1.0)
     running = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     running.start()
 
