@@ -6,6 +6,7 @@ import argparse
 import os
 import re
 import sys
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 _HEADING = re.compile(r"^(\w[\w ]*:)", re.MULTILINE)
@@ -43,9 +44,27 @@ class LinnaParser(argparse.ArgumentParser):
         options.setdefault("formatter_class", LinnaFormatter)
         super().__init__(*arguments, **options)
         self.register("action", "parsers", _Subcommands)
+        self._fill: Callable[[LinnaParser], None] | None = None
+
+    def fill(self, configure: Callable[[LinnaParser], None]) -> None:
+        """Add the options by a function when the command is parsed or described."""
+        self._fill = configure
+
+    def filled(self) -> LinnaParser:
+        """Return the parser with its options."""
+        configure, self._fill = self._fill, None
+        if configure is not None:
+            configure(self)
+        return self
+
+    def parse_known_args(self, *arguments: Any, **options: Any) -> Any:
+        """Return the parsed arguments and the unknown ones."""
+        self.filled()
+        return super().parse_known_args(*arguments, **options)
 
     def format_help(self) -> str:
         """Return the help text, in colours if stdout is a terminal."""
+        self.filled()
         text = super().format_help()
         return colored(text) if uses_colors() else text
 
@@ -77,6 +96,8 @@ def colored(text: str) -> str:
 def all_commands(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:
     """Return every command below a parser with its full name, in the order of its help."""
     found: list[tuple[str, argparse.ArgumentParser]] = []
+    if isinstance(parser, LinnaParser):
+        parser.filled()
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for one in action.choices.values():

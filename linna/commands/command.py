@@ -8,99 +8,57 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_operator_options, ground_client
+from linna.commands._table import Command, Commands, Hand, Option, add_commands
+from linna.errors import UsageError
 from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
-    from ground_service.commanding.model import Telecommand, UplinkChannel
+    from ground_service.client import Client
+    from ground_service.commanding.model import Telecommand, UplinkChannel, UplinkState
+    from linna.parser import LinnaParser
+
+SHOWN = {"id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by", "remark"}
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    entering = actions.add_parser("enter", help="queue a telecommand")
-    entering.add_argument("name", help="telecommand of the dictionary (see linna tm icd)")
-    entering.add_argument("arguments", nargs="*", metavar="FIELD=VALUE")
-    entering.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
-    entering.add_argument(
-        "--timeout-s",
-        type=int,
-        default=600,
-        help="time limit for its completion report, in seconds (default: 600)",
+def _enter(
+    service: Client,
+    name: str,
+    arguments: list[str] = (),  # type: ignore[assignment]  # none
+    *,
+    spacecraft_id: int,
+    instance: str = "flight",
+    timeout_s: int = 600,
+) -> Telecommand:
+    values = dict(map(_argument, arguments))
+    return service.enter_telecommand(
+        name, spacecraft_id, arguments=values, instance=instance, timeout_s=timeout_s
     )
-    entering.set_defaults(handler=enter)
-    listing = actions.add_parser("list", help="list telecommands and their states, newest first")
-    listing.add_argument("--limit", type=int, default=50)
-    listing.set_defaults(handler=list_all)
-    showing = actions.add_parser("show", help="show a telecommand, its verification, and why it failed")
-    showing.set_defaults(handler=show)
-    releasing = actions.add_parser("release", help="release a queued telecommand")
-    releasing.set_defaults(handler=release)
-    rejecting = actions.add_parser("reject", help="remove a queued telecommand from the queue")
-    rejecting.add_argument("--reason", required=True)
-    rejecting.set_defaults(handler=reject)
-    for action in (showing, releasing, rejecting):
-        action.add_argument("command_id", type=int, metavar="ID")
-    taking = actions.add_parser(
-        "uplink",
-        help="take the released telecommands and write or send them; they count as sent from then on",
-    )
-    taking.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
-    taking.add_argument("--format", choices=("cltu", "packets"), default="cltu")
-    taking.add_argument("--out", type=Path, metavar="FILE", help="file for the octets")
-    taking.add_argument("--tcp", metavar="HOST:PORT", help="TCP address to send the octets to")
-    taking.set_defaults(handler=uplink)
-    looking = actions.add_parser(
-        "receiver", help="show the state of the telecommand receiver according to the newest telemetry"
-    )
-    looking.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
-    looking.set_defaults(handler=receiver)
-    for action in (entering, taking, looking):
-        action.add_argument(
-            "--instance", default="flight", help="instance of the spacecraft (default: flight)"
-        )
-    for action in (entering, listing, showing, releasing, rejecting, taking, looking):
-        add_operator_options(action)
-        add_json_flag(action)
 
 
-def enter(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        telecommand = service.enter_telecommand(
-            arguments.name,
-            arguments.spacecraft_id,
-            arguments=dict(_argument(text) for text in arguments.arguments),
-            instance=arguments.instance,
-            timeout_s=arguments.timeout_s,
-        )
-    return _show(arguments, telecommand)
+def _argument(text: str) -> tuple[str, object]:
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise UsageError(f"argument {text!r}: expected FIELD=VALUE")
+    for kind in (int, float):
+        try:
+            return name, kind(value)
+        except ValueError:
+            continue
+    return name, value
 
 
-def list_all(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        page = service.list_telecommands().page(arguments.limit)
-    rows = [_figures(one) for one in page.items]
-    lines = [f"{row['id']:>6}  {row['state']:<10} {row['name']}  {row['requested_by']}" for row in rows]
-    emit(arguments, {"telecommands": rows, "total": page.total}, text="\n".join(lines) or "no telecommands")
-    return 0
+def _configure_uplink(parser: LinnaParser) -> None:
+    parser.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
+    parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
+    parser.add_argument("--format", choices=("cltu", "packets"), default="cltu")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file for the octets")
+    parser.add_argument("--tcp", metavar="HOST:PORT", help="TCP address to send the octets to")
+    add_operator_options(parser)
+    add_json_flag(parser)
+    parser.set_defaults(handler=_uplink)
 
 
-def show(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        return _show(arguments, service.get_telecommand(arguments.command_id))
-
-
-def release(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        return _show(arguments, service.release_telecommand(arguments.command_id))
-
-
-def reject(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        return _show(arguments, service.reject_telecommand(arguments.command_id, arguments.reason))
-
-
-def uplink(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
-
+def _uplink(arguments: argparse.Namespace) -> int:
     if arguments.out is None and arguments.tcp is None:
         raise UsageError("uplink: expected --out FILE or --tcp HOST:PORT, found neither")
     with contextlib.ExitStack() as opened:
@@ -128,31 +86,8 @@ def uplink(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def receiver(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        state = service.get_uplink_state(arguments.spacecraft_id, instance=arguments.instance)
-    lines = [_channel_line(channel) for channel in state.channels]
-    emit(
-        arguments,
-        state.model_dump(mode="json"),
-        text="\n".join(lines) or "no telemetry with the state of the telecommand receiver",
-    )
-    return 0
-
-
-def _channel_line(channel: UplinkChannel) -> str:
-    flags = ("no_rf_available", "no_bit_lock", "lockout", "wait", "retransmit")
-    states = ", ".join(flag.replace("_", " ") for flag in flags if getattr(channel, flag)) or "ready"
-    return (
-        f"channel {channel.virtual_channel}: {states}; expects frame {channel.report_value}, "
-        f"expedited frames {channel.farm_b_counter} (modulo 4); received {channel.received}"
-    )
-
-
 def _connection(address: str) -> Any:
     import socket
-
-    from linna.errors import UsageError
 
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
@@ -165,37 +100,69 @@ def _connection(address: str) -> Any:
         ) from None
 
 
-def _show(arguments: argparse.Namespace, telecommand: Telecommand) -> int:
-    remark = f", {telecommand.remark}" if telecommand.remark else ""
-    text = f"telecommand {telecommand.id} ({telecommand.name}): {telecommand.state}{remark}"
-    emit(arguments, _figures(telecommand), text=text)
-    return 0
-
-
 def _figures(telecommand: Telecommand) -> dict[str, Any]:
-    kept = {
-        "id",
-        "name",
-        "arguments",
-        "state",
-        "critical",
-        "timed_out",
-        "requested_by",
-        "decided_by",
-        "remark",
-    }
-    return {**telecommand.model_dump(mode="json", include=kept), "reports": len(telecommand.reports)}
+    return {**telecommand.model_dump(mode="json", include=SHOWN), "reports": len(telecommand.reports)}
 
 
-def _argument(text: str) -> tuple[str, object]:
-    from linna.errors import UsageError
+def _text(telecommand: Telecommand) -> str:
+    remark = f", {telecommand.remark}" if telecommand.remark else ""
+    return f"telecommand {telecommand.id} ({telecommand.name}): {telecommand.state}{remark}"
 
-    name, separator, value = text.partition("=")
-    if not separator:
-        raise UsageError(f"argument {text!r}: expected FIELD=VALUE")
-    for kind in (int, float):
-        try:
-            return name, kind(value)
-        except ValueError:
-            continue
-    return name, value
+
+def _receiver(state: UplinkState) -> str:
+    lines = map(_channel, state.channels)
+    return "\n".join(lines) or "no telemetry with the state of the telecommand receiver"
+
+
+def _channel(channel: UplinkChannel) -> str:
+    flags = ("no_rf_available", "no_bit_lock", "lockout", "wait", "retransmit")
+    states = ", ".join(flag.replace("_", " ") for flag in flags if getattr(channel, flag)) or "ready"
+    return (
+        f"channel {channel.virtual_channel}: {states}; expects frame {channel.report_value}, "
+        f"expedited frames {channel.farm_b_counter} (modulo 4); received {channel.received}"
+    )
+
+
+COMMANDS: Commands = {
+    "enter": Command(
+        _enter,
+        "queue a telecommand",
+        _text,
+        figures=_figures,
+        options={
+            "name": Option("telecommand of the dictionary (see linna tm icd)", "name"),
+            "arguments": Option(metavar="FIELD=VALUE"),
+            "timeout_s": "time limit for its completion report, in seconds",
+        },
+        positional=["arguments"],
+    ),
+    "list": Command(
+        "list_telecommands",
+        "list telecommands and their states, newest first",
+        lambda one: f"{one.id:>6}  {one.state:<10} {one.name}  {one.requested_by}",
+        "telecommands",
+        "no telecommands",
+        _figures,
+        options={"state": "only telecommands in this stored state"},
+    ),
+    "show": Command(
+        "get_telecommand", "show a telecommand, its verification, and why it failed", _text, figures=_figures
+    ),
+    "release": Command("release_telecommand", "release a queued telecommand", _text, figures=_figures),
+    "reject": Command(
+        "reject_telecommand", "remove a queued telecommand from the queue", _text, figures=_figures
+    ),
+    "uplink": Hand(
+        "take the released telecommands and write or send them; they count as sent from then on",
+        _configure_uplink,
+    ),
+    "receiver": Command(
+        "get_uplink_state",
+        "show the state of the telecommand receiver according to the newest telemetry",
+        _receiver,
+    ),
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    add_commands(parser, COMMANDS)

@@ -6,55 +6,26 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linna.commands._ground import add_operator_options, ground_client
-from linna.output import add_json_flag, emit
+from linna.commands._table import Command, Option, add_commands
 
 if TYPE_CHECKING:
-    from ground_service.timekeeping.model import Correlation
+    from ground_service.client import Client
+    from ground_service.timekeeping.model import Correlation, TimeReport
 
 BLOCK = 10_000
 """Number of receptions in one request."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="list the segments in force, one for each run of the clock")
-    listing.add_argument("--all", action="store_true", help="also segments that are no longer in force")
-    listing.set_defaults(handler=list_segments)
-    reports = actions.add_parser("residuals", help="list the received time reports and their residuals")
-    reports.set_defaults(handler=residuals)
-    running = actions.add_parser(
-        "run",
-        help="fit the segments again from the received time reports; this replaces segments entered by hand",
-    )
-    running.set_defaults(handler=run)
-    receiving = actions.add_parser("receptions", help="enter reception times of time reports (CSV)")
-    receiving.add_argument(
-        "file", type=Path, help="columns packet_ticks, sequence_count, received_utc; optional: station"
-    )
-    receiving.set_defaults(handler=receptions)
-    for action in (listing, reports, running, receiving):
-        action.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
-        action.add_argument("--instance", default="flight")
-        add_operator_options(action)
-        add_json_flag(action)
+def _list(
+    service: Client, *, spacecraft_id: int, instance: str = "flight", all: bool = False
+) -> list[Correlation]:
+    rows = service.list_correlations(spacecraft_id, instance=instance)
+    return rows if all else sorted((row for row in rows if row.in_force), key=lambda row: row.start_ticks)
 
 
-def list_segments(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        rows = list(service.list_correlations(arguments.spacecraft_id, instance=arguments.instance))
-    if not arguments.all:
-        rows = sorted((row for row in rows if row.in_force), key=lambda row: row.start_ticks)
-    return _show(arguments, rows)
-
-
-def run(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        rows = service.run_correlation(arguments.spacecraft_id, instance=arguments.instance)
-    return _show(arguments, rows)
-
-
-def receptions(arguments: argparse.Namespace) -> int:
+def _receptions(
+    service: Client, file: Path, *, spacecraft_id: int, instance: str = "flight"
+) -> list[Correlation]:
     from ground_service.timekeeping.recorrelation import read_receptions
     from lunar.timescales import format_utc
 
@@ -65,42 +36,59 @@ def receptions(arguments: argparse.Namespace) -> int:
             "received": format_utc(one.earth_utc_ns),
             "station": one.station,
         }
-        for one in read_receptions(arguments.file)
+        for one in read_receptions(file)
     ]
     rows: list[Correlation] = []
-    with ground_client(arguments) as service:
-        for start in range(0, len(given), BLOCK):
-            block = given[start : start + BLOCK]
-            rows = service.add_receptions(arguments.spacecraft_id, block, instance=arguments.instance)
-    return _show(arguments, rows)
+    for start in range(0, len(given), BLOCK):
+        rows = service.add_receptions(spacecraft_id, given[start : start + BLOCK], instance=instance)
+    return rows
 
 
-def residuals(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        rows = list(service.list_time_reports(arguments.spacecraft_id, instance=arguments.instance))
-    lines = [
-        f"{row.received}  boot {row.boot_count}  light time {row.light_time_s:.6f} s  "
-        f"correlation {row.correlation_id}  residual {row.residual_ns * 1e-3:+.1f} us"
-        for row in rows
-    ]
-    emit(
-        arguments,
-        {"time_reports": [row.model_dump(mode="json") for row in rows]},
-        text="\n".join(lines) or "no time reports with a known reception time",
-    )
-    return 0
-
-
-def _show(arguments: argparse.Namespace, rows: list[Correlation]) -> int:
-    lines = [
+def _segment(row: Correlation) -> str:
+    return (
         f"{row.id:>5}  boot {row.boot_count}  from {row.reference}  drift {row.drift_ppb:+.1f} ppb  "
         f"{row.points} reports ({row.rejected} rejected)  rms {(row.residual_rms_ns or 0.0) * 1e-3:.1f} us"
         f"{'' if row.in_force else '  not in force'}"
-        for row in rows
-    ]
-    emit(
-        arguments,
-        {"correlations": [row.model_dump(mode="json") for row in rows]},
-        text="\n".join(lines) or "no time correlation: the on-board clock is assumed to be ideal",
     )
-    return 0
+
+
+def _residual(row: TimeReport) -> str:
+    return (
+        f"{row.received}  boot {row.boot_count}  light time {row.light_time_s:.6f} s  "
+        f"correlation {row.correlation_id}  residual {row.residual_ns * 1e-3:+.1f} us"
+    )
+
+
+SEGMENTS = (_segment, "correlations", "no time correlation: the on-board clock is assumed to be ideal")
+COMMANDS = {
+    "list": Command(
+        _list,
+        "list the segments in force, one for each run of the clock",
+        *SEGMENTS,
+        options={"all": "also segments that are no longer in force"},
+    ),
+    "residuals": Command(
+        "list_time_reports",
+        "list the received time reports and their residuals",
+        _residual,
+        "time_reports",
+        "no time reports with a known reception time",
+    ),
+    "run": Command(
+        "run_correlation",
+        "fit the segments again from the received time reports; this replaces segments entered by hand",
+        *SEGMENTS,
+    ),
+    "receptions": Command(
+        _receptions,
+        "enter reception times of time reports (CSV)",
+        *SEGMENTS,
+        options={
+            "file": Option("columns packet_ticks, sequence_count, received_utc; optional: station", "file")
+        },
+    ),
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    add_commands(parser, COMMANDS)

@@ -7,17 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import (
-    add_operator_options,
-    add_service_options,
-    ground_client,
-    open_ground_only,
-    settings_of,
-)
+from linna.commands._ground import add_service_options, open_ground_only, settings_of
+from linna.commands._table import Command, Commands, Hand, Option, add_commands
 from linna.output import add_json_flag, emit, log
 
 if TYPE_CHECKING:
-    from ground_service.links.model import LinkStatus
+    from ground_service.links.model import Contacts, LinkStatus
+    from linna.parser import LinnaParser
     from tmtc.link_check import LinkProposal
 
 INCONCLUSIVE = 3
@@ -34,21 +30,17 @@ _DECLARED = (
 _CODE_ONLY = ("interleave", "rs_errors", "dual_basis")
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    checking = actions.add_parser(
-        "check",
-        help="propose the link settings of a recording from the whole file",
-        description="Propose the link settings of a recording from the whole file. Exit status 0: one candidate; "
-        "1: it contradicts the mission description; 3: none, or several with equal support.",
+def _configure_check(parser: LinnaParser) -> None:
+    parser.description = (
+        "Propose the link settings of a recording from the whole file. Exit status 0: one candidate; "
+        "1: it contradicts the mission description; 3: none, or several with equal support."
     )
-    checking.add_argument("file", type=Path, metavar="FILE")
-    checking.add_argument(
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument(
         "--mission", type=Path, metavar="M", help="mission description to compare the settings with"
     )
-    add_json_flag(checking)
-    checking.set_defaults(handler=check)
-    _configure_operation(actions)
+    add_json_flag(parser)
+    parser.set_defaults(handler=check)
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -139,57 +131,11 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.0f} %"
 
 
-def _configure_operation(actions: Any) -> None:
-    listing = actions.add_parser("list", help="list the links of the mission descriptions with their state")
-    listing.set_defaults(handler=list_all)
-    sending = actions.add_parser("send", help="send the released telecommands now, in a contact or not")
-    sending.add_argument("name", metavar="LINK")
-    sending.set_defaults(handler=send)
-    contacts = actions.add_parser("contacts", help="list past, missed and predicted contacts")
-    contacts.add_argument("--since", metavar="UTC", help="default: a day before mission time")
-    contacts.add_argument("--until", metavar="UTC", help="default: two days after --since")
-    contacts.add_argument("--link", metavar="LINK")
-    contacts.set_defaults(handler=list_contacts)
-    for one in (listing, sending, contacts):
-        add_operator_options(one)
-        add_json_flag(one)
-    running = actions.add_parser(
-        "run",
-        help="operate links in a process of their own",
-        description="Operate links until stopped, in place of `linna serve` (LINNA_LINKS=false).",
-    )
-    running.add_argument("names", nargs="*", metavar="LINK", help="default: all links")
-    add_service_options(running)
-    running.set_defaults(handler=operate)
-
-
-def list_all(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        found = list(service.list_links())
-    lines = [_line(one) for one in found]
-    figures = {"links": [one.model_dump(mode="json") for one in found]}
-    emit(arguments, figures, text="\n".join(lines) or "no mission description states a link")
-    return 0
-
-
-def send(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        found = service.send_link(arguments.name)
-    emit(arguments, found.model_dump(mode="json"), text=_line(found))
-    return 0
-
-
-def list_contacts(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        found = service.list_contacts(since=arguments.since, until=arguments.until, link=arguments.link)
-    lines = [
-        f"{one.start}  {one.stop or 'open':<27}  {one.state:<9} {one.link} ({one.station})"
-        f"  {one.octets} octets, {one.telecommands} telecommands{'  ' + one.reason if one.reason else ''}"
-        for one in found.contacts
-    ]
-    lines += [f"{name}: not predicted: {reason}" for name, reason in found.unpredicted.items()]
-    emit(arguments, found.model_dump(mode="json"), text="\n".join(lines) or "no contacts")
-    return 0
+def _configure_run(parser: LinnaParser) -> None:
+    parser.description = "Operate links until stopped, in place of `linna serve` (LINNA_LINKS=false)."
+    parser.add_argument("names", nargs="*", metavar="LINK", help="default: all links")
+    add_service_options(parser)
+    parser.set_defaults(handler=operate)
 
 
 def operate(arguments: argparse.Namespace) -> int:
@@ -230,3 +176,46 @@ def _line(link: LinkStatus) -> str:
     return (
         f"{link.name} ({link.station or 'no station'}): {link.state}{reason}; {link.octets} octets{waiting}"
     )
+
+
+def _contacts(found: Contacts) -> str:
+    lines = [
+        f"{one.start}  {one.stop or 'open':<27}  {one.state:<9} {one.link} ({one.station})"
+        f"  {one.octets} octets, {one.telecommands} telecommands{'  ' + one.reason if one.reason else ''}"
+        for one in found.contacts
+    ]
+    lines += [f"{name}: not predicted: {reason}" for name, reason in found.unpredicted.items()]
+    return "\n".join(lines) or "no contacts"
+
+
+COMMANDS: Commands = {
+    "check": Hand("propose the link settings of a recording from the whole file", _configure_check),
+    "list": Command(
+        "list_links",
+        "list the links of the mission descriptions with their state",
+        _line,
+        "links",
+        "no mission description states a link",
+    ),
+    "send": Command(
+        "send_link",
+        "send the released telecommands now, in a contact or not",
+        _line,
+        options={"name": Option(metavar="LINK")},
+    ),
+    "contacts": Command(
+        "list_contacts",
+        "list past, missed and predicted contacts",
+        _contacts,
+        options={
+            "since": "default: a day before mission time",
+            "until": "default: two days after --since",
+            "link": Option("contacts of this link only", "LINK"),
+        },
+    ),
+    "run": Hand("operate links in a process of their own", _configure_run),
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    add_commands(parser, COMMANDS)

@@ -3,56 +3,27 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_operator_options, ground_client
-from linna.output import add_json_flag, emit
+from linna.commands._table import Command, add_commands, as_json
 
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="list passes, newest first")
-    listing.add_argument("--limit", type=int, default=50, help="largest number of passes (default: 50)")
-    listing.set_defaults(handler=list_passes)
-    showing = actions.add_parser("show", help="evaluate a pass and show its metrics")
-    showing.add_argument("pass_id", type=int, metavar="ID")
-    showing.set_defaults(handler=show_pass)
-    for action in (listing, showing):
-        add_operator_options(action)
-        add_json_flag(action)
+if TYPE_CHECKING:
+    from ground_service.evaluation.model import PassFigures
+    from ground_service.passes.model import PassSummary
 
 
-def list_passes(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        page = service.list_passes().page(arguments.limit)
-    rows = [
-        {
-            "pass_id": item.id,
-            "name": item.name,
-            "start": _milliseconds(item.start),
-            "stop": _milliseconds(item.stop),
-        }
-        for item in page.items
-    ]
-    lines = [f"{row['pass_id']:>6}  {row['start']}  {row['stop']}  {row['name']}" for row in rows]
-    emit(arguments, {"passes": rows, "total": page.total}, text="\n".join(lines) or "no passes")
-    return 0
+def _listed(item: PassSummary) -> dict[str, Any]:
+    times = {"start": f"{item.start[:23]}Z", "stop": f"{item.stop[:23]}Z"}
+    return {"pass_id": item.id, "name": item.name, **times}
 
 
-def show_pass(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        figures = service.evaluate_pass(arguments.pass_id).model_dump(mode="json")
-    emit(arguments, figures, text=describe(figures))
-    return 0
+def _line(item: PassSummary) -> str:
+    return f"{item.id:>6}  {item.start[:23]}Z  {item.stop[:23]}Z  {item.name}"
 
 
-def _milliseconds(time: object) -> str:
-    """Return the text of a time with milliseconds."""
-    return f"{str(time)[:23]}Z"
-
-
-def describe(figures: dict[str, Any]) -> str:
+def describe(found: PassFigures) -> str:
     """Return the metrics of a pass as lines of text."""
+    figures = as_json(found)
     lines = [
         f"pass {figures['pass_id']}: {figures['frames']} frames, {figures['packets']} packets, "
         f"{figures['packets_lost']} lost",
@@ -93,3 +64,24 @@ def _figure(value: float | None, unit: str) -> str:
 
 def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f} m"
+
+
+COMMANDS = {
+    "list": Command(
+        "list_passes",
+        "list passes, newest first",
+        _line,
+        "passes",
+        "no passes",
+        _listed,
+        options={
+            "search": "part of the name",
+            "verdict": "verdict of the newest report; none: without a report",
+        },
+    ),
+    "show": Command("evaluate_pass", "evaluate a pass and show its metrics", describe),
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    add_commands(parser, COMMANDS)

@@ -23,6 +23,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.server import bind
 from ground_service.settings import Settings
 from linna.cli import GROUPS, run
+from linna.parser import LinnaParser
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
@@ -168,7 +169,7 @@ def ground_commands() -> set[tuple[str, ...]]:
     """Return the commands that accept --server, as group and action."""
     found: set[tuple[str, ...]] = set()
     for group, (module, _) in GROUPS.items():
-        parser = argparse.ArgumentParser()
+        parser = LinnaParser()
         importlib.import_module(f"linna.commands.{module}").configure(parser)
         actions = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
         inner = {(group, name): one for action in actions for name, one in action.choices.items()}

@@ -267,7 +267,7 @@ def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: G
     define_pass(ground, name="no", start_utc_ns=start, stop_utc_ns=start + 10**12, spacecraft_id=SPACECRAFT)
     found = performance(ground, SPACECRAFT)
     assert (found.passes_in_span, len(found.passes)) == (2, 1)
-    assert performance_lines(found)[0] == "1 passes with a report, 1 without"
+    assert performance_lines(found).splitlines()[0] == "1 passes with a report, 1 without"
     value = monthly_value(found, "2029-08")
     assert value.verdict_level == "unknown"
     assert value.verdict.endswith("; 1 of 2 passes have a report")
