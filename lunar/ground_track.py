@@ -64,14 +64,12 @@ def even_epochs(ephemeris: Ephemeris, step_s: float) -> IntArray:
     return np.asarray(epochs[ephemeris.covers(epochs)])
 
 
-def track_statistics(
-    ephemeris: Ephemeris, track: GroundTrack, latitude_limit_rad: float = PASS_LATITUDE_RAD
-) -> TrackStatistics:
+def track_statistics(ephemeris: Ephemeris, track: GroundTrack) -> TrackStatistics:
     """Return the figures of a track over its own epochs, each counted alike."""
     position_m, velocity_m_s = ephemeris.at(track.utc_ns)
     radius_m = np.linalg.norm(position_m, axis=1)
     rate_rad_s = np.linalg.norm(np.cross(position_m, velocity_m_s), axis=1) / radius_m**2
-    inside = np.abs(track.latitude_rad) <= latitude_limit_rad
+    inside = np.abs(track.latitude_rad) <= PASS_LATITUDE_RAD
     steps = np.diff(track.utc_ns)
     # A pass ends where the latitude leaves the limits or where the track itself breaks off.
     broken = steps > 10 * np.median(steps) if len(steps) else np.zeros(0, dtype=np.bool_)

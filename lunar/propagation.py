@@ -212,7 +212,7 @@ def propagate_with_stm(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arc:
-    """One uninterrupted integration: knots in order of integration, why it ended, where it met the ground."""
+    """One uninterrupted integration: knots in order of integration, and why it ended."""
 
     elapsed_s: FloatArray
     states: FloatArray
@@ -220,7 +220,6 @@ class Arc:
     status: int
     evaluations: int
     next_step_s: float
-    ground_s: float
 
 
 def integrate_arc(
@@ -237,7 +236,6 @@ def integrate_arc(
     event: int = 0,
     event_radius_m: float = 0.0,
     first_step_s: float = 10.0,
-    stop_at_ground: bool = False,
 ) -> Arc:
     """Return the steps from ``start_s`` to ``stop_s`` after the epoch, or to the event asked for (see the kernel)."""
     from lunar import _dynamics_kernel as kernel
@@ -271,12 +269,10 @@ def integrate_arc(
             f"propagation: expected steps over 1 us to meet a tolerance of {rtol:g}, found none at {time:.3f} s"
         )
     elapsed, states, rates = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    ground_s = np.nan
     if status == kernel.GROUND:
         ground_s = _ground_time(elapsed[-2:], states[-2:], rates[-2:], ground_radius_m)
-        if not stop_at_ground:
-            raise _impact(epoch_tdb_s, ground_s, elapsed[-2:], states[-2:], rates[-2:], model)
-    return Arc(elapsed, states, rates, status, evaluations, step, ground_s)
+        raise _impact(epoch_tdb_s, ground_s, elapsed[-2:], states[-2:], rates[-2:], model)
+    return Arc(elapsed, states, rates, status, evaluations, step)
 
 
 def _check_arc(
@@ -427,7 +423,7 @@ def _impact(
     from lunar.frames import spherical_from_mcmf
     from lunar.timescales import format_utc, utc_ns_from_tdb_s
 
-    arc = Arc(elapsed, states, rates, 0, 0, 0.0, np.nan)
+    arc = Arc(elapsed, states, rates, 0, 0, 0.0)
     position = join(epoch_tdb_s, [arc]).state_after(ground_s)[:3]
     tdb_s = epoch_tdb_s + ground_s
     latitude, longitude, _ = spherical_from_mcmf(model.orientation.mcmf_from_icrf(tdb_s) @ position)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,34 +167,10 @@ def _round_step(least: float) -> float:
 
 def chi2_quantile(probability: float, dof: NDArray[np.float64] | float) -> FloatArray:
     """Quantile of chi-squared for each number of degrees of freedom, NaN where that is not positive."""
+    from scipy.special import gammaincinv
+
     freedom = np.asarray(dof, dtype=np.float64)
-    known = {k: _chi2_quantile(probability, k) for k in np.unique(freedom).tolist() if k > 0}
-    return np.array([known.get(k, math.nan) for k in freedom.ravel().tolist()]).reshape(freedom.shape)
-
-
-@lru_cache(maxsize=1024)
-def _chi2_quantile(probability: float, dof: float) -> float:
-    low, high = 0.0, dof + 20.0 * math.sqrt(dof) + 60.0
-    for _ in range(80):
-        middle = (low + high) / 2
-        if _gamma_p(dof / 2, middle / 2) < probability:
-            low = middle
-        else:
-            high = middle
-    return (low + high) / 2
-
-
-def _gamma_p(a: float, x: float) -> float:
-    """Regularised lower incomplete gamma function by its power series (Abramowitz and Stegun, 6.5.29)."""
-    if x <= 0:
-        return 0.0
-    term = total = 1.0 / a
-    n = 1
-    while term > 1e-16 * total:
-        term *= x / (a + n)
-        total += term
-        n += 1
-    return total * math.exp(a * math.log(x) - x - math.lgamma(a))
+    return np.asarray(2.0 * gammaincinv(np.where(freedom > 0.0, freedom, np.nan) / 2.0, probability))
 
 
 def running_mean(values: FloatArray, window: int) -> FloatArray:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".svg", ".pdf")
 CLASS_NAMES = ("Class 0 (5-10 km)", "Class 1 (10-15 km)", "Class 2 (15-30 km)")
 CLASS_EDGES_KM = (5.0, 10.0, 15.0, 30.0)
+BIN_KM = 0.5
 
 
 def save_fov_study(
@@ -62,9 +63,9 @@ def save_fov_study(
         _caption(figure, caption)
 
 
-def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str, bin_km: float = 0.5) -> None:
+def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str) -> None:
     """Histogram of crater diameters of 5 to 30 km in the three size classes, light to dark (the paper's Fig. 4)."""
-    edges = np.arange(CLASS_EDGES_KM[0], CLASS_EDGES_KM[-1] + bin_km / 2, bin_km)
+    edges = np.arange(CLASS_EDGES_KM[0], CLASS_EDGES_KM[-1] + BIN_KM / 2, BIN_KM)
     counts, _ = np.histogram(diameter_km, edges)
     with _sheet(path, 7.2, 4.2) as figure:
         axes = figure.add_axes((0.11, 0.21, 0.85, 0.68))
@@ -76,7 +77,7 @@ def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str, bin_
             axes.bar(
                 edges[:-1][mine],
                 counts[mine],
-                bin_km * 0.92,
+                BIN_KM * 0.92,
                 align="edge",
                 color=color(role),
                 label=f"{name}: {total:,}".replace(",", " "),
@@ -87,7 +88,7 @@ def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str, bin_
         axes.set_xlim(CLASS_EDGES_KM[0], CLASS_EDGES_KM[-1])
         axes.set_xticks([5, 10, 15, 20, 25, 30])
         axes.set_xlabel("diameter, km")
-        axes.set_ylabel(f"craters per {bin_km:g} km")
+        axes.set_ylabel(f"craters per {BIN_KM:g} km")
         axes.set_title("Crater diameters by size class")
         axes.legend(loc="upper right")
         _caption(figure, caption)

@@ -27,7 +27,6 @@ from payload_emulator.flight.navigation.lost_in_space import (
     LostFrame,
     LostParameters,
     Place,
-    PlaceIndex,
     find_place,
     find_place_in_frames,
     place_index,
@@ -43,9 +42,17 @@ KINDS = ("true", "all_false", "mirrored", "rotated")
 # Chi-square of 3 degrees of freedom at 1e-5: a correction beyond it is wrong, not unlucky.
 _WRONG_NEES = 25.9
 _FRAME_INTERVAL_S = 15.0
-_CAMERA = PinholeCamera()
+CAMERA = PinholeCamera()
 _IDENTIFICATION = IdentificationParameters()
+ALTITUDES_M = (14e3, 50e3)
+LEAST_DETECTIONS = 6
+"""True detections that a frame of a search without a prior must have."""
 
+PRIOR_M = (30.0, 1_400.0)
+"""Smallest and greatest standard deviation of a prediction, log-uniform between them."""
+
+_TRACKING_ATTITUDE_RAD = math.radians(0.01)
+_COMBINED = 4
 
 STUDY_DETECTOR = SimulatedDetector(
     recall=(0.5, 0.5, 0.5, 0.5), recall_outside=0.5, precision=0.8, sigma_px=1.4, log_diameter_sigma=0.05
@@ -151,7 +158,6 @@ def draw_frame(
     position_mcmf_m: FloatArray,
     attitude_error_rad: FloatArray,
     model: SimulatedDetector,
-    camera: PinholeCamera,
     rng: np.random.Generator,
     kind: str = "true",
 ) -> StudyFrame:
@@ -165,9 +171,9 @@ def draw_frame(
     left, _, right = np.linalg.svd(turned)
     nothing = np.zeros(3)
     pose = Pose(position_mcmf_m, left @ right, np.eye(3), nothing, np.zeros(2), nothing)
-    seen = in_view(world.true, pose, camera, 0.0)
+    seen = in_view(world.true, pose, CAMERA, 0.0)
     seen = seen.select(model.found(world.true.diameter_m[seen.index], rng))
-    corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    corner = np.array([CAMERA.width_px - 1.0, CAMERA.height_px - 1.0])
     uv, size = seen.uv_px, seen.diameter_px
     if len(seen):  # a frame without craters has no false detections either: it is drawn again
         uv, size = model.detect(uv, size, corner, rng)
@@ -196,24 +202,17 @@ def study_lost(
     kind: str = "true",
     model: SimulatedDetector = STUDY_DETECTOR,
     attitude_rad: float = math.radians(0.5),
-    altitudes_m: tuple[float, float] = (14e3, 50e3),
-    least_detections: int = 6,
-    parameters: LostParameters | None = None,
-    camera: PinholeCamera = _CAMERA,
 ) -> LostScore:
-    """Return the score of single frames; those with fewer true detections than asked for are drawn again."""
+    """Return the score of single frames; those with too few true detections are drawn again."""
     rng = np.random.default_rng((seed, 2, KINDS.index(kind)))
-    index = place_index(world.board)
-    rules = parameters or LostParameters(attitude_sigma_rad=attitude_rad)
-    return _lost_score(
-        kind,
-        (
-            _timed(frame, index, rules, camera)
-            for frame in _frames(
-                world, frames, rng, kind, model, attitude_rad, altitudes_m, least_detections, camera
-            )
-        ),
-    )
+    index, rules = place_index(world.board), LostParameters(attitude_sigma_rad=attitude_rad)
+    results = []
+    for frame in _frames(world, frames, rng, kind, model, attitude_rad, LEAST_DETECTIONS):
+        started = time.process_time()
+        place = find_place(frame.found, frame.found.sigma_px, index, CAMERA, rules)
+        places = () if place is None else (place,)
+        results.append((_error_m(places, [frame]), time.process_time() - started))
+    return _lost_score(kind, results)
 
 
 def study_lost_in_frames(
@@ -221,40 +220,29 @@ def study_lost_in_frames(
     sets: int,
     seed: int,
     *,
-    combined: int = 4,
     model: SimulatedDetector = STUDY_DETECTOR,
     attitude_rad: float = math.radians(0.5),
-    altitudes_m: tuple[float, float] = (14e3, 50e3),
-    least_detections: int = 6,
-    camera: PinholeCamera = _CAMERA,
 ) -> LostScore:
     """Return the score of sets of consecutive frames 15 s apart, each with enough true detections."""
     rng = np.random.default_rng((seed, 3))
-    index = place_index(world.board)
-    rules = LostParameters(attitude_sigma_rad=attitude_rad)
+    index, rules = place_index(world.board), LostParameters(attitude_sigma_rad=attitude_rad)
     results: list[tuple[float | None, float]] = []
     while len(results) < sets:
-        group = _consecutive(world, combined, rng, model, attitude_rad, altitudes_m, least_detections, camera)
+        group = _consecutive(world, rng, model, attitude_rad)
         if group is None:
             continue
         started = time.process_time()
-        places = find_place_in_frames(
-            [LostFrame(f.found, f.found.sigma_px, k * _FRAME_INTERVAL_S) for k, f in enumerate(group)],
-            index,
-            camera,
-            rules,
-        )
-        spent = time.process_time() - started
-        if places is None:
-            results.append((None, spent))
-        else:
-            # Each place belongs to one of the frames: the nearest.
-            error = max(
-                min(float(np.linalg.norm(place.position_mcmf_m - f.pose.position_icrf_m)) for f in group)
-                for place in places
-            )
-            results.append((error, spent))
-    return _lost_score(f"{combined} frames", results)
+        frames = [LostFrame(f.found, f.found.sigma_px, k * _FRAME_INTERVAL_S) for k, f in enumerate(group)]
+        places = find_place_in_frames(frames, index, CAMERA, rules)
+        results.append((_error_m(places or (), group), time.process_time() - started))
+    return _lost_score(f"{_COMBINED} frames", results)
+
+
+def _error_m(places: Sequence[Place], frames: Sequence[StudyFrame]) -> float | None:
+    """Return the greatest error of places, each of which belongs to the nearest frame; None without a place."""
+    true = [frame.pose.position_icrf_m for frame in frames]
+    errors = [min(float(np.linalg.norm(one.position_mcmf_m - at)) for at in true) for one in places]
+    return max(errors, default=None)
 
 
 def study_tracking(
@@ -264,22 +252,17 @@ def study_tracking(
     *,
     kind: str = "true",
     model: SimulatedDetector = STUDY_DETECTOR,
-    prior_m: tuple[float, float] = (30.0, 1_400.0),
-    attitude_noise_rad: float = math.radians(0.01),
-    altitudes_m: tuple[float, float] = (14e3, 50e3),
-    parameters: IdentificationParameters = _IDENTIFICATION,
-    camera: PinholeCamera = _CAMERA,
 ) -> TrackingScore:
     """Return the score of identification around predictions whose error is drawn from a known sigma (log-uniform)."""
     rng = np.random.default_rng((seed, 4, KINDS.index(kind)))
-    errors = kalman.CommonErrors(attitude_noise_rad=attitude_noise_rad)
+    errors = kalman.CommonErrors(attitude_noise_rad=_TRACKING_ATTITUDE_RAD)
     counts = dict.fromkeys(TrackingScore.__slots__[2:], 0)
-    for frame in _frames(world, frames, rng, kind, model, attitude_noise_rad, altitudes_m, 0, camera):
-        sigma_m = math.exp(rng.uniform(*np.log(prior_m)))
+    for frame in _frames(world, frames, rng, kind, model, _TRACKING_ATTITUDE_RAD, 0):
+        sigma_m = math.exp(rng.uniform(*np.log(PRIOR_M)))
         prior = _prior(frame, sigma_m, errors, rng)
         findable = frame.true_detections >= 4
         counts["findable"] += findable
-        pairs = _tracked(frame, prior, world.board, errors, parameters, camera)
+        pairs = _tracked(frame, prior, world.board, errors)
         if pairs is None:
             continue
         detection, crater = pairs
@@ -290,9 +273,7 @@ def study_tracking(
         counts["wrong_pairs"] += wrong
         if 2 * wrong >= detection.size:
             counts["majority_wrong"] += 1
-            counts["wrong_fixes"] += _contradicts_truth(
-                frame, prior, world.board, detection, crater, errors, camera
-            )
+            counts["wrong_fixes"] += _contradicts_truth(frame, prior, world.board, detection, crater, errors)
     return TrackingScore(kind, frames, **counts)
 
 
@@ -303,24 +284,22 @@ def _frames(
     kind: str,
     model: SimulatedDetector,
     attitude_rad: float,
-    altitudes_m: tuple[float, float],
     least_detections: int,
-    camera: PinholeCamera,
 ) -> Iterator[StudyFrame]:
     """Yield frames over random craters of the map."""
     drawn = 0
     while drawn < frames:
-        place = _place(world, rng, altitudes_m)
-        frame = draw_frame(world, place, attitude_rad * rng.standard_normal(3), model, camera, rng, "true")
+        place = _place(world, rng)
+        frame = draw_frame(world, place, attitude_rad * rng.standard_normal(3), model, rng)
         if frame.true_detections < least_detections:
             continue
         if kind != "true":
-            frame = draw_frame(world, place, attitude_rad * rng.standard_normal(3), model, camera, rng, kind)
+            frame = draw_frame(world, place, attitude_rad * rng.standard_normal(3), model, rng, kind)
         drawn += 1
         yield frame
 
 
-def _place(world: StudyWorld, rng: np.random.Generator, altitudes_m: tuple[float, float]) -> FloatArray:
+def _place(world: StudyWorld, rng: np.random.Generator) -> FloatArray:
     """Return a place below 62 degrees of latitude, uniform over the part of the sphere that the map covers."""
     position = world.true.position_mcmf_m
     while True:
@@ -328,22 +307,15 @@ def _place(world: StudyWorld, rng: np.random.Generator, altitudes_m: tuple[float
         latitude = math.asin(near[2] / float(np.linalg.norm(near))) + rng.uniform(-0.05, 0.05)
         longitude = math.atan2(near[1], near[0]) + rng.uniform(-0.05, 0.05) / math.cos(latitude)
         if abs(latitude) < math.radians(62.0):
-            altitude = rng.uniform(*altitudes_m)
+            altitude = rng.uniform(*ALTITUDES_M)
             return np.asarray(mcmf_from_spherical(latitude, longitude, altitude), dtype=np.float64)
 
 
 def _consecutive(
-    world: StudyWorld,
-    combined: int,
-    rng: np.random.Generator,
-    model: SimulatedDetector,
-    attitude_rad: float,
-    altitudes_m: tuple[float, float],
-    least_detections: int,
-    camera: PinholeCamera,
+    world: StudyWorld, rng: np.random.Generator, model: SimulatedDetector, attitude_rad: float
 ) -> list[StudyFrame] | None:
     """Return frames along a near-polar orbit, None where one of them has too few true detections."""
-    start = _place(world, rng, altitudes_m)
+    start = _place(world, rng)
     radius = float(np.linalg.norm(start))
     latitude, longitude = math.asin(start[2] / radius), math.atan2(start[1], start[0])
     east, north, up = enu_from_mcmf(latitude, longitude)
@@ -351,33 +323,18 @@ def _consecutive(
     along = math.sin(heading) * east + math.cos(heading) * north
     climb_m_s = rng.uniform(-10.0, 10.0)
     group = []
-    for k in range(combined):
+    for k in range(_COMBINED):
         time_s = k * _FRAME_INTERVAL_S
         angle = math.sqrt(GM_MOON_M3_S2 / radius**3) * time_s
         place = (radius + climb_m_s * time_s) * (math.cos(angle) * up + math.sin(angle) * along)
-        frame = draw_frame(world, place, attitude_rad * rng.standard_normal(3), model, camera, rng)
-        if frame.true_detections < least_detections:
+        frame = draw_frame(world, place, attitude_rad * rng.standard_normal(3), model, rng)
+        if frame.true_detections < LEAST_DETECTIONS:
             return None
         group.append(frame)
     return group
 
 
-def _timed(
-    frame: StudyFrame, index: PlaceIndex, rules: LostParameters, camera: PinholeCamera
-) -> tuple[float | None, float]:
-    """Return the error of the place found (None: no fix) and the time it took."""
-    started = time.process_time()
-    place: Place | None = find_place(frame.found, frame.found.sigma_px, index, camera, rules)
-    spent = time.process_time() - started
-    if place is None:
-        return None, spent
-    return float(np.linalg.norm(place.position_mcmf_m - frame.pose.position_icrf_m)), spent
-
-
-def _lost_score(
-    kind: str, results: Iterator[tuple[float | None, float]] | Sequence[tuple[float | None, float]]
-) -> LostScore:
-    rows = list(results)
+def _lost_score(kind: str, rows: Sequence[tuple[float | None, float]]) -> LostScore:
     errors = np.array([error for error, _ in rows if error is not None])
     # What is found in a hostile frame is wrong wherever it is.
     right = errors[errors < WRONG_PLACE_M] if kind not in KINDS[1:] else errors[:0]
@@ -407,14 +364,12 @@ def _tracked(
     prior: kalman.FilterState,
     board: LandmarkMap,
     errors: kalman.CommonErrors,
-    parameters: IdentificationParameters,
-    camera: PinholeCamera,
 ) -> tuple[IntArray, IntArray] | None:
     """Return believed pairs of detections and craters (indices into the map), None without any."""
     pose = kalman.pose_of(prior, frame.measured_camera_from_mcmf, np.eye(3))
     altitude_m = max(float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M, 1_000.0)
-    margin_px = min(3.5 * prior.position_sigma_m / altitude_m * camera.focal_px, 200.0)
-    sighting = in_view(board, pose, camera, margin_px)
+    margin_px = min(3.5 * prior.position_sigma_m / altitude_m * CAMERA.focal_px, 200.0)
+    sighting = in_view(board, pose, CAMERA, margin_px)
     count = len(sighting)
     if not count or not len(frame.found):
         return None
@@ -428,8 +383,8 @@ def _tracked(
         spread,
         scaled @ np.swapaxes(scaled, 1, 2),
         frame.found.sigma_px**2,
-        float(camera.width_px * camera.height_px),
-        parameters,
+        float(CAMERA.width_px * CAMERA.height_px),
+        _IDENTIFICATION,
         sighting.by_position @ prior.covariance[:3, :3] @ np.swapaxes(sighting.by_position, 1, 2),
     )
     return (result.detection, sighting.index[result.sighted]) if result.believed else None
@@ -442,7 +397,6 @@ def _contradicts_truth(
     detection: IntArray,
     crater: IntArray,
     errors: kalman.CommonErrors,
-    camera: PinholeCamera,
 ) -> bool:
     """Return whether the fix of these pairs claims what the truth rules out."""
     updated = kalman.update(
@@ -453,7 +407,7 @@ def _contradicts_truth(
         crater,
         np.stack([frame.found.u_px, frame.found.v_px], axis=1)[detection],
         frame.found.sigma_px[detection] ** 2,
-        camera,
+        CAMERA,
         errors,
     )
     if updated is None:

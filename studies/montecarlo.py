@@ -298,10 +298,10 @@ def consistency(runs: Iterable[NavigationRun], settle_frames: int = 20) -> Consi
     )
 
 
-def anees_bounds(runs: int, degrees: int = 6, sigmas: float = 1.96) -> tuple[float, float]:
-    """Return the 95 % bounds of the average over independent runs of a chi-square (normal limit)."""
-    width = sigmas * np.sqrt(2.0 * degrees / runs)
-    return degrees - float(width), degrees + float(width)
+def anees_bounds(runs: int) -> tuple[float, float]:
+    """Return the 95 % bounds of the average over independent runs of a chi-square of 6 degrees (normal limit)."""
+    width = 1.96 * math.sqrt(12.0 / runs)
+    return 6.0 - width, 6.0 + width
 
 
 @dataclass(frozen=True, slots=True)

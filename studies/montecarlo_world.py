@@ -65,10 +65,10 @@ _TRACKS: dict[Track, TrackOrbit] = {
 }
 
 
-def rough_gravity(degree: int, seed: int = 3) -> GravityField:
+def rough_gravity(degree: int) -> GravityField:
     """The built-in field continued with random coefficients of the size that the Moon's have."""
     known = builtin_gravity()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     n = np.arange(degree + 1)
     size = np.where(n > known.degree, KAULA / np.maximum(n, 1) ** 2, 0.0)[:, None]
     c_bar = np.tril(rng.standard_normal((degree + 1, degree + 1))) * size
@@ -79,9 +79,9 @@ def rough_gravity(degree: int, seed: int = 3) -> GravityField:
     return GravityField("rough", known.gm_m3_s2, known.radius_m, c_bar, s_bar)
 
 
-def crater_world(seed: int = 11) -> CraterCatalogue:
+def crater_world() -> CraterCatalogue:
     """Craters of 5 to 30 km, uniform on the sphere at the paper's density, with heights of two kilometres' range."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(11)
     count = int(4.0 * np.pi * MOON_RADIUS_M**2 * _DENSITY_M2)
     z, longitude = rng.uniform(-1.0, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count)
     diameter = 5e3 * (1.0 - rng.uniform(size=count) * (1.0 - 6.0**_SIZE_SLOPE)) ** (1.0 / _SIZE_SLOPE)

@@ -80,12 +80,12 @@ def checksums_hold(rows: RecordArray, tables: RecordArray, holds: RecordArray) -
 
 
 @njit(nogil=True)
-def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
+def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int) -> int:
     """Octets of the packet whose header stands at `p`, or 0 where no such header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:
         return 0
     length = (np.int64(buffer[p + 4]) << 8 | np.int64(buffer[p + 5])) + 7
-    if length > stop - p or length > longest or (length < 9 and not is_idle(buffer, p)):
+    if length > stop - p or (length < 9 and not is_idle(buffer, p)):
         return 0
     return length
 
@@ -101,7 +101,6 @@ def walk(
     p: int,
     stop: int,
     packet_type: int,
-    longest: int,
     tables: RecordArray,
     rows: RecordArray,
     count: int,
@@ -113,7 +112,7 @@ def walk(
     full rows.
     """
     while p < stop and count < rows.shape[0]:
-        length = length_at(buffer, p, stop, packet_type, longest)
+        length = length_at(buffer, p, stop, packet_type)
         if length == 0 or is_idle(buffer, p) or _crc(buffer, p, p + length, tables) != 0:
             break
         rows[count, 0] = GOOD
@@ -173,11 +172,11 @@ def _prefix_holds(
 
 @njit(nogil=True)
 def _stands(
-    buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int,
+    buffer: RecordArray, p: int, stop: int, packet_type: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> bool:  # fmt: skip
     """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
-    length = length_at(buffer, p, stop, packet_type, longest)
+    length = length_at(buffer, p, stop, packet_type)
     if length == 0:
         return False
     return is_idle(buffer, p) or _prefix_holds(buffer, p, length, prefix, known, tables, powers)
@@ -185,7 +184,7 @@ def _stands(
 
 @njit(nogil=True)
 def chain_start(
-    buffer: RecordArray, first: int, end: int, packet_type: int, longest: int,
+    buffer: RecordArray, first: int, end: int, packet_type: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> int:  # fmt: skip
     """Least position in [first, end) from which right packets lead exactly to `end`, or -1."""
@@ -195,7 +194,7 @@ def chain_start(
     _prefix_holds(buffer, first, end - first, prefix, known, tables, powers)
     found = -1
     for q in range(end - 9, first - 1, -1):
-        length = length_at(buffer, q, end, packet_type, longest)
+        length = length_at(buffer, q, end, packet_type)
         if length == 0 or is_idle(buffer, q) or not leads[q + length - first]:
             continue
         if _prefix_holds(buffer, q, length, prefix, known, tables, powers):
@@ -206,7 +205,7 @@ def chain_start(
 
 @njit(nogil=True)
 def search(
-    buffer: RecordArray, first: int, limit: int, stop: int, packet_type: int, longest: int,
+    buffer: RecordArray, first: int, limit: int, stop: int, packet_type: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> int:  # fmt: skip
     """First position in [first, limit) at which a packet is believed to begin, or `limit`.
@@ -215,7 +214,7 @@ def search(
     end or another right packet just after.
     """
     for q in range(first, limit):
-        length = length_at(buffer, q, stop, packet_type, longest)
+        length = length_at(buffer, q, stop, packet_type)
         if length == 0 or is_idle(buffer, q):
             continue
         if _prefix_holds(buffer, q, length, prefix, known, tables, powers):
@@ -223,7 +222,7 @@ def search(
             if (
                 is_pus(buffer, q, length, packet_type)
                 or e == stop
-                or _stands(buffer, e, stop, packet_type, longest, prefix, known, tables, powers)
+                or _stands(buffer, e, stop, packet_type, prefix, known, tables, powers)
             ):
                 return q
     return limit
@@ -234,12 +233,12 @@ _AHEAD = 256
 
 
 @njit(nogil=True)
-def header_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
+def header_at(buffer: RecordArray, p: int, stop: int, packet_type: int) -> int:
     """Octets that the header at `p` claims, whether or not they are there; 0 where no header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:
         return 0
     length = (np.int64(buffer[p + 4]) << 8 | np.int64(buffer[p + 5])) + 7
-    return length if length <= longest else 0
+    return length
 
 
 @njit(nogil=True)
@@ -248,7 +247,6 @@ def walk_unchecked(
     p: int,
     stop: int,
     packet_type: int,
-    longest: int,
     last: RecordArray,
     rows: RecordArray,
     count: int,
@@ -258,7 +256,7 @@ def walk_unchecked(
     Idle packets are rows of their own kind; `last` (2048,) keeps the sequence count of each APID.
     """
     while p < stop and count < rows.shape[0]:
-        length = header_at(buffer, p, stop, packet_type, longest)
+        length = header_at(buffer, p, stop, packet_type)
         if length == 0 or length > stop - p:
             break
         idle = is_idle(buffer, p)
@@ -275,7 +273,7 @@ def walk_unchecked(
 
 @njit(nogil=True)
 def proves(
-    buffer: RecordArray, q: int, stop: int, packet_type: int, longest: int, last: RecordArray, is_begin: bool
+    buffer: RecordArray, q: int, stop: int, packet_type: int, last: RecordArray, is_begin: bool
 ) -> bool:
     """Whether packets without error control begin at `q`.
 
@@ -289,7 +287,7 @@ def proves(
     for k in range(CHAIN):
         if p == stop:
             return is_begin and k > 0
-        length = header_at(buffer, p, stop, packet_type, longest)
+        length = header_at(buffer, p, stop, packet_type)
         if length == 0 or length > stop - p:
             return is_begin and k >= 3
         apids[k] = (np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])
@@ -306,11 +304,9 @@ def proves(
 
 
 @njit(nogil=True)
-def search_unchecked(
-    buffer: RecordArray, first: int, stop: int, packet_type: int, longest: int, last: RecordArray
-) -> int:
+def search_unchecked(buffer: RecordArray, first: int, stop: int, packet_type: int, last: RecordArray) -> int:
     """First position in [first, stop) at which packets without error control begin, or `stop`."""
     for q in range(first, stop):
-        if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, longest, last, False):
+        if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, last, False):
             return q
     return stop

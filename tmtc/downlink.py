@@ -162,7 +162,6 @@ def encode_cadus(
     frame_length: int = 1115,
     coding: Coding = "rs",
     randomiser: Randomiser = "legacy",
-    interleave: int | None = None,
     checksum: bool = True,
 ) -> bytes:
     """A whole downlink: CADUs that carry `packets`, frame counts from zero (`DownlinkEncoder` goes on counting)."""
@@ -170,7 +169,6 @@ def encode_cadus(
         frame_length=frame_length,
         coding=coding,
         randomiser=randomiser,
-        interleave=interleave,
         checksum=checksum,
     )
     return DownlinkEncoder(spacecraft_id, settings).encode(packets, virtual_channel)
@@ -380,12 +378,10 @@ def decode(
     return _frames_to_packets(stream, sections, plan, spacecraft_id, dictionary, error_control)
 
 
-def propose_settings(
-    octets: Octets, dictionary: Dictionary = DICTIONARY, *, error_control: bool = True
-) -> LinkProposal:
+def propose_settings(octets: Octets) -> LinkProposal:
     """Return the link settings that the whole stream supports, with the evidence."""
     stream = as_octets(octets)
-    counter = _packet_counter(stream, dictionary, error_control)
+    counter = _packet_counter(stream, DICTIONARY, True)
     return propose_link(stream, counter, survey_markers(stream))
 
 

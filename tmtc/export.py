@@ -16,7 +16,7 @@ from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import UnknownPacket
 from tmtc.parquet import parquet_octets
-from tmtc.schema import Dictionary, Field, Table
+from tmtc.schema import Field, Table
 
 FORMATS = ("json", "csv", "parquet")
 
@@ -35,14 +35,14 @@ def format_onboard_time(ticks: int) -> str:
     return time.isoformat(timespec="microseconds")
 
 
-def packet_records(tables: Mapping[str, Table], dictionary: Dictionary = DICTIONARY) -> list[Record]:
+def packet_records(tables: Mapping[str, Table]) -> list[Record]:
     """A record for each packet, ordered as in the stream: header fields, then engineering values.
 
     Enumerated fields give their names, vectors lists, repeated items a list of records, unknown numbers None.
     """
     numbered: list[tuple[int, Record]] = []
     for name, table in tables.items():
-        definition = dictionary.packet(name)
+        definition = DICTIONARY.packet(name)
         columns = {f.name: _column(f, table.columns[f.name]) for f in definition.fields}
         items: list[list[Record]] = []
         if definition.group:
@@ -106,9 +106,9 @@ def record_columns(records: list[Record]) -> dict[str, list[object]]:
     return columns
 
 
-def column_metadata(packet: str, dictionary: Dictionary = DICTIONARY) -> dict[str, dict[str, str]]:
+def column_metadata(packet: str) -> dict[str, dict[str, str]]:
     """Return unit and description of the columns of a packet, as `record_columns` names them."""
-    definition = dictionary.packet(packet)
+    definition = DICTIONARY.packet(packet)
     stated: dict[str, dict[str, str]] = {}
     for one in definition.fields:
         entry = {"description": one.description} | ({"unit": one.unit} if one.unit else {})

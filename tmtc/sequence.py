@@ -6,19 +6,18 @@ come late, interleaved and twice). Only extended counts are compared.
 
 Between two packets that follow each other in on-board time the count is taken to have moved by the least
 number of steps that explains what is seen: a loss of 8192 packets or more in one stretch looks like a
-shorter one, unless an `expected_rate` says how many to expect.
+shorter one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from tmtc.arrays import IntArray
-from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.packets import SEQUENCE_COUNT_LIMIT
 
 FIRST, DUPLICATE, CONFLICT = 0, 1, 2
@@ -86,26 +85,19 @@ class SequenceReport:
         return sum(account.conflicts for account in self.accounts)
 
 
-def extend_counts(
-    sequence_count: IntArray, ticks: IntArray, expected_rate: float | None = None
-) -> tuple[IntArray, IntArray]:
+def extend_counts(sequence_count: IntArray, ticks: IntArray) -> tuple[IntArray, IntArray]:
     """(extended counts (n,), extended counts at which the counter restarted (r,)) of one APID and boot.
 
     Parameters
     ----------
     sequence_count, ticks : (n,)
         The 14-bit counts and the on-board times, in any order.
-    expected_rate
-        Packets per second, where the sender is known to send steadily.
     """
     if not sequence_count.size:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     order = np.lexsort((np.arange(ticks.size), ticks))
     count, time = sequence_count[order], ticks[order]
-    step = _nearest(np.diff(count), 0)
-    if expected_rate is not None:
-        expected = np.rint(np.diff(time) * (expected_rate / TICKS_PER_SECOND)).astype(np.int64)
-        step = _nearest(np.diff(count), expected)
+    step = _nearest(np.diff(count))
     restart = (step < -_RESET_FALL) & (count[1:] < _RESET_COUNT) & (np.diff(time) > 0)
     extended = np.empty(count.size, dtype=np.int64)
     extended[0] = count[0]
@@ -128,7 +120,6 @@ def account(
     ticks: IntArray,
     same: Callable[[int, int], bool],
     boot: IntArray | None = None,
-    expected_rate: Mapping[int, float] | None = None,
 ) -> SequenceReport:
     """Completeness of n packets in order of arrival.
 
@@ -144,11 +135,10 @@ def account(
     extended = np.zeros(n, dtype=np.int64)
     verdict = np.zeros(n, dtype=np.int8)
     accounts = []
-    rates = expected_rate or {}
     for key in np.unique(boots * (1 << 16) + apid).tolist():
         this_boot, this_apid = divmod(key, 1 << 16)
         rows = np.flatnonzero((boots == this_boot) & (apid == this_apid))
-        counts, restarts = extend_counts(sequence_count[rows], ticks[rows], rates.get(this_apid))
+        counts, restarts = extend_counts(sequence_count[rows], ticks[rows])
         extended[rows] = counts
         by_count = np.lexsort((rows, counts))
         ordered = counts[by_count]
@@ -181,7 +171,7 @@ def account(
     return SequenceReport(tuple(accounts), extended, verdict)
 
 
-def _nearest(difference: IntArray, expected: IntArray | int) -> IntArray:
-    """The step congruent to `difference` that lies nearest to `expected`."""
+def _nearest(difference: IntArray) -> IntArray:
+    """The step congruent to `difference` that lies nearest to 0."""
     half = SEQUENCE_COUNT_LIMIT // 2
-    return (difference - expected + half) % SEQUENCE_COUNT_LIMIT - half + expected
+    return (difference + half) % SEQUENCE_COUNT_LIMIT - half

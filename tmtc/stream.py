@@ -26,6 +26,9 @@ from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETR
 
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 
+LOOK_AHEAD = 3 * PACKET_MAX_LENGTH + PRIMARY_HEADER_LENGTH
+"""Octets that one decision after damage can need: a window of search, a packet begun in it, its successor."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketCut:
@@ -85,7 +88,6 @@ def cut_packets(
     buffer: Octets,
     *,
     packet_type: int = TYPE_TELEMETRY,
-    longest: int = PACKET_MAX_LENGTH,
     segments: IntArray | None = None,
     final: bool = True,
     error_control: bool = True,
@@ -97,8 +99,6 @@ def cut_packets(
     ----------
     packet_type
         Only packets of this type are packets.
-    longest
-        Octets that no packet exceeds; a good bound shortens the search after damage.
     segments : (s, 2), optional
         Ranges that are cut each for itself, for example between lost frames; the whole buffer by default.
     final
@@ -119,11 +119,11 @@ def cut_packets(
     consumed = 0
     cutter: _Cutter | _UncheckedCutter
     if not error_control:
-        cutter = _UncheckedCutter(octets, packet_type, longest)
+        cutter = _UncheckedCutter(octets, packet_type)
     elif unchecked_apids:
-        cutter = _MixedCutter(octets, packet_type, longest, unchecked_apids)
+        cutter = _MixedCutter(octets, packet_type, unchecked_apids)
     else:
-        cutter = _Cutter(octets, packet_type, longest)
+        cutter = _Cutter(octets, packet_type)
     for start, stop in segments.tolist():
         consumed = cutter.cut(start, stop, final)
     rows = cutter.rows[: cutter.count]
@@ -163,14 +163,13 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
 class _Cutter:
     """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
 
-    def __init__(self, octets: OctetArray, packet_type: int, longest: int) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int) -> None:
         from tmtc import _cutting  # numba is imported only where it is used
 
         self.kernels: Any = _cutting
         self.tables, self.powers = _tables()
         self.octets = octets
         self.packet_type = packet_type
-        self.longest = longest
         self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
         self.count = 0
         self.prefix: npt.NDArray[np.uint16] | None = None
@@ -189,7 +188,7 @@ class _Cutter:
                 break
             if q := self.idle_end(p, stop):
                 ends = [(_IDLE, q)]
-            elif not final and stop - p < look_ahead(self.longest):
+            elif not final and stop - p < LOOK_AHEAD:
                 return p
             else:
                 ends = self.decide(p, stop)
@@ -201,13 +200,13 @@ class _Cutter:
     def walk(self, p: int, stop: int, final: bool) -> int:
         """Write rows of undamaged packets from `p` on; return the position behind them."""
         end, self.count = self.kernels.walk(
-            self.octets, p, stop, self.packet_type, self.longest, self.tables, self.rows, self.count
+            self.octets, p, stop, self.packet_type, self.tables, self.rows, self.count
         )
         return int(end)
 
     def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
         """Return the first position in [first, limit) at which a packet is believed to begin, or `limit`."""
-        key = (first, limit, stop, self.packet_type, self.longest)
+        key = (first, limit, stop, self.packet_type)
         return int(self.kernels.search(self.octets, *key, *state))
 
     def note(self, kind: int, p: int, q: int, begin: int) -> None:
@@ -234,9 +233,9 @@ class _Cutter:
         if trusted and (e == stop or self.is_packet_at(e, stop)):
             # the header is one and a packet follows where it says, so the damage is inside [p, e), whatever else may
             # be found in there, unless the length is wrong and right packets fill the end of that range
-            q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
+            q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, *state)
             return [(self.kind_of(p), e)] if q < 0 else [(_SKIPPED, q)]
-        limit = min(stop, p + self.longest)
+        limit = min(stop, p + PACKET_MAX_LENGTH)
         q = self.search(p + 1, limit, stop, state)
         if q == limit < stop:
             return [(_SKIPPED, q)]
@@ -262,7 +261,7 @@ class _Cutter:
         return bool(self.octets[p] & 0x0F == 0x07 and self.octets[p + 1] == 0xFF)
 
     def length_at(self, p: int, stop: int) -> int:
-        return int(self.kernels.length_at(self.octets, p, stop, self.packet_type, self.longest))
+        return int(self.kernels.length_at(self.octets, p, stop, self.packet_type))
 
     def is_packet_at(self, p: int, stop: int) -> bool:
         """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
@@ -274,33 +273,33 @@ class _MixedCutter(_Cutter):
     """A cutter that knows APIDs whose packets do not end with a checksum."""
 
     def __init__(
-        self, octets: npt.NDArray[np.uint8], packet_type: int, longest: int, unchecked_apids: Collection[int]
+        self, octets: npt.NDArray[np.uint8], packet_type: int, unchecked_apids: Collection[int]
     ) -> None:
         from tmtc import _mixed_cutting
 
-        super().__init__(octets, packet_type, longest)
+        super().__init__(octets, packet_type)
         self.mixed: Any = _mixed_cutting
         self.unchecked = np.zeros(1 << 11, dtype=np.bool_)
         self.unchecked[list(unchecked_apids)] = True
 
     def walk(self, p: int, stop: int, final: bool) -> int:
         end, self.count = self.mixed.walk_mixed(
-            self.octets, p, stop, self.packet_type, self.longest, self.tables, self.rows, self.count,
+            self.octets, p, stop, self.packet_type, self.tables, self.rows, self.count,
             self.unchecked, not final,
         )  # fmt: skip
         return int(end)
 
     def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
-        key = (first, limit, stop, self.packet_type, self.longest)
+        key = (first, limit, stop, self.packet_type)
         return int(self.mixed.search_mixed(self.octets, *key, *state, self.unchecked))
 
     def length_at(self, p: int, stop: int) -> int:
-        key = (p, stop, self.packet_type, self.longest)
+        key = (p, stop, self.packet_type)
         found = self.mixed.unchecked_length(self.octets, *key, self.unchecked)
         return int(found) or super().length_at(p, stop)
 
     def is_packet_at(self, p: int, stop: int) -> bool:
-        key = (p, stop, self.packet_type, self.longest, self.unchecked)
+        key = (p, stop, self.packet_type, self.unchecked)
         if self.mixed.unchecked_length(self.octets, *key):
             return True
         return super().is_packet_at(p, stop)
@@ -309,20 +308,19 @@ class _MixedCutter(_Cutter):
 class _UncheckedCutter:
     """One pass over packets without error control: walk over headers, search where they end."""
 
-    def __init__(self, octets: OctetArray, packet_type: int, longest: int) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int) -> None:
         from tmtc import _cutting
 
         self.kernels: Any = _cutting
         self.octets = octets
         self.packet_type = packet_type
-        self.longest = longest
         self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
         self.count = 0
         self.last = np.full(1 << 11, -1, dtype=np.int64)
 
     def cut(self, start: int, stop: int, final: bool) -> int:
         """Cut [start, stop), where a packet is expected at `start`."""
-        kernels, key = self.kernels, (stop, self.packet_type, self.longest)
+        kernels, key = self.kernels, (stop, self.packet_type)
         p = start
         if p < stop and not kernels.proves(self.octets, p, *key, self.last, True):
             p = self.skip(p, *key)
@@ -346,15 +344,15 @@ class _UncheckedCutter:
                 p = q
         return p
 
-    def is_begun(self, p: int, stop: int, packet_type: int, longest: int) -> bool:
+    def is_begun(self, p: int, stop: int, packet_type: int) -> bool:
         """Return whether a packet can begin at `p` and end behind `stop`."""
         if stop - p <= PRIMARY_HEADER_LENGTH:
             return bool(self.octets[p] >> 4 == packet_type)
-        return bool(self.kernels.header_at(self.octets, p, stop, packet_type, longest))
+        return bool(self.kernels.header_at(self.octets, p, stop, packet_type))
 
-    def skip(self, p: int, stop: int, packet_type: int, longest: int) -> int:
+    def skip(self, p: int, stop: int, packet_type: int) -> int:
         """Skip from `p` to the next position at which packets begin; return it."""
-        q = int(self.kernels.search_unchecked(self.octets, p + 1, stop, packet_type, longest, self.last))
+        q = int(self.kernels.search_unchecked(self.octets, p + 1, stop, packet_type, self.last))
         self.note(p, q)
         return q
 
@@ -368,11 +366,6 @@ class _UncheckedCutter:
     def grow(self) -> None:
         """Make room for more rows."""
         self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
-
-
-def look_ahead(longest: int) -> int:
-    """Octets that one decision after damage can need: a window of search, a packet begun in it, its successor."""
-    return 3 * longest + PRIMARY_HEADER_LENGTH
 
 
 @functools.cache

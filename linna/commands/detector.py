@@ -16,7 +16,7 @@ from linna.commands._detector_common import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from linna.commands import _detector_make, _detector_pictures
+    from linna.commands import _detector_pictures
 
     verbs = parser.add_subparsers(title="verbs", required=True)
 
@@ -25,7 +25,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_calibrate(verbs)
     _add_evaluate(verbs)
     _add_compare(verbs)
-    _detector_make.configure(verbs)
     _detector_pictures.configure(verbs)
     _add_bench_and_info(verbs)
 
@@ -225,15 +224,6 @@ def _add_compare(verbs: Any) -> None:
     add_json_flag(compare)
     compare.set_defaults(handler=_compare)
 
-    choose = verbs.add_parser(
-        "choose",
-        help="which of several models flies, by the validation split alone (shipped: the one that does)",
-    )
-    choose.add_argument("models", nargs="+", metavar="M.onnx", help='files, or "shipped"')
-    choose.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    add_json_flag(choose)
-    choose.set_defaults(handler=_choose)
-
 
 def _add_bench_and_info(verbs: Any) -> None:
     from linna.output import add_json_flag
@@ -389,20 +379,6 @@ def _compare(arguments: argparse.Namespace) -> int:
     if arguments.picture is not None:
         draw_comparison(pair, arguments.picture)
     emit(arguments, document, format_comparison(document))
-    return 0
-
-
-def _choose(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, progress
-    from payload_emulator.training.data.dataset import Dataset
-    from payload_emulator.training.evaluate.choice import choose, format_choice
-
-    document = choose(
-        {name: model_octets(None if name == "shipped" else Path(name)) for name in arguments.models},
-        [Dataset(folder) for folder in arguments.dataset],
-        lambda frames: progress(frames, len(frames), "validate", "frames"),
-    )
-    emit(arguments, document, format_choice(document))
     return 0
 
 

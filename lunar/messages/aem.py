@@ -101,15 +101,12 @@ def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...
     return tuple(segments)
 
 
-def format_aem(
-    segments: tuple[AttitudeSegment, ...], *, originator: str = "LINNA", creation_utc_ns: int | None = None
-) -> str:
-    """Return AEM 1.0 text, quaternions with the scalar last; CREATION_DATE is the first epoch unless given."""
-    created = int(segments[0].utc_ns[0]) if creation_utc_ns is None else creation_utc_ns
+def format_aem(segments: tuple[AttitudeSegment, ...]) -> str:
+    """Return AEM 1.0 text, quaternions with the scalar last; CREATION_DATE is the first epoch."""
     lines = [
         "CCSDS_AEM_VERS = 1.0",
-        f"CREATION_DATE = {format_utc(created).rstrip('Z')}",
-        f"ORIGINATOR = {originator}",
+        f"CREATION_DATE = {format_utc(int(segments[0].utc_ns[0])).rstrip('Z')}",
+        "ORIGINATOR = LINNA",
         "",
     ]
     for one in segments:

@@ -61,16 +61,9 @@ def load_oem(path: Path | str) -> Ephemeris:
     return parse_oem(read_text(path, "a CCSDS OEM"), source=str(path))
 
 
-def save_oem(
-    ephemeris: Ephemeris,
-    path: Path | str,
-    *,
-    time_system: str | None = None,
-    creation_utc_ns: int | None = None,
-) -> None:
+def save_oem(ephemeris: Ephemeris, path: Path | str) -> None:
     """Write an OEM 2.0 file."""
-    text = format_oem(ephemeris, time_system=time_system, creation_utc_ns=creation_utc_ns)
-    Path(path).write_text(text, encoding="utf-8", newline="\n")
+    Path(path).write_text(format_oem(ephemeris), encoding="utf-8", newline="\n")
 
 
 def parse_oem(text: str, source: str = "OEM text") -> Ephemeris:

@@ -46,9 +46,8 @@ def parse_oem_xml(octets: bytes, source: str = "OEM XML") -> Ephemeris:
     return parse_oem_lines(Lines(reader.read(octets), source))
 
 
-def format_oem_xml(ephemeris: Ephemeris, *, creation_utc_ns: int | None = None) -> str:
+def format_oem_xml(ephemeris: Ephemeris) -> str:
     """Return OEM 2.0 as XML; positions to 1 um, velocities to 1 nm/s, epochs exact to the nanosecond."""
-    created = ephemeris.start_utc_ns if creation_utc_ns is None else creation_utc_ns
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<oem xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
@@ -56,7 +55,7 @@ def format_oem_xml(ephemeris: Ephemeris, *, creation_utc_ns: int | None = None) 
         'id="CCSDS_OEM_VERS" version="2.0">',
         "<header>",
         *_comments(ephemeris.comments),
-        _element("CREATION_DATE", format_utc(created).rstrip("Z")),
+        _element("CREATION_DATE", format_utc(ephemeris.start_utc_ns).rstrip("Z")),
         _element("ORIGINATOR", ephemeris.originator),
         "</header>",
         "<body>",

@@ -80,12 +80,10 @@ class BreakableDetector:
         return self.detector.examine(image, sun_in_camera)
 
 
-def new_board(
-    seed: int, model: PlatformModel = _PLATFORM, store_octets: int = STORE_OCTETS
-) -> SimulatedBoard:
+def new_board(seed: int, store_octets: int = STORE_OCTETS) -> SimulatedBoard:
     """A board as it comes from the factory: all memory zero."""
     return SimulatedBoard(
-        model, seed, np.zeros(store_octets, dtype=np.uint8), np.zeros(SETTINGS_OCTETS, dtype=np.uint8)
+        _PLATFORM, seed, np.zeros(store_octets, dtype=np.uint8), np.zeros(SETTINGS_OCTETS, dtype=np.uint8)
     )
 
 

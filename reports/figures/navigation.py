@@ -134,8 +134,6 @@ def draw_error_over_time(
     styles: Styles,
     time: TimeScale,
     arcs: Sequence[TimeSpan],
-    *,
-    resets: bool = True,
 ) -> None:
     """3-D position error of every solution on one logarithmic axis."""
     height = canvas.height_in - _BOTTOM - _TOP
@@ -149,8 +147,7 @@ def draw_error_over_time(
     for one, error, keep in sorted(lines, key=lambda item: item[0].kind != "baseline"):
         draw_lines(canvas, axes, time.x(one.utc_ns[keep]), error[keep], styles[one.name])
         entries.append((one.name, _last_finite(error[keep])))
-    if resets:
-        mark_resets(canvas, axes, time, resets_of(series, time), named=True)
+    mark_resets(canvas, axes, time, resets_of(series, time), named=True)
     _name_lines(canvas, axes, height, entries, styles)
 
 
@@ -418,9 +415,7 @@ def _log_percent_axis(axes: Axes, values: FloatArray) -> None:
     axes.set_yticks([], minor=True)
 
 
-def zoom_span(
-    time: TimeScale, arcs: Sequence[TimeSpan], hours: float = 1.0, resets: Sequence[int] = ()
-) -> TimeScale | None:
+def zoom_span(time: TimeScale, arcs: Sequence[TimeSpan], resets: Sequence[int] = ()) -> TimeScale | None:
     """Return the hour to enlarge, with a reset or else an imaging arc; None for spans under two hours.
 
     Parameters
@@ -430,7 +425,7 @@ def zoom_span(
         two thirds of the hour, so that the growth of the error before it is visible. Without resets, the hour begins
         shortly before the imaging arc nearest the middle.
     """
-    length_ns = int(hours * 3.6e12)
+    length_ns = 3_600 * 10**9
     if time.stop_utc_ns - time.start_utc_ns < 2 * length_ns:
         return None
     middle = (time.start_utc_ns + time.stop_utc_ns) // 2

@@ -108,30 +108,30 @@ def series_styles(names_and_kinds: list[tuple[str, str]]) -> dict[str, tuple[str
 
 
 @contextmanager
-def drawing(scale: float = 1.0, more: Mapping[str, Any] | None = None) -> Iterator[None]:
-    """Matplotlib set up for one drawing, type and lines scaled; drawings of one process take turns."""
+def drawing(more: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Matplotlib set up for one drawing; drawings of one process take turns."""
     import matplotlib
 
-    with _LOCK, matplotlib.rc_context({**_settings(scale), **(more or {})}), warnings.catch_warnings():
+    with _LOCK, matplotlib.rc_context({**_settings(), **(more or {})}), warnings.catch_warnings():
         # A name in letters that the type does not have is still text on the page.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
 
-def _settings(scale: float) -> dict[str, Any]:
+def _settings() -> dict[str, Any]:
     return {
         "font.family": ["DejaVu Sans"],
-        "font.size": 9.5 * scale,
-        "axes.titlesize": 9.5 * scale,
-        "axes.labelsize": 9.0 * scale,
-        "xtick.labelsize": 8.5 * scale,
-        "ytick.labelsize": 8.5 * scale,
-        "legend.fontsize": 8.5 * scale,
+        "font.size": 9.5,
+        "axes.titlesize": 9.5,
+        "axes.labelsize": 9.0,
+        "xtick.labelsize": 8.5,
+        "ytick.labelsize": 8.5,
+        "legend.fontsize": 8.5,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
-        "axes.titlepad": 6.0 * scale,
-        "axes.labelpad": 4.0 * scale,
-        "axes.linewidth": 0.7 * scale,
+        "axes.titlepad": 6.0,
+        "axes.labelpad": 4.0,
+        "axes.linewidth": 0.7,
         "axes.edgecolor": LIGHT["faint"],
         "axes.facecolor": "none",
         "axes.labelcolor": LIGHT["muted"],
@@ -143,20 +143,20 @@ def _settings(scale: float) -> dict[str, Any]:
         "axes.grid.axis": "y",
         "axes.unicode_minus": True,
         "grid.color": LIGHT["grid"],
-        "grid.linewidth": 0.7 * scale,
+        "grid.linewidth": 0.7,
         "figure.facecolor": "none",
         "text.color": LIGHT["ink"],
         "xtick.color": LIGHT["faint"],
         "ytick.color": LIGHT["faint"],
         "xtick.labelcolor": LIGHT["muted"],
         "ytick.labelcolor": LIGHT["muted"],
-        "xtick.major.size": 3.0 * scale,
+        "xtick.major.size": 3.0,
         "ytick.major.size": 0.0,
-        "xtick.major.width": 0.7 * scale,
-        "xtick.major.pad": 3.0 * scale,
-        "ytick.major.pad": 4.0 * scale,
-        "lines.linewidth": 1.4 * scale,
-        "lines.markersize": 4.0 * scale,
+        "xtick.major.width": 0.7,
+        "xtick.major.pad": 3.0,
+        "ytick.major.pad": 4.0,
+        "lines.linewidth": 1.4,
+        "lines.markersize": 4.0,
         "lines.solid_capstyle": "round",
         "lines.solid_joinstyle": "round",
         "patch.linewidth": 0.0,

@@ -198,17 +198,6 @@ def test_bench_reports_latency_memory_and_size(capsys):
     assert figures["model_bytes"] <= 6_000_000
 
 
-def test_a_run_without_its_data_set_is_refused(tmp_path, capsys):
-    recipe = str(tmp_path / "r.toml")
-    assert run(["detector", "make", recipe, "--out", str(tmp_path), "--run", str(tmp_path)]) == 2
-    assert "--run: expected the data set it was trained on" in capsys.readouterr().err
-
-
-def test_making_from_no_recipe_is_refused(tmp_path, capsys):
-    assert run(["detector", "make", str(tmp_path / "r.toml"), "--out", str(tmp_path)]) == 2
-    assert "expected a TOML file" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("precision", ["0", "1", "-0.5", "nan"])
 def test_a_precision_outside_zero_and_one_is_refused_before_any_work(capsys, tmp_path, precision):
     command = ["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(tmp_path / "m.onnx")]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lunar.camera import PinholeCamera
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical
 from studies.identification import (
@@ -36,11 +35,11 @@ def world() -> StudyWorld:
 def test_detections_have_the_recall_and_the_precision_they_are_drawn_with(world: StudyWorld) -> None:
     rng = np.random.default_rng(1)
     place, model = mcmf_from_spherical(0.0, 0.25, 30e3), STUDY_DETECTOR
-    frames = [draw_frame(world, place, np.zeros(3), model, PinholeCamera(), rng) for _ in range(300)]
+    frames = [draw_frame(world, place, np.zeros(3), model, rng) for _ in range(300)]
     true = sum(frame.true_detections for frame in frames)
     total = sum(len(frame.found) for frame in frames)
     perfect = replace(STUDY_DETECTOR, recall=(1.0,) * 4, precision=1.0)
-    every = draw_frame(world, place, np.zeros(3), perfect, PinholeCamera(), rng)
+    every = draw_frame(world, place, np.zeros(3), perfect, rng)
     # Binomial and Poisson counts of about 10,000 and 3,000: three sigma are 2 %.
     assert true / (300 * len(every.found)) == pytest.approx(0.5, rel=0.04)
     assert true / total == pytest.approx(0.8, rel=0.03)
@@ -50,7 +49,7 @@ def test_a_hostile_frame_has_no_true_detection(world: StudyWorld) -> None:
     rng = np.random.default_rng(1)
     place = mcmf_from_spherical(0.0, 0.25, 30e3)
     for kind in ("all_false", "mirrored", "rotated"):
-        frame = draw_frame(world, place, np.zeros(3), STUDY_DETECTOR, PinholeCamera(), rng, kind)
+        frame = draw_frame(world, place, np.zeros(3), STUDY_DETECTOR, rng, kind)
         assert len(frame.found) > 5
         assert frame.true_detections == 0
 

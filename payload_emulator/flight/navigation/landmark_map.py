@@ -522,9 +522,7 @@ def map_rows(landmarks: Sequence[Landmark]) -> MapRows:
     )
 
 
-def unclaimed(
-    found: Detections, sighting: Sighting, used: IntArray, reach_px: float = _CLAIMED_PX
-) -> BoolArray:
+def unclaimed(found: Detections, sighting: Sighting, used: IntArray) -> BoolArray:
     """Return which detections belong to no crater of the catalogue: not used, and none of their size near by."""
     free = np.ones(len(found), dtype=np.bool_)
     free[used] = False
@@ -536,5 +534,5 @@ def unclaimed(
                 np.abs(np.log(found.diameter_px[:, None] / sighting.diameter_px[None]))
                 < _CLAIMED_LOG_DIAMETER
             )
-        free &= ~np.any((away < reach_px) & alike, axis=1)
+        free &= ~np.any((away < _CLAIMED_PX) & alike, axis=1)
     return free

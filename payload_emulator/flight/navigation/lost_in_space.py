@@ -247,7 +247,6 @@ def candidate_places(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-    camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> list[Place]:
     """Return the best places that explain at least three detections, the least likely by chance first.
 
@@ -255,8 +254,6 @@ def candidate_places(
     ----------
     sigma_px
         One sigma of the centre of each detection, per axis, shape (n,).
-    camera_from_enu
-        Attitude that the ADCS holds, shape (3, 3).
     """
     usable = np.flatnonzero(
         np.isfinite(found.u_px) & np.isfinite(found.v_px) & (found.diameter_px > 0.0) & np.isfinite(sigma_px)
@@ -268,8 +265,8 @@ def candidate_places(
         return []
     chosen, sigma = found.select(usable), np.maximum(sigma_px[usable], _SMALLEST_SIGMA_PX)
     uv = np.stack([chosen.u_px, chosen.v_px], axis=1)
-    places = _voted(uv, chosen.diameter_px, index, camera, parameters, camera_from_enu)
-    fits = _fitted(places, chosen, sigma, index, camera, parameters, camera_from_enu)
+    places = _voted(uv, chosen.diameter_px, index, camera, parameters)
+    fits = _fitted(places, chosen, sigma, index, camera, parameters)
     fits.sort(key=lambda place: place.log_false)
     apart: list[Place] = []
     for place in fits:
@@ -286,12 +283,9 @@ def find_place(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-    camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> Place | None:
     """Return the place of a single frame, None where none is safe."""
-    return believed_place(
-        candidate_places(found, sigma_px, index, camera, parameters, camera_from_enu), parameters
-    )
+    return believed_place(candidate_places(found, sigma_px, index, camera, parameters), parameters)
 
 
 def believed_place(places: Sequence[Place], parameters: LostParameters = LostParameters()) -> Place | None:
@@ -307,7 +301,6 @@ def find_place_in_frames(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-    camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> tuple[Place, ...] | None:
     """Return the places of frames seconds to a minute apart, one per frame that takes part; None where none is safe.
 
@@ -315,8 +308,7 @@ def find_place_in_frames(
     """
     frames = sorted(frames, key=lambda frame: frame.elapsed_s)[-FRAMES_COMBINED:]
     candidates = [
-        candidate_places(frame.found, frame.sigma_px, index, camera, parameters, camera_from_enu)
-        for frame in frames
+        candidate_places(frame.found, frame.sigma_px, index, camera, parameters) for frame in frames
     ]
     return place_of_frames(candidates, frames, parameters)
 
@@ -362,13 +354,12 @@ def _voted(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters,
-    camera_from_enu: FloatArray,
 ) -> FloatArray:
     """Return the best places of the vote (MCMF), shape (n, 3), best first."""
     from payload_emulator.flight.navigation._vote_kernel import Blocks, Directions, SortedCraters, vote
 
     rays = camera.rays(uv)
-    enu = rays @ camera_from_enu
+    enu = rays @ NADIR_NORTH_UP
     off_nadir = np.arccos(np.clip(-enu[:, 2], -1.0, 1.0))
     azimuth = np.arctan2(enu[:, 0], enu[:, 1])
     # Depth below the camera over depth along the boresight is one for a camera that looks down.
@@ -482,7 +473,6 @@ def _fitted(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters,
-    camera_from_enu: FloatArray,
 ) -> list[Place]:
     """Return places (MCMF), shape (n, 3), fitted to the detections they explain; those without three are left out."""
     from payload_emulator.flight.navigation._fit_kernel import Craters, Found, Gates, Image, fit_place
@@ -510,7 +500,7 @@ def _fitted(
     fits: list[Place] = []
     for start in places:
         position, attitude, normal, pair, evidence = fit_place(
-            start, camera_from_enu, image, found, craters, parameters.attitude_sigma_rad, gates, MOON_RADIUS_M
+            start, NADIR_NORTH_UP, image, found, craters, parameters.attitude_sigma_rad, gates, MOON_RADIUS_M
         )
         detection = np.flatnonzero(pair >= 0)
         altitude_m = float(np.linalg.norm(position)) - MOON_RADIUS_M

@@ -195,7 +195,6 @@ def label_frame_as_the_paper(
     terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
-    minimum_diameter_m: float = 2_500.0,
     lit: npt.NDArray[np.float32] | None = None,
     range_m: npt.NDArray[np.float32] | None = None,
 ) -> Labels:
@@ -205,7 +204,7 @@ def label_frame_as_the_paper(
     """
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     rotation = nadir_camera_from_mcmf(position)
-    exact = label_frame(terrain, camera, position, rotation, minimum_diameter_m, lit, range_m)
+    exact = label_frame(terrain, camera, position, rotation, lit=lit, range_m=range_m)
     u, v, diameter = project_as_the_paper(terrain.catalogue.select(exact.index), camera, position)
     inside = camera.contains(np.stack([u, v], axis=-1))
     return replace(

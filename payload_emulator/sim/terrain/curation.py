@@ -415,10 +415,13 @@ def _bilinear(values: FloatArray, row: FloatArray, column: FloatArray) -> FloatA
     return np.asarray(np.where(inside, upper * (1.0 - y) + lower * y, np.nan))
 
 
+SMOOTHING_PIXELS = 0.7
+
+
 class RasterHeights:
     """Height rasters as files: the finest resolution of those given, smoothed by a pixel against quantisation."""
 
-    def __init__(self, paths: Sequence[Path | str], smoothing_pixels: float = 0.7) -> None:
+    def __init__(self, paths: Sequence[Path | str]) -> None:
         from payload_emulator.sim.terrain.rasters import open_layers
 
         if not paths:
@@ -428,7 +431,6 @@ class RasterHeights:
         self._layer = max(layers, key=lambda layer: (len(layer.files), layer.pixels_per_degree))
         self.pixels_per_degree = float(self._layer.pixels_per_degree)
         self.files = tuple(file.path for file in self._layer.files)
-        self._smoothing = smoothing_pixels
 
     def window(self, south: float, north: float, west: float, east: float) -> tuple[FloatArray, float, float]:
         """Heights of a window in degrees, with latitude and longitude of the centre of its first pixel."""
@@ -439,7 +441,7 @@ class RasterHeights:
         columns = math.ceil((east - west) * ppd) + 2
         values = np.asarray(layer.read(top, left, rows, columns), dtype=np.float64)
         if np.isfinite(values).any():
-            values = _smoothed(values, self._smoothing)
+            values = _smoothed(values, SMOOTHING_PIXELS)
         return (
             values,
             90.0 - (top + 0.5 + layer.north_offset) / ppd,

@@ -52,10 +52,9 @@ class RasterFile:
 
 
 class ChunkCache:
-    """Decoded chunks of the layers of one terrain; the oldest in use are dropped above `limit_octets`."""
+    """Decoded chunks of the layers of one terrain; the oldest in use are dropped above `CHUNK_LIMIT_OCTETS`."""
 
-    def __init__(self, limit_octets: int = CHUNK_LIMIT_OCTETS) -> None:
-        self.limit_octets = limit_octets
+    def __init__(self) -> None:
         self.octets = 0
         self._chunks: OrderedDict[tuple[int, int, int, int], Heights] = OrderedDict()
 
@@ -70,7 +69,7 @@ class ChunkCache:
         """Keep a chunk; the newest is kept whatever its size."""
         self._chunks[key] = chunk
         self.octets += chunk.nbytes
-        while self.octets > self.limit_octets and len(self._chunks) > 1:
+        while self.octets > CHUNK_LIMIT_OCTETS and len(self._chunks) > 1:
             self.octets -= self._chunks.popitem(last=False)[1].nbytes
 
     def clear(self) -> None:

@@ -29,6 +29,7 @@ PAPER_TABLE_2 = (
 )
 MATCH_RADIUS_PX = 10.0  # the pixel rule, as in the project's first studies; the paper does not print its own
 FAIR_DEPTH_RATIO = 0.03
+_ROUNDS = 400
 _LEAST_FOR_PRECISION = 100  # below, one false detection more moves the precision by a hundredth and over
 DEGRADATION_EDGES = (0.0, 0.03, 0.06, 0.10, 1.0)
 
@@ -346,14 +347,12 @@ def match_any(
     return np.asarray((distance <= limit[None, :]).any(axis=1))
 
 
-def best_threshold(
-    tallied: Tally, candidates: FloatArray | None = None, beta: float = 1.0
-) -> tuple[float, Figures]:
+def best_threshold(tallied: Tally, beta: float = 1.0) -> tuple[float, Figures]:
     """Threshold of the greatest F-beta and its figures (choose it on a validation set only).
 
     `beta` below 1 gives precision more weight than recall.
     """
-    candidates = np.arange(0.10, 0.91, 0.01) if candidates is None else candidates
+    candidates = np.arange(0.10, 0.91, 0.01)
     every = [tallied.figures(float(threshold)) for threshold in candidates]
     values = np.array([_f_beta(figures, beta) for figures in every])
     best = int(np.argmax(values))
@@ -398,21 +397,15 @@ def average_precision(tallied: Tally) -> float:
     return float(np.sum(np.diff(recall) * precision))
 
 
-def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 400) -> tuple[float, float]:
+def bootstrap_f1(tallied: Tally, threshold: float) -> tuple[float, float]:
     """95 % interval of F1 over resampled blocks of ground."""
     blocks = np.unique(np.concatenate([tallied.crater_block, tallied.detection_block]))
-    f1 = _resampled_f1(tallied, threshold, blocks, seed, rounds)
+    f1 = _resampled_f1(tallied, threshold, blocks)
     return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
 
 
 def bootstrap_f1_difference(
-    tallied: Tally,
-    reference: Tally,
-    threshold: float,
-    seed: int = 0,
-    rounds: int = 400,
-    *,
-    reference_threshold: float | None = None,
+    tallied: Tally, reference: Tally, threshold: float, *, reference_threshold: float | None = None
 ) -> tuple[float, float]:
     """95 % interval of F1 less the reference's, both of the same frames, over the same resampled blocks of ground.
 
@@ -421,16 +414,14 @@ def bootstrap_f1_difference(
     both = (tallied, reference)
     blocks = np.unique(np.concatenate([c for t in both for c in (t.crater_block, t.detection_block)]))
     limits = (threshold, threshold if reference_threshold is None else reference_threshold)
-    one, other = (
-        _resampled_f1(t, limit, blocks, seed, rounds) for t, limit in zip(both, limits, strict=True)
-    )
+    one, other = (_resampled_f1(t, limit, blocks) for t, limit in zip(both, limits, strict=True))
     return float(np.percentile(one - other, 2.5)), float(np.percentile(one - other, 97.5))
 
 
-def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray, seed: int, rounds: int) -> FloatArray:
-    """F1 (rounds,) of blocks drawn with replacement; NaN without any."""
+def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray) -> FloatArray:
+    """F1 (_ROUNDS,) of blocks drawn with replacement; NaN without any."""
     if blocks.size == 0:
-        return np.full(rounds, np.nan)
+        return np.full(_ROUNDS, np.nan)
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
         wrong = (tallied.score >= threshold) & (tallied.outcome == 0)
@@ -445,21 +436,19 @@ def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray, seed: int,
         ],
         dtype=np.float64,
     )
-    rng = np.random.default_rng(seed)
-    drawn = counts[rng.integers(0, len(blocks), (rounds, len(blocks)))].sum(axis=1)
+    rng = np.random.default_rng(0)
+    drawn = counts[rng.integers(0, len(blocks), (_ROUNDS, len(blocks)))].sum(axis=1)
     return np.asarray(2.0 * drawn[:, 0] / np.maximum(drawn[:, 0] + drawn[:, 2] + drawn[:, 1], 1.0))
 
 
-def bootstrap_recall(
-    found: BoolArray, block: IntArray, seed: int = 0, rounds: int = 400
-) -> tuple[float, float]:
+def bootstrap_recall(found: BoolArray, block: IntArray) -> tuple[float, float]:
     """95 % interval of the share of craters found (n,), over resampled blocks of ground (n,)."""
     if found.size == 0:
         return float("nan"), float("nan")
     _, place = np.unique(block, return_inverse=True)
     total = np.bincount(place).astype(float)
     hits = np.bincount(place, weights=found)
-    drawn = np.random.default_rng(seed).integers(0, total.size, (rounds, total.size))
+    drawn = np.random.default_rng(0).integers(0, total.size, (_ROUNDS, total.size))
     recall = hits[drawn].sum(axis=1) / total[drawn].sum(axis=1)
     return float(np.percentile(recall, 2.5)), float(np.percentile(recall, 97.5))
 

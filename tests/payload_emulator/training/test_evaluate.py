@@ -3,16 +3,11 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.training.data.dataset import frame_truth
-from payload_emulator.training.evaluate import choice
-from payload_emulator.training.evaluate.choice import choose, format_choice
 from payload_emulator.training.evaluate.evaluate import (
-    Scored,
     detect_by_class,
     evaluate,
     evidence_level,
@@ -21,9 +16,7 @@ from payload_emulator.training.evaluate.evaluate import (
     run,
     summary,
 )
-from payload_emulator.training.evaluate.metrics import Scene, Thresholds
 from payload_emulator.training.evaluate.report import detector_report
-from payload_emulator.training.evaluate.scoring import FrameDetections
 from reports.json_form import to_json
 from reports.render import render_html
 
@@ -104,33 +97,6 @@ def test_a_higher_threshold_never_finds_more(blob_dataset):
     high = evaluate(model, blob_dataset, threshold=0.6)["micro"]
     assert low["detected_true"] >= high["detected_true"]
     assert low["false_alarms"] >= high["false_alarms"]
-
-
-def test_the_network_with_the_greater_validation_f1_is_chosen(blob_dataset, monkeypatch):
-    frames = [(blob_dataset, frame) for frame in blob_dataset.frames("val")]
-    truths = [frame_truth(*item) for item in frames]
-    scenes = [Scene(30.0, 10.0, 0.0, "val")] * len(frames)
-
-    def answered(model, datasets, split, progress):
-        """The first model finds every crater of the validation frames, the second half of them."""
-        assert split == "val"
-        step = {b"good": 1, b"poor": 2}[model]
-        found = []
-        for truth in truths:
-            kept = [part[::step] for part in (truth.u_px, truth.v_px, truth.diameter_px, truth.diameter_m)]
-            found.append(FrameDetections(*kept, np.full(kept[0].size, 0.8), np.ones(kept[0].size)))
-        return Scored(frames, truths, found, scenes, Thresholds(0.4, 0.4, 0.4))
-
-    class Model(bytes):
-        sha256 = "0"
-
-    monkeypatch.setattr(choice, "open_for_evaluation", Model)
-    monkeypatch.setattr(choice, "run", answered)
-    document = choose({"a": b"poor", "b": b"good"}, [blob_dataset])
-    assert document["chosen"] == "b"
-    assert document["models"]["b"]["f1"] == 1.0 and document["models"]["a"]["precision"] == 1.0
-    assert document["models"]["a"]["frames"] == len(frames)
-    assert "chosen: b" in format_choice(document)
 
 
 def test_real_terrain_that_fixed_thresholds_or_weights_counts_as_seen(blob_dataset):
