@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reports.document import Block, Column, Document, Facts, Heading, Picture, Table
-from reports.figures import dataset
+from reports.figures import training
 from reports.figures.detector import OCTANTS, octant_bias
 from reports.sections.detection import detector_blocks, gallery_picture
 from reports.sections.opening import (
@@ -64,7 +64,7 @@ def detector_document(report: DetectorReport) -> Document:
                 "Quantities over the training run.",
                 "Training curves: " + ", ".join(c.name for c in curves),
                 0.78 + rows * 1.25 + (rows - 1) * 0.75,
-                lambda c: dataset.draw_training(c, curves),
+                lambda c: training.draw_training(c, curves),
             ),
         ]
     blocks.append(Heading("Cost on board"))
@@ -116,7 +116,7 @@ def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
         ),
     )
     picture = Picture(
-        key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: dataset.draw_named_scores(c, scores)
+        key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: training.draw_named_scores(c, scores)
     )
     return [picture, table]
 

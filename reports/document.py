@@ -52,10 +52,18 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """Numbers of the first page and their evidence level; None if they need no evidence."""
+    """Numbers of the first page and their evidence level, empty if it is not stated."""
 
     figures: tuple[HeadlineFigure, ...]
-    evidence_level: str | None
+    evidence_level: str
+
+    @property
+    def ladder(self) -> str:
+        """The level of the figures, and what the levels mean."""
+        stated = "No evidence level was stated for these figures."
+        if self.evidence_level:
+            stated = f"These figures are at {evidence_text(self.evidence_level)}."
+        return f"{stated} Evidence levels: {evidence_ladder()}."
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,6 @@ from reports.document import (
     Verdict,
     cells,
     evidence_label,
-    evidence_ladder,
     evidence_number,
     evidence_text,
 )
@@ -123,24 +122,12 @@ def _headline(block: Headline) -> str:
             value, words = "not available", True
         unit = f"<small>{escape(figure.unit)}</small>" if figure.unit and not words else ""
         note = f'<dd class="note">{escape(figure.note)}</dd>' if figure.note else ""
-        level = (
-            "" if block.evidence_level is None else _evidence(figure.evidence_level or block.evidence_level)
-        )
+        level = _evidence(figure.evidence_level or block.evidence_level)
         items.append(
             f"<div><dt>{escape(figure.label)}</dt>"
             f'<dd class="number{" words" if words else ""}">{escape(value)}{unit}</dd>{note}{level}</div>'
         )
-    return f'\n<dl class="headline">{"".join(items)}</dl>{_ladder(block.evidence_level)}'
-
-
-def _ladder(level: str | None) -> str:
-    if level is None:
-        return ""
-    ladder = evidence_ladder()
-    stands = "No evidence level was stated for these figures."
-    if level:
-        stands = f"These figures are at {evidence_text(level)}."
-    return f'<p class="ladder">{escape(stands)} Evidence levels: {escape(ladder)}.</p>'
+    return f'\n<dl class="headline">{"".join(items)}</dl><p class="ladder">{escape(block.ladder)}</p>'
 
 
 def _evidence(level: str) -> str:

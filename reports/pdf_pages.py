@@ -35,8 +35,6 @@ from reports.document import (
     Verdict,
     cells,
     evidence_label,
-    evidence_ladder,
-    evidence_text,
 )
 from reports.drawings import Drawings
 from reports.figures.theme import LIGHT, color
@@ -180,10 +178,7 @@ def _headline(block: Headline) -> dict[str, Any]:
     for figure in block.figures:
         value = headline_text(figure.value)
         value = "not available" if value == NOT_A_VALUE else value
-        level = ""
-        if block.evidence_level is not None:
-            label = evidence_label(figure.evidence_level or block.evidence_level)
-            level = f"level {label}" if label else "level not stated"
+        label = evidence_label(figure.evidence_level or block.evidence_level)
         figures.append(
             {
                 "label": figure.label,
@@ -191,16 +186,10 @@ def _headline(block: Headline) -> dict[str, Any]:
                 "words": len(value) > 9,
                 "unit": figure.unit,
                 "note": figure.note,
-                "level": level,
+                "level": f"level {label}" if label else "level not stated",
             }
         )
-    ladder = ""
-    if block.evidence_level is not None:
-        stated = "No evidence level was stated for these figures."
-        if block.evidence_level:
-            stated = f"These figures are at {evidence_text(block.evidence_level)}."
-        ladder = f"{stated} Evidence levels: {evidence_ladder()}."
-    return {"kind": "headline", "figures": figures, "ladder": ladder}
+    return {"kind": "headline", "figures": figures, "ladder": block.ladder}
 
 
 def _table(block: Table, number: int) -> dict[str, Any]:

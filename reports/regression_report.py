@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from reports.arrays import FloatArray
-from reports.campaign_report import solution_table, solutions
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
-from reports.figures import campaign
+from reports.figures.regression import draw_paired
+from reports.figures.theme import series_styles
+from reports.sections.common import role_of
 from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.statistics import quantiles
-from reports.text import count_text, significant_text
-from reports.values import CampaignPass, RegressionGate, RegressionReport
+from reports.text import count_text, number_text, significant_text
+from reports.values import RegressionGate, RegressionPass, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "not judged", "pass")
 _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "not judged": ""}
@@ -108,24 +111,21 @@ def _changed(report: RegressionReport) -> Block:
     )
 
 
-def _paired(report: RegressionReport) -> tuple[list[CampaignPass], list[CampaignPass]]:
+def _paired(report: RegressionReport) -> tuple[list[RegressionPass], list[RegressionPass]]:
     """Passes run with both builds, in the same order."""
     after = {p.pass_id: p for p in report.candidate_passes}
     both = [p for p in sorted(report.baseline_passes, key=lambda p: p.start_utc_ns) if p.pass_id in after]
     return both, [after[p.pass_id] for p in both]
 
 
-def _comparison(before: list[CampaignPass], after: list[CampaignPass]) -> list[Block]:
-    names, styles = solutions([*before, *after])
-    flown = sorted(
-        (n for n in names if not any(n in p.baselines for p in before)),
-        key=lambda n: quantiles(campaign.statistic(before, n, "median_3d_m"), (0.5,))[0],
-    )
+def _comparison(before: list[RegressionPass], after: list[RegressionPass]) -> list[Block]:
+    names = list(dict.fromkeys(name for one in (*before, *after) for name in one.navigation))
+    flown = sorted(names, key=lambda n: quantiles(_statistic(before, n, "median_3d_m"), (0.5,))[0])
     pairs: list[tuple[str, FloatArray, FloatArray, bool]] = [
         (
             f"median error, {name}",
-            campaign.statistic(before, name, "median_3d_m"),
-            campaign.statistic(after, name, "median_3d_m"),
+            _statistic(before, name, "median_3d_m"),
+            _statistic(after, name, "median_3d_m"),
             True,
         )
         for name in flown[:2]
@@ -147,9 +147,52 @@ def _comparison(before: list[CampaignPass], after: list[CampaignPass]) -> list[B
                 f"Passes that became worse: {'; '.join(worse)}.",
                 "Candidate against baseline for each pass. Worse: " + "; ".join(worse),
                 3.3,
-                lambda c: campaign.draw_paired(c, pairs),
+                lambda c: draw_paired(c, pairs),
             )
         )
-    blocks.append(solution_table(before, names, styles, ", baseline"))
-    blocks.append(solution_table(after, names, styles, ", candidate"))
+    blocks.append(_solutions(before, names, "baseline"))
+    blocks.append(_solutions(after, names, "candidate"))
     return blocks
+
+
+def _solutions(passes: Sequence[RegressionPass], names: Sequence[str], build: str) -> Table:
+    """Figures of every solution over the passes."""
+    styles = series_styles([(name, "estimate") for name in names])
+    rows: list[tuple[Cell | str, ...]] = []
+    for name in names:
+        median = _statistic(passes, name, "median_3d_m")
+        low, middle, high = quantiles(median, (0.0, 0.5, 1.0))
+        rows.append(
+            (
+                Cell(name, swatch=role_of(styles[name][0]), strong=True),
+                count_text(int(np.isfinite(median).sum())),
+                number_text(low, 0),
+                number_text(middle, 0),
+                number_text(high, 0),
+                number_text(quantiles(_statistic(passes, name, "p95_3d_m"), (0.5,))[0], 0),
+                number_text(quantiles(_statistic(passes, name, "max_3d_m"), (1.0,))[0], 0),
+                number_text(quantiles(_statistic(passes, name, "drift_percent"), (0.5,))[0], 3),
+            )
+        )
+    return Table(
+        f"3-D position error over the passes, {build}: each pass counts once.",
+        (
+            Column("solution", numeric=False),
+            Column("passes"),
+            Column("best", group="median of a pass, m"),
+            Column("median", group="median of a pass, m"),
+            Column("worst", group="median of a pass, m"),
+            Column("median of 95 %", unit="m"),
+            Column("largest error", unit="m"),
+            Column("drift", unit="% of path"),
+        ),
+        tuple(rows),
+    )
+
+
+def _statistic(passes: Sequence[RegressionPass], name: str, field: str) -> FloatArray:
+    """Return one statistic of one solution over the passes, NaN where a pass does not have it."""
+    return np.array(
+        [float(getattr(p.navigation[name], field)) if name in p.navigation else np.nan for p in passes],
+        dtype=np.float64,
+    )

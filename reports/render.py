@@ -8,8 +8,6 @@ from reports.errors import UnknownReportKind
 from reports.json_form import to_json
 from reports.paper_values import PaperReport
 from reports.values import (
-    CampaignReport,
-    DatasetReport,
     DetectorReport,
     MonthlyReportValue,
     PassReport,
@@ -19,7 +17,7 @@ from reports.values import (
 if TYPE_CHECKING:
     from reports.document import Document
 
-__all__ = ["render_html", "render_pages", "render_pdf", "to_json"]
+__all__ = ["render_html", "render_pages", "to_json"]
 
 
 def render_html(report: Any) -> str:
@@ -35,21 +33,6 @@ def render_html(report: Any) -> str:
     from reports.html_page import html_page
 
     return html_page(_document(report))
-
-
-def render_pdf(report: Any) -> bytes:
-    """The same report as the octets of an A4 PDF; the same value gives the same octets.
-
-    Raises
-    ------
-    UnknownReportKind
-        when the value is none of those of `reports.values`
-    InconsistentReport
-        when parts of the value do not fit together
-    """
-    from reports.pdf_pages import pdf_pages
-
-    return pdf_pages(_document(report))
 
 
 def render_pages(report: Any) -> tuple[str, bytes]:
@@ -76,10 +59,6 @@ def _document(report: Any) -> Document:
             from reports.pass_report import pass_document
 
             return pass_document(report)
-        case CampaignReport():
-            from reports.campaign_report import campaign_document
-
-            return campaign_document(report)
         case RegressionReport():
             from reports.regression_report import regression_document
 
@@ -92,10 +71,6 @@ def _document(report: Any) -> Document:
             from reports.monthly_report import monthly_document
 
             return monthly_document(report)
-        case DatasetReport():
-            from reports.dataset_report import dataset_document
-
-            return dataset_document(report)
         case PaperReport():
             from reports.paper_report import paper_document
 

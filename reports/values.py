@@ -555,34 +555,20 @@ class PassReport(ReportCommon):
 
 
 @dataclass(frozen=True, slots=True)
-class CampaignPass:
-    """One pass of a campaign: what its own report found, by name of the estimator where there are several."""
+class RegressionPass:
+    """One pass with one build; statistics by name of the estimator."""
 
     pass_id: str
     start_utc_ns: int
     build: str = ""
     light: str = ""
-    altitude_km: float = float("nan")
-    sun_elevation_deg: float = float("nan")
     frames_expected: int | None = None
     frames_processed: int | None = None
     packets: int | None = None
-    packets_lost: int | None = None
     precision: float = float("nan")
     recall: float = float("nan")
     localisation_px: float = float("nan")
     navigation: Mapping[str, NavigationStatistics] = field(default_factory=dict)
-    anchor_reads_after_start: Mapping[str, int] = field(default_factory=dict)
-    baselines: tuple[str, ...] = ()
-    verdict_level: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class CampaignReport(ReportCommon):
-    """Comparison of many passes: trend, and by build, altitude and illumination."""
-
-    campaign_id: str
-    passes: tuple[CampaignPass, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -667,59 +653,6 @@ class DetectorReport(ReportCommon):
 
 
 @dataclass(frozen=True, slots=True)
-class ClassCount:
-    """Labels of one size class in a data set, by part ("train", "val", "test")."""
-
-    size_class: int
-    label: str
-    by_part: Mapping[str, int]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Histogram:
-    """Counts (n,) between edges (n+1,) of one quantity."""
-
-    name: str
-    unit: str
-    edges: FloatArray
-    counts: IntArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FramePlaces:
-    """Where the frames of a data set lie: arrays (n,) and the part of each."""
-
-    latitude_deg: FloatArray
-    longitude_deg: FloatArray
-    part: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class IntegrityCheck:
-    """One check of a data set: how many things were looked at, how many failed."""
-
-    name: str
-    looked_at: int
-    failed: int
-    detail: str = ""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DatasetReport(ReportCommon):
-    """A data set: how much, of what, from where, in which light, and whether it is whole."""
-
-    dataset_id: str
-    frames_by_part: Mapping[str, int] = field(default_factory=dict)
-    classes: tuple[ClassCount, ...] = ()
-    histograms: tuple[Histogram, ...] = ()
-    places: FramePlaces | None = None
-    terrain: TerrainMap | None = None
-    integrity: tuple[IntegrityCheck, ...] = ()
-    gallery: tuple[GalleryFrame, ...] = ()
-    configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
 class RegressionGate:
     """One requirement on a candidate build.
 
@@ -770,8 +703,8 @@ class RegressionReport(ReportCommon):
     candidate: str = ""
     baseline: str = ""
     gates: tuple[RegressionGate, ...] = ()
-    candidate_passes: tuple[CampaignPass, ...] = ()
-    baseline_passes: tuple[CampaignPass, ...] = ()
+    candidate_passes: tuple[RegressionPass, ...] = ()
+    baseline_passes: tuple[RegressionPass, ...] = ()
     changed_frames: tuple[ChangedFrame, ...] = ()
 
 

@@ -31,12 +31,12 @@ from ground_service.regression.outcome import (
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 from lunar.timescales import format_utc
 from reports.values import (
-    CampaignPass,
     ChangedFrame,
     GalleryFrame,
     HeadlineFigure,
     NavigationStatistics,
     RegressionGate,
+    RegressionPass,
     RegressionReport,
 )
 
@@ -216,8 +216,8 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         candidate=outcome.candidate.title,
         baseline=outcome.baseline.title,
         gates=tuple(_report_gate(gate) for gate in outcome.gates),
-        candidate_passes=tuple(_campaign_pass(one, "candidate") for one in judged),
-        baseline_passes=tuple(_campaign_pass(one, "baseline") for one in judged),
+        candidate_passes=tuple(_regression_pass(one, "candidate") for one in judged),
+        baseline_passes=tuple(_regression_pass(one, "baseline") for one in judged),
         changed_frames=tuple(changed_frames(ground, judged)),
         verdict=_verdict_text(outcome, troubled),
         verdict_level=outcome.verdict,
@@ -400,12 +400,12 @@ def _report_gate(gate: Gate) -> RegressionGate:
     )
 
 
-def _campaign_pass(one: PassVerdict, side: str) -> CampaignPass:
+def _regression_pass(one: PassVerdict, side: str) -> RegressionPass:
     assert one.context and one.baseline_read and one.candidate_read
     frames = (one.candidate_read if side == "candidate" else one.baseline_read).frames
     hits, expected = float(frames.hits.sum()), float(frames.expected.sum())
     found = hits + float(frames.alarms.sum())
-    return CampaignPass(
+    return RegressionPass(
         pass_id=one.name,
         start_utc_ns=int(one.context.frame_utc_ns[0]),
         build=side,

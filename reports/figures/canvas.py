@@ -315,8 +315,3 @@ def spread(wanted: list[float], gap: float) -> list[float]:
         first = centre - gap * (count - 1) / 2
         heights.extend(first + gap * i for i in range(int(count)))
     return heights
-
-
-def bare(axes: Axes) -> None:
-    """Take away frame, ticks and grid."""
-    axes.set_axis_off()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from reports.document import (
     Absent,
@@ -19,64 +19,35 @@ from reports.document import (
 )
 from reports.sections.common import is_hash, setting_text
 from reports.text import hash_text
-from reports.values import HeadlineFigure
+from reports.values import ReportCommon
 
 
-class Judged(Protocol):
-    """What all report values share."""
-
-    @property
-    def verdict(self) -> str: ...
-    @property
-    def verdict_level(self) -> str: ...
-    @property
-    def generated_for(self) -> str: ...
-    @property
-    def created_utc(self) -> str: ...
-    @property
-    def evidence_level(self) -> str: ...
-    @property
-    def headline(self) -> tuple[HeadlineFigure, ...]: ...
-    @property
-    def provenance(self) -> Mapping[str, str]: ...
-    @property
-    def data_sources(self) -> tuple[str, ...]: ...
-    @property
-    def remarks(self) -> tuple[str, ...]: ...
-    @property
-    def not_available(self) -> Mapping[str, str]: ...
-
-
-def about(report: Judged, *facts: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+def about(report: ReportCommon, *facts: tuple[str, str]) -> tuple[tuple[str, str], ...]:
     """Return the known facts for the header."""
     known = (*facts, ("for", report.generated_for), ("made", report.created_utc))
     return tuple((name, value) for name, value in known if value)
 
 
-def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
-    """Return verdict and figures; figures that are only counts have no evidence level unless one is given."""
+def judgement(report: ReportCommon) -> list[Block]:
+    """Return verdict and figures."""
     blocks: list[Block] = []
     if report.verdict:
         blocks.append(Verdict(report.verdict[0].upper() + report.verdict[1:], report.verdict_level))
     else:
         blocks.append(absent(report, "verdict", "Verdict", "there is no verdict"))
     if report.headline:
-        blocks.append(
-            Headline(
-                report.headline, None if counts_only and not report.evidence_level else report.evidence_level
-            )
-        )
+        blocks.append(Headline(report.headline, report.evidence_level))
     else:
         blocks.append(absent(report, "headline", "Five figures", "no figure was computed"))
     return blocks
 
 
-def absent(report: Judged, field: str, what: str, usual: str) -> Absent:
+def absent(report: ReportCommon, field: str, what: str, usual: str) -> Absent:
     """Return the block for an item that is not available."""
     return Absent(what, report.not_available.get(field) or usual)
 
 
-def missing_and_remarks(report: Judged) -> list[Block]:
+def missing_and_remarks(report: ReportCommon) -> list[Block]:
     """Return the list of missing items and the remarks."""
     blocks: list[Block] = []
     if report.not_available:
@@ -89,7 +60,7 @@ def missing_and_remarks(report: Judged) -> list[Block]:
     return blocks
 
 
-def provenance_and_data(report: Judged) -> list[Block]:
+def provenance_and_data(report: ReportCommon) -> list[Block]:
     """Return the provenance of the figures and their data sources."""
     blocks: list[Block] = [Heading("Provenance and data")]
     if evidence_number(report.evidence_level) is not None:

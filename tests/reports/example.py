@@ -16,23 +16,16 @@ from reports.values import (
     ApidAccounting,
     BinScore,
     CalibrationBin,
-    CampaignPass,
-    CampaignReport,
-    ClassCount,
     ClassScore,
     CompletenessSeries,
     CraterMap,
-    DatasetReport,
     DetectorReport,
     DetectorScore,
     DriftSample,
     FrameAccounting,
-    FramePlaces,
     GalleryFrame,
     HeadlineFigure,
-    Histogram,
     HousekeepingParameter,
-    IntegrityCheck,
     NamedScore,
     NavigationSeries,
     NavigationStatistics,
@@ -43,6 +36,7 @@ from reports.values import (
     PrecisionRecallCurve,
     ReceptionQuality,
     RegressionGate,
+    RegressionPass,
     RegressionReport,
     ResidualSeries,
     ScoreGroup,
@@ -603,21 +597,18 @@ def pass_report(
     )
 
 
-def _campaign_pass(i: int, rng: np.random.Generator, build: str, gain: float = 1.0) -> CampaignPass:
+def _regression_pass(i: int, rng: np.random.Generator, build: str, gain: float = 1.0) -> RegressionPass:
     drift = float(rng.normal(1.6, 0.25))
     scale = gain * float(rng.lognormal(0.0, 0.18))
     lost = int(rng.poisson(0.4)) * int(rng.integers(1, 14))
-    return CampaignPass(
+    return RegressionPass(
         pass_id=f"W-{i:04d}",
         start_utc_ns=START_UTC_NS + i * 6_672_000_000_000,
         build=build,
         light="real" if i % 3 else "paper",
-        altitude_km=float(rng.uniform(19.0, 44.0)),
-        sun_elevation_deg=float(rng.uniform(5.0, 40.0)),
         frames_expected=148,
         frames_processed=148 - int(rng.poisson(0.3)),
         packets=1_200 - lost,
-        packets_lost=lost,
         precision=float(np.clip(rng.normal(0.84, 0.03), 0, 1)),
         recall=float(np.clip(rng.normal(0.68, 0.05), 0, 1)),
         localisation_px=float(rng.normal(1.4, 0.15)),
@@ -629,32 +620,6 @@ def _campaign_pass(i: int, rng: np.random.Generator, build: str, gain: float = 1
             "anchored": NavigationStatistics(41 * scale, 60 * scale, 130 * scale, 180, 240, 0.002),
             "propagate only, degree 50": NavigationStatistics(45 * scale, 60, 90 * scale, 100, 110, 0.003),
         },
-        anchor_reads_after_start={"paper": 0, "spherical": 0, "anchored": 0},
-        baselines=("propagate only, degree 50",),
-        verdict_level="met",
-    )
-
-
-def campaign_report(seed: int = 11, count: int = 40) -> CampaignReport:
-    """A campaign of many passes with two builds."""
-    rng = np.random.default_rng(seed)
-    return CampaignReport(
-        title="Campaign August 2029",
-        campaign_id="C-2029-08",
-        passes=tuple(_campaign_pass(i, rng, "0.2.0" if i > count // 2 else "0.1.0") for i in range(count)),
-        verdict="The catalogue filter held under 60 m in every pass; nothing trends.",
-        verdict_level="met",
-        evidence_level="3",
-        headline=(
-            HeadlineFigure("Median over passes, anchored", 41.0, "m"),
-            HeadlineFigure("Worst pass, anchored", 58.0, "m", "95 %: 190 m"),
-            HeadlineFigure("Anchor reads after start", 0, "", "by the filter"),
-            HeadlineFigure("Median recall", 0.68, "", "all classes"),
-            HeadlineFigure("Packets lost", 0.11, "%"),
-        ),
-        provenance={"Builds": "0.1.0, 0.2.0", "Seed": str(seed)},
-        data_sources=("LROC GLD100", "LU1319381"),
-        remarks=("Passes 20 and earlier were flown with build 0.1.0.",),
     )
 
 
@@ -671,8 +636,8 @@ def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
             RegressionGate("95 % error, anchored", 130.0, 121.0, 143.0, "pass", "m", "", 0.1, 0.09, 3_552),
             RegressionGate("recall, class 0", 0.71, 0.66, 0.69, "fail", "", "W-0007", 0.02, 0.015, 148),
         ),
-        candidate_passes=tuple(_campaign_pass(i, new, "0.2.0", 0.85) for i in range(count)),
-        baseline_passes=tuple(_campaign_pass(i, old, "0.1.0") for i in range(count)),
+        candidate_passes=tuple(_regression_pass(i, new, "0.2.0", 0.85) for i in range(count)),
+        baseline_passes=tuple(_regression_pass(i, old, "0.1.0") for i in range(count)),
         verdict="One gate failed: recall of the smallest class in W-0007 fell below its limit.",
         verdict_level="fail",
         evidence_level="3",
@@ -745,53 +710,4 @@ def detector_report(seed: int = 13) -> DetectorReport:
         provenance={"Model SHA-256": "7f0c" * 16, "Data set": "D-3"},
         data_sources=("procedural Moon, seed 3",),
         configuration={"training": {"epochs": 40, "crop_px": 384, "batch": 8, "learning_rate": 0.0025}},
-    )
-
-
-def dataset_report(seed: int = 14) -> DatasetReport:
-    """A data set with everything that can be said of it."""
-    rng = np.random.default_rng(seed)
-    n = 3_000
-    latitude = rng.uniform(-60, 60, n)
-    part = tuple(
-        "test" if -20 < v < -8 else ("val" if r < 0.16 else "train")
-        for v, r in zip(latitude, rng.random(n), strict=True)
-    )
-    quantities = (
-        ("altitude", "km", rng.normal(30.0, 6.0, n)),
-        ("Sun elevation", "degrees", rng.uniform(5, 15, n)),
-        ("Sun azimuth", "degrees", rng.uniform(-45, 45, n)),
-        ("labels in a frame", "", rng.poisson(22, n).astype(np.float64)),
-        ("diameter", "px", rng.pareto(1.8, n) * 12 + 8),
-    )
-    histograms = []
-    for name, unit, values in quantities:
-        counts, edges = np.histogram(values, 24, (float(values.min()), float(np.quantile(values, 0.995))))
-        histograms.append(Histogram(name, unit, edges, counts.astype(np.int64)))
-    return DatasetReport(
-        title="Procedural Moon, 3,000 frames",
-        dataset_id="D-3",
-        frames_by_part={p: part.count(p) for p in ("train", "val", "test")},
-        classes=(
-            ClassCount(0, "5–10 km", {"train": 38_000, "val": 7_100, "test": 4_900}),
-            ClassCount(1, "10–15 km", {"train": 8_800, "val": 1_700, "test": 1_100}),
-            ClassCount(2, "15–30 km", {"train": 5_400, "val": 1_000, "test": 690}),
-        ),
-        histograms=tuple(histograms),
-        places=FramePlaces(latitude, rng.uniform(0, 360, n), part),
-        integrity=(
-            IntegrityCheck("images open and have their size", n, 0),
-            IntegrityCheck("hashes", n, 1, "frame 1204"),
-            IntegrityCheck("labels inside their frames", 68_690, 0),
-        ),
-        gallery=tuple(gallery_frame(seed + 3 * i, i) for i in range(3)),
-        verdict="Whole but for one frame; classes follow the paper's shares within 2 %.",
-        verdict_level="partly met",
-        headline=(
-            HeadlineFigure("Frames", n),
-            HeadlineFigure("Labels", 68_690),
-            HeadlineFigure("Checks failed", 1),
-        ),
-        provenance={"Seed": str(seed)},
-        data_sources=("procedural Moon, seed 3",),
     )

@@ -98,7 +98,7 @@ def test_a_quantity_with_one_bin_is_a_sentence_and_no_plot() -> None:
 
 
 def test_no_column_is_without_a_name() -> None:
-    for kind in ("pass", "campaign", "regression", "detector", "dataset"):
+    for kind in ("pass", "regression", "detector"):
         text = render_html(getattr(example, f"{kind}_report")())
         heads = [part.split("</thead>")[0] for part in text.split("<thead>")[1:]]
         assert heads

@@ -1,4 +1,4 @@
-"""Campaign, regression, detector and data-set reports: the same promises as the report of a pass."""
+"""Regression and detector reports: the same promises as the report of a pass."""
 
 import json
 from dataclasses import replace
@@ -7,10 +7,8 @@ from typing import Any
 import pytest
 
 from reports.json_form import to_json
-from reports.render import render_html, render_pdf
+from reports.render import render_html, render_pages
 from reports.values import (
-    CampaignReport,
-    DatasetReport,
     DetectorReport,
     DetectorScore,
     HeadlineFigure,
@@ -19,7 +17,7 @@ from reports.values import (
 from tests.reports import example
 from tests.reports.page import Page
 
-KINDS = ("campaign", "regression", "detector", "dataset")
+KINDS = ("regression", "detector")
 
 
 def _report(kind: str) -> Any:
@@ -53,47 +51,23 @@ def test_the_verdict_and_the_figures_come_first(kind: str, text: str) -> None:
 
 def test_the_pdf_repeats_and_the_json_names_its_kind(kind: str) -> None:
     report = _report(kind)
-    assert render_pdf(report) == render_pdf(_report(kind))
+    assert render_pages(report)[1] == render_pages(_report(kind))[1]
     assert json.loads(to_json(report))["kind"] == type(report).__name__
 
 
 @pytest.mark.parametrize(
     "empty",
     [
-        CampaignReport("Empty", "c0"),
         RegressionReport("Empty", "r0"),
         DetectorReport("Empty", "m0"),
         DetectorReport("Empty", "m1", score=DetectorScore()),
-        DatasetReport("Empty", "d0"),
     ],
 )
 def test_a_report_of_nothing_says_what_is_missing(empty: Any) -> None:
     page = Page(render_html(empty))
     assert page.left_open == []
     assert page.text.count("not available: ") >= 4
-    assert render_pdf(empty).startswith(b"%PDF-")
-
-
-def test_a_campaign_gives_every_pass_its_row_and_counts_what_was_lost() -> None:
-    report = example.campaign_report(count=12)
-    words = Page(render_html(report)).text
-    assert all(p.pass_id in words for p in report.passes)
-    lost = sum(p.packets_lost or 0 for p in report.passes)
-    assert f"{lost} of" in words
-
-
-def test_a_campaign_of_one_pass_without_navigation_is_reported() -> None:
-    one = example.campaign_report(count=1)
-    bare = CampaignReport("One", "c1", passes=tuple(type(p)(p.pass_id, p.start_utc_ns) for p in one.passes))
-    words = Page(render_html(bare)).text
-    assert "no pass has a navigation solution" in words and "no pass has a score" in words
-
-
-@pytest.mark.slow
-def test_a_campaign_of_a_thousand_passes_stays_small_and_says_what_it_leaves_out() -> None:
-    text = render_html(example.campaign_report(count=1_000))
-    assert len(text.encode()) < 4_000_000
-    assert "600 further passes" in Page(text).text
+    assert render_pages(empty)[1].startswith(b"%PDF-")
 
 
 def test_failed_gates_stand_first() -> None:
@@ -101,21 +75,6 @@ def test_failed_gates_stand_first() -> None:
     table = words[words.index("Gates, failed gates first.") :]
     assert table.index("recall, class 0") < table.index("median error, anchored")
     assert "gates 1 failed, 0 inconclusive, 2 passed" in words
-
-
-def test_a_data_set_stands_beside_the_counts_printed_in_the_paper() -> None:
-    # LINNA paper, Section V-B: 51,924 images; 956,110, 221,860 and 135,098 labels; 72.8, 16.9 and 10.3 %.
-    words = Page(render_html(example.dataset_report())).text
-    for figure in ("51 924", "956 110", "221 860", "135 098", "72.8 %", "16.9 %", "10.3 %"):
-        assert figure in words
-
-
-def test_counts_need_no_evidence_level_but_accuracies_do() -> None:
-    figures = (HeadlineFigure("Frames", 3),)
-    assert "level" not in Page(render_html(DatasetReport("D", "d", headline=figures))).text.lower()
-    assert (
-        "No evidence level was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text
-    )
 
 
 def test_the_bias_of_every_octant_met_is_in_the_table() -> None:
@@ -149,3 +108,10 @@ def test_a_verdict_is_named_by_its_level_and_has_its_colour(level: str, role: st
     assert f'<div class="verdict {role}"><p class="word">{heading}</p>' in text
     if role:
         assert f".verdict.{role} .word{{color:" in text
+
+
+def test_accuracies_without_an_evidence_level_are_marked() -> None:
+    figures = (HeadlineFigure("Frames", 3),)
+    assert (
+        "No evidence level was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text
+    )

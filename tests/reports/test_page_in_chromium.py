@@ -125,7 +125,7 @@ def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser: Ta
     assert ground == "rgb(255, 255, 255)"
 
 
-@pytest.mark.parametrize("kind", ["campaign", "regression", "detector", "dataset"])
+@pytest.mark.parametrize("kind", ["regression", "detector"])
 def test_the_other_reports_are_as_silent_and_as_legible(browser: Tab, kind: str, path: Path) -> None:
     other = path.with_name(f"{kind}.html")
     other.write_text(render_html(getattr(example, f"{kind}_report")()), encoding="utf-8")
@@ -170,7 +170,7 @@ _GEOMETRY = """
 """
 
 
-@pytest.mark.parametrize("kind", ["pass", "campaign", "regression", "detector", "dataset"])
+@pytest.mark.parametrize("kind", ["pass", "regression", "detector"])
 def test_nothing_is_cut_and_every_number_can_be_read(browser: Tab, kind: str, path: Path) -> None:
     """At 1,280 px every table is whole; at 390 px tables and figures scroll in their frames, the page does not."""
     other = path.with_name(f"{kind}-geometry.html")

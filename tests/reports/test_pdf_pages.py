@@ -11,7 +11,7 @@ from pypdf import PdfReader
 
 from reports.document import Column, Document, Facts, Heading, Listing, Paragraph, Table
 from reports.pdf_pages import _typeset, pdf_pages
-from reports.render import render_html, render_pages, render_pdf
+from reports.render import render_html, render_pages
 from reports.values import PassReport
 from tests.reports import example
 
@@ -25,7 +25,7 @@ def small() -> PassReport:
 
 @pytest.fixture(scope="module")
 def octets(small: PassReport) -> bytes:
-    return render_pdf(small)
+    return render_pages(small)[1]
 
 
 def pages_of(octets: bytes) -> list[str]:
@@ -46,7 +46,7 @@ def test_it_is_a_pdf_of_numbered_a4_pages(octets: bytes) -> None:
 
 
 def test_the_same_value_gives_the_same_octets(octets: bytes) -> None:
-    same = render_pdf(example.pass_report(hours=0.2, gallery=1, worst=0)) == octets
+    same = render_pages(example.pass_report(hours=0.2, gallery=1, worst=0))[1] == octets
     assert same  # pytest would compare long octets line by line
 
 
@@ -69,7 +69,7 @@ def test_all_figures_and_tables_of_the_page_are_in_it(small: PassReport, octets:
 
 
 def test_text_stays_inside_the_margins(whole_pass: PassReport) -> None:
-    for page in PdfReader(io.BytesIO(render_pdf(whole_pass))).pages:
+    for page in PdfReader(io.BytesIO(render_pages(whole_pass)[1])).pages:
         places: list[tuple[float, float]] = []
 
         def note(text: str, cm: list[float], tm: list[float], *_: object, places: list = places) -> None:
@@ -135,7 +135,7 @@ def test_awkward_text_is_printed_and_not_interpreted() -> None:
 
 
 def test_a_pass_with_nothing_in_it_is_one_honest_document() -> None:
-    text = "".join(pages_of(render_pdf(PassReport(title="Nothing", pass_id="p0"))))
+    text = "".join(pages_of(render_pages(PassReport(title="Nothing", pass_id="p0"))[1]))
     assert "not available" in text
 
 

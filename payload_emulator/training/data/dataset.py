@@ -410,11 +410,6 @@ def write_picture(path: Path, image: NDArray[Any]) -> str:
     return write_whole(path, octets.tobytes())
 
 
-def write_gray(path: Path, image: NDArray[Any]) -> str:
-    """Write a gray frame (H, W); its SHA-256 comes back."""
-    return write_picture(path, image)
-
-
 def write_frame(path: Path, image: NDArray[Any]) -> str:
     """Write a frame, gray (H, W) or RGB (H, W, 3); its SHA-256 comes back."""
     return write_picture(path, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))

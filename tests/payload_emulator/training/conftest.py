@@ -44,7 +44,7 @@ def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int
             far = np.array([i == 0 or np.hypot(u[:i] - u[i], v[:i] - v[i]).min() > 60 for i in range(n)])
             u, v = u[far], v[far]
             d = rng.uniform(26.0, 50.0, u.size)
-            store.write_gray(folder / "images" / f"{number:06d}.png", draw_blobs(rng, u, v, d))
+            store.write_frame(folder / "images" / f"{number:06d}.png", draw_blobs(rng, u, v, d))
             store.write_json(folder / "metadata" / f"{number:06d}.json", {"frame": number})
             rows.append(number)
             craters.append(

@@ -117,7 +117,7 @@ def test_a_sheet_shows_rims_in_the_papers_colours(blob_dataset):
 
 def test_sixteen_bits_are_stored_and_read_as_eight(tmp_path):
     deep = (np.arange(64 * 64, dtype=np.uint16) * 16).reshape(64, 64)
-    store.write_gray(tmp_path / "a.png", deep)
+    store.write_frame(tmp_path / "a.png", deep)
     import cv2
 
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), deep)
