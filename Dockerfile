@@ -17,7 +17,8 @@ RUN python -m venv /opt/linna
 WORKDIR /src
 COPY requirements/hashed requirements
 RUN /opt/linna/bin/pip install --require-hashes -r requirements/runtime.txt -r requirements/postgres.txt \
-    -r requirements/parquet.txt -r requirements/traces.txt -r requirements/oidc.txt -r requirements/objects.txt
+    -r requirements/parquet.txt -r requirements/traces.txt -r requirements/oidc.txt -r requirements/objects.txt \
+    -r requirements/terrain.txt -r requirements/exports.txt
 COPY pyproject.toml README.md LICENSE ./
 COPY kernels kernels
 COPY lunar lunar

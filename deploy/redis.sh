@@ -13,6 +13,6 @@ password="$(password broker_password)"
 hash="$(printf '%s' "$password" | sha256sum | cut -d ' ' -f 1)"
 users="${LINNA_REDIS_USERS:-/tmp/users.acl}"
 umask 077
-rights='-@all +@read +@write +@connection +@transaction +@pubsub +@blocking -@dangerous +info +time +eval +evalsha +script|load'
+rights='-@all +@read +@write +@connection +@transaction +@pubsub +@blocking -@dangerous +info +time +eval +evalsha +script|load +script|exists'
 printf 'user default off\nuser linna on #%s ~* &* %s\n' "$hash" "$rights" > "$users"
 exec redis-server --aclfile "$users" --appendonly yes "$@"

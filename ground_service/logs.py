@@ -12,6 +12,21 @@ from ground_service.tracing import trace_id
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
 
 
+class LineFormatter(logging.Formatter):
+    """An entry as one line, and the traceback if any; other control characters are escaped.
+
+    A message contains what clients sent, such as decoded paths: it must neither look like another entry nor change the
+    state of a terminal.
+    """
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        record.message = _escaped(record.message)
+        return super().formatMessage(record)
+
+    def formatException(self, ei: Any) -> str:
+        return "\n".join(_escaped(line) for line in super().formatException(ei).split("\n"))
+
+
 class JsonFormatter(logging.Formatter):
     """An entry as one JSON object: time, level, logger, message, trace id, `extra` values, and the traceback if any."""
 
@@ -27,7 +42,11 @@ class JsonFormatter(logging.Formatter):
         entry.update({key: value for key, value in vars(record).items() if key not in _OWN})
         if record.exc_info:
             entry["trace"] = self.formatException(record.exc_info)
-        return json.dumps(entry, default=str)
+        return json.dumps(entry, default=str).replace("\x7f", "\\u007f")
+
+
+def _escaped(text: str) -> str:
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
 
 def logging_config(style: str) -> dict[str, Any]:
@@ -35,7 +54,7 @@ def logging_config(style: str) -> dict[str, Any]:
     formatter = (
         {"()": f"{__name__}.JsonFormatter"}
         if style == "json"
-        else {"format": "%(asctime)s %(levelname)s %(name)s: %(message)s"}
+        else {"()": f"{__name__}.LineFormatter", "format": "%(asctime)s %(levelname)s %(name)s: %(message)s"}
     )
     return {
         "version": 1,
@@ -48,5 +67,7 @@ def logging_config(style: str) -> dict[str, Any]:
         "loggers": {
             # Requests are counted and logged by `ground_service.worker.metrics`, with their times.
             "uvicorn.access": {"level": "WARNING"},
+            # It would log the addresses of webhooks, which may contain a password or a token.
+            "httpx": {"level": "WARNING"},
         },
     }

@@ -139,7 +139,10 @@ def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
     assert stated and not licences.is_copyleft(stated), f"{name}: {stated}"
 
 
-@pytest.mark.parametrize("name", ["runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain"])
+HASHED = ("runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain", "exports")
+
+
+@pytest.mark.parametrize("name", HASHED)
 def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
     text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
     entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}
@@ -156,6 +159,8 @@ def test_what_is_installed_for_users_is_installed_with_hashes() -> None:
         True,
         True,
     ]
+    image = re.findall(r"pip install ((?:.*\\\n)*.*)", (ROOT / "Dockerfile").read_text())[0]
+    assert {f"-r requirements/{name}.txt" for name in HASHED} <= set(re.findall(r"-r \S+", image))
     rules = (ROOT / "Makefile").read_text()
     for name in ("runtime", "terrain"):
         assert re.search(rf"--require-hashes .*-r requirements/hashed/{name}\.txt", rules)

@@ -51,7 +51,7 @@ def start_provider_session(ground: Ground, who: ProviderIdentity, state: str) ->
     started = Session(
         name=user.name,
         role=who.role,
-        expires=UtcTime(now + service.SESSION_NS),
+        expires=UtcTime(now + service.PROVIDER_SESSION_NS),
         browser=True,
         time=UtcTime(mission_now_ns()),
     )

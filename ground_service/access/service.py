@@ -34,6 +34,9 @@ TOKEN_MINIMUM = 24
 SESSION_NS = 12 * 3_600_000_000_000
 """Longest duration of a browser session: one shift."""
 
+PROVIDER_SESSION_NS = 3_600_000_000_000
+"""Duration of a session that an OpenID provider started, after which the provider states the role again."""
+
 HINT_LENGTH = 12
 """Number of characters of a token that are stored to identify it; 37 random characters remain secret."""
 
@@ -196,7 +199,9 @@ def change_user(
         if state is not None:
             before = next(one for one in STATES if one != state)
             store.change_user(connection, user, "state", before, state)
-            audit(connection, actor, "disable user" if state == "disabled" else "enable user", name, {})
+            # A session must not continue when the user is enabled again.
+            detail = {"sessions": store.revoke_sessions(connection, user, utc_now_ns())}
+            audit(connection, actor, "disable user" if state == "disabled" else "enable user", name, detail)
         if role is not None:
             if user.provider is not None:
                 raise Conflict(f"user {name}: the OpenID provider {user.provider} states the role")
@@ -345,7 +350,7 @@ def add_session_token(
     connection: Connection, user: UserRecord, now: int, provider_session: str
 ) -> tuple[int, str]:
     """Add the token of a browser session that an OpenID provider started; return its id and secret."""
-    return _add_token(connection, user, now, SESSION_NS, provider_session=provider_session)
+    return _add_token(connection, user, now, PROVIDER_SESSION_NS, provider_session=provider_session)
 
 
 def check_user(name: str, role: str) -> None:

@@ -21,6 +21,7 @@ ANSWERS, AUDIT = repository.ANSWERS, repository.AUDIT
 SESSION_LENGTH = 255
 """Characters of the identity of a provider's session that are stored."""
 
+_IS_SESSION = or_(TOKENS.c.parent_id.is_not(None), TOKENS.c.provider_session.is_not(None))
 _ANYBODY = select(USERS.c.id).limit(1)
 
 
@@ -166,13 +167,18 @@ def revoke_tokens(
     return int(connection.execute(query.values(revoked_utc_ns=now_utc_ns)).rowcount)
 
 
+def revoke_sessions(connection: Connection, user: UserRecord, now_utc_ns: int) -> int:
+    """Revoke the browser sessions of a user, not the tokens; return their number."""
+    query = update(TOKENS).where(TOKENS.c.user_id == user.id, TOKENS.c.revoked_utc_ns.is_(None), _IS_SESSION)
+    return int(connection.execute(query.values(revoked_utc_ns=now_utc_ns)).rowcount)
+
+
 def delete_ended_sessions(connection: Connection, now_utc_ns: int) -> int:
     """Delete the tokens of browser sessions that have expired; return their number.
 
     The audit log keeps the start of each session. Revoked sessions are deleted when they would have expired.
     """
-    sessions = or_(TOKENS.c.parent_id.is_not(None), TOKENS.c.provider_session.is_not(None))
-    query = delete(TOKENS).where(sessions, TOKENS.c.expires_utc_ns < now_utc_ns)
+    query = delete(TOKENS).where(_IS_SESSION, TOKENS.c.expires_utc_ns < now_utc_ns)
     return int(connection.execute(query).rowcount)
 
 

@@ -153,7 +153,9 @@ class Channel(Section):
     email: Annotated[tuple[Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$")], ...], Array] | None = None
     smtp: Annotated[str, Field(pattern=r"^[^\s:/]+:[0-9]{1,5}$")] = "localhost:25"
     sender: Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$")] = "linna@localhost"
-    signing_secret: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]+$", max_length=64)] | None = None
+    signing_secret: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", max_length=64)] | None = (
+        None
+    )
 
     @model_validator(mode="after")
     def _one(self) -> Self:

@@ -71,7 +71,7 @@ async def complete_sign_in(
     response.set_cookie(
         SESSION_COOKIE,
         secret,
-        max_age=users.SESSION_NS // 1_000_000_000,
+        max_age=users.PROVIDER_SESSION_NS // 1_000_000_000,
         httponly=True,
         samesite="strict",
         secure=_safe(request),

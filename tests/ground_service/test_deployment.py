@@ -6,15 +6,20 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
+import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import redis
 import yaml
 
 from ground_service.settings import Settings
+from studies.mission_run.parts import Part, free_port, listens
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -329,6 +334,49 @@ def test_passwords_may_have_any_character(tmp_path: Path) -> None:
         f" #{hashlib.sha256(odd.encode()).hexdigest()} " in written.read_text()
         and odd not in written.read_text()
     )
+
+
+def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path: Path) -> None:
+    """A right that is missing would be a traceback in the log of the worker every second."""
+    for program in ("redis-server", "redis-cli"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is not installed")
+    (tmp_path / "broker_password").write_text("secret")
+    port = free_port()
+    environment = {
+        **os.environ,
+        "LINNA_SECRETS": str(tmp_path),
+        "LINNA_REDIS_USERS": str(tmp_path / "users.acl"),
+    }
+    words = ["--port", str(port), "--bind", "127.0.0.1", "--dir", str(tmp_path)]
+    broker = Part(
+        ["sh", str(ROOT / "deploy/redis.sh"), *words],
+        tmp_path / "redis.log",
+        lambda: listens(port),
+        env=environment,
+    )
+    url = f"redis://linna:secret@127.0.0.1:{port}/0"
+    log = tmp_path / "worker.log"
+    worker = Part(
+        [sys.executable, "-m", "linna", "worker"],
+        log,
+        lambda: log.exists() and " ready." in log.read_text(),
+        env={**os.environ, "LINNA_HOME": str(tmp_path / "home"), "LINNA_BROKER_URL": url},
+    )
+    try:
+        broker.start()
+        worker.start()
+        time.sleep(4.0)  # its scripts run every second
+        worker.finish()
+        assert "Error" not in log.read_text()
+        client = redis.Redis.from_url(url)
+        for command in ("CONFIG GET dir", "FLUSHALL", "ACL LIST", "SHUTDOWN"):
+            with pytest.raises(redis.exceptions.NoPermissionError):
+                client.execute_command(*command.split())
+        client.close()
+    finally:
+        worker.end()
+        broker.end()
 
 
 @pytest.mark.parametrize("name", CERTIFICATE)

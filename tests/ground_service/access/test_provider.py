@@ -7,6 +7,7 @@ import re
 import time
 import warnings
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -95,7 +96,9 @@ def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client
         True,
         True,
     )
-    assert found["expires"] is not None
+    left_s = (datetime.fromisoformat(found["expires"]) - datetime.now(UTC)).total_seconds()
+    assert 0 < left_s <= 3600.0  # then the provider states the role again
+    assert "max-age=3600" in cookies[SESSION_COOKIE]
     ground = client.app.state.ground
     (user,), (token,) = users.list_users(ground), users.list_tokens(ground)
     assert user.provider == provider.issuer and token.kind == "provider session"

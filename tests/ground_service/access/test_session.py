@@ -52,6 +52,16 @@ def test_a_wrong_token_starts_no_session(client: TestClient, token: str) -> None
     assert answer.status_code == 401 and "set-cookie" not in answer.headers
 
 
+def test_a_session_ends_when_its_user_is_disabled_and_stays_ended(client: TestClient, token: str) -> None:
+    ground = client.app.state.ground
+    start(client, token)
+    users.change_user(ground, "ann", state="disabled")
+    assert client.get("/api/v1/session").status_code == 401
+    users.change_user(ground, "ann", state="active")
+    assert client.get("/api/v1/session").status_code == 401
+    assert users.token_valid(ground, token)  # tokens of programs are valid again
+
+
 def test_sign_out_ends_the_session_and_not_the_token(client: TestClient, token: str) -> None:
     start(client, token)
     secret = client.cookies[SESSION_COOKIE]

@@ -226,9 +226,9 @@ def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -
         ("ann", "add token", "bob", {"token_id": 3}),
         ("ann", "renew token", "bob", {"token_id": 4, "revoked": 2}),
         ("ann", "change role", "bob", {"from": "viewer", "to": "operator"}),
-        ("ann", "disable user", "bob", {}),
+        ("ann", "disable user", "bob", {"sessions": 0}),
         ("ann", "change role", "bob", {"from": "operator", "to": "viewer"}),
-        ("ann", "enable user", "bob", {}),
+        ("ann", "enable user", "bob", {"sessions": 0}),
         ("ann", "revoke token", "bob", {"token_id": 4}),
         ("deployment", "ensure user", "cleo", {"role": "operator", "token_id": 5}),
     ]

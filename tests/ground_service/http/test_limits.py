@@ -96,3 +96,23 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
     assert entry["time"].endswith("+00:00")
     for style in ("text", "json"):
         logging.config.DictConfigurator(logging_config(style))
+
+
+@pytest.mark.parametrize("style", ["text", "json"])
+def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style: str) -> None:
+    """A path is decoded before it is logged: `GET /%0a2026-01-01 INFO forged`."""
+    configuration = logging.config.DictConfigurator(logging_config(style))
+    formatter = configuration.configure_formatter(configuration.config["formatters"]["line"])
+    forged = "/x\n2026-01-01 INFO forged\r\x1b[2J\x7f\x9b31m\u2028"
+    try:
+        raise ValueError(forged)
+    except ValueError:
+        record = logging.LogRecord("linna", logging.INFO, "f.py", 1, "GET %s", (forged,), sys.exc_info())
+    lines = formatter.format(record).split("\n")
+    assert all(line.isprintable() for line in lines)
+    assert not any(line.startswith("2026-01-01 INFO forged") for line in lines[:-1])
+
+
+def test_addresses_of_webhooks_are_not_logged() -> None:
+    """The HTTP client logs the address of each request at the level INFO."""
+    assert logging_config("json")["loggers"]["httpx"]["level"] == "WARNING"
