@@ -7,7 +7,8 @@ import logging
 import stat
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
@@ -36,7 +37,8 @@ log = logging.getLogger(__name__)
 class Ground:
     """An opened ground service: pass it to the services of the capabilities.
 
-    `stopping` is set before it is closed; long work then ends between two transactions.
+    `networks` are those of receivers of notifications that are not public. `stopping` is set before it is closed; long
+    work then ends between two transactions.
     """
 
     database: Database
@@ -45,6 +47,7 @@ class Ground:
     data: DataFolder
     runner: Path | None = None
     objects: ObjectStore | None = None
+    networks: tuple[IPv4Network | IPv6Network, ...] = ()
     stopping: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
 
     def check_stopping(self) -> None:
@@ -152,6 +155,7 @@ def ground_from_settings(settings: Settings) -> Ground:
         runner=settings.runner_exchange,
         objects=objects_of(settings),
     )
+    ground = replace(ground, networks=tuple(map(ip_network, settings.notify_networks)))
     try:
         if not settings.allow_database_owner:
             check_role(ground.database)

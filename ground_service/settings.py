@@ -157,6 +157,11 @@ class Settings(BaseSettings):
         description="Comma-separated addresses or networks of reverse proxies whose X-Forwarded-For, "
         "-Proto and -Host headers are accepted; headers of other peers are ignored",
     )
+    notify_networks: Words = Field(
+        default=(),
+        description="Comma-separated addresses or networks of webhooks and mail servers that are not public, such as "
+        "127.0.0.1 or 10.0.0.0/8; notifications to other addresses that are not public are refused",
+    )
     retention_days: int = Field(
         default=90, ge=1, description="Days for which the feed and finished jobs are kept"
     )
@@ -205,7 +210,7 @@ class Settings(BaseSettings):
             raise ValueError("expected a URL such as redis://host:6379/0, found another one")
         return value
 
-    @field_validator("trusted_proxies")
+    @field_validator("trusted_proxies", "notify_networks")
     @classmethod
     def _networks(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for text in value:

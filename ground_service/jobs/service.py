@@ -35,6 +35,7 @@ KINDS = (
     "redecode",
     "re-evaluation",
     "automation",
+    "notification",
 )
 """Kinds of jobs; `worker.jobs` has a function for each."""
 
@@ -48,6 +49,7 @@ IDENTITY = {
     "redecode": ("vehicle_id",),
     "re-evaluation": ("pass_id",),
     "automation": ("event",),
+    "notification": ("event",),
 }
 """Arguments that must be equal for two requests with the same job id to be the same request."""
 

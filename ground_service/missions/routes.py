@@ -44,9 +44,10 @@ def add_mission(
 
 
 @missions.get("/missions/{revision}")
-def get_mission(ground: GroundOf, _: Viewer, revision: Revision) -> MissionDetail:
-    """Show a revision with its document."""
-    return ground.read(store.find_revision, revision)
+def get_mission(ground: GroundOf, caller: Viewer, revision: Revision) -> MissionDetail:
+    """Show a revision with its document; viewers see the hosts of webhooks only, not what may be a token."""
+    found = ground.read(store.find_revision, revision)
+    return found if caller.may("operator") else service.without_tokens(found)
 
 
 @missions.get("/catalogues")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from sqlalchemy import Connection
 
@@ -146,3 +147,29 @@ def mission_of_pass(connection: Connection, mission_id: int | None, manifest: Ma
     if mission_id is not None:
         return store.get_mission(connection, mission_id)
     return mission_of_manifest(manifest)
+
+
+def without_tokens(found: MissionDetail) -> MissionDetail:
+    """Return a revision whose webhooks show scheme and host only: the rest of an address may be a token or password."""
+    automation = found.document.automation
+    channels = (automation.channels if automation is not None else None) or {}
+    shown = {}
+    for channel in channels.values():
+        if channel.webhook is not None:
+            parts = urlsplit(channel.webhook)
+            shown[channel.webhook] = f"{parts.scheme}://{parts.hostname}/..."
+    if automation is None or not shown:
+        return found
+    text = found.text
+    for address in sorted(shown, key=len, reverse=True):
+        text = text.replace(address, shown[address])
+    stated = parse_mission(text).automation
+    if stated is None or any(one.webhook in shown for one in (stated.channels or {}).values()):
+        text = ""  # an address is written with escapes
+    public = {
+        name: one.model_copy(update={"webhook": shown.get(one.webhook or "")})
+        for name, one in channels.items()
+    }
+    changed = automation.model_copy(update={"channels": public})
+    document = found.document.model_copy(update={"automation": changed})
+    return found.model_copy(update={"document": document, "text": text})

@@ -29,13 +29,14 @@ from ground_service.errors import (
 from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.service import make_report, pass_summary, reevaluate
 from ground_service.evaluation.store import newest_report
-from ground_service.events import LimitsBroken, publish
+from ground_service.events import AutomationChanged, LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.service import add_job
 from ground_service.missions.rules import DEFAULT_RULES, Rule
 from ground_service.planning.progress import close_window, note_reason
 from ground_service.timekeeping.recorrelation import recorrelate
-from ground_service.worker.notifications import NotDelivered, send
+from ground_service.worker.notifications import send
+from ground_service.worker.outgoing import NotDelivered
 from ground_service.worker.upkeep import broken_limits
 
 log = logging.getLogger(__name__)
@@ -55,13 +56,20 @@ RETRY_NS = (0, 60_000_000_000)
 """Time from a failed attempt to the next one: at once, then after a minute."""
 
 
-def run_actions(ground: Ground, event: int, job_id: str) -> dict[str, Any]:
-    """Run the actions of an event that are queued; return their numbers by state."""
+def run_actions(ground: Ground, event: int, *, notify: bool = False) -> dict[str, Any]:
+    """Run the actions of an event that are queued; return their numbers by state.
+
+    Notifications wait for other people's computers. They are the work of a separate job, which runs this with `notify`.
+    """
+    due: list[AutomationAction] = []
     with _alone(ground, event):
         with ground.database.reading() as connection:
             actions = store.actions_of_event(connection, event)
         for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
-            _run_chain(ground, list(chain))
+            due += _run_chain(ground, list(chain), notify)
+    for one in due:
+        with ground.database.writing() as connection:
+            publish(connection, AutomationChanged(id=one.id, event=event, action=one.action, state="sending"))
     with ground.database.reading() as connection:
         after = store.actions_of_event(connection, event)
     counts: dict[str, int] = {}
@@ -96,16 +104,16 @@ def _alone(ground: Ground, event: int) -> Iterator[None]:
             _changed.notify_all()
 
 
-def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:
+def _run_chain(ground: Ground, chain: list[AutomationAction], notify: bool) -> list[AutomationAction]:
     """Run the actions of one rule on one subject in order, up to one that waits or is to be repeated later.
 
-    Actions after one that finally failed are skipped.
+    Actions after one that finally failed are skipped. Without `notify`, return the notification that is due.
     """
     stopped = ""
     for action in chain:
         ground.check_stopping()
         if action.state == "waiting" and not stopped:
-            return
+            return []
         if action.state in ("failed", "refused", "skipped"):
             stopped = action.action
         if action.state not in OPEN_STATES:
@@ -113,11 +121,14 @@ def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:
         if stopped:
             _end(ground, action, "skipped", error=f"{stopped} before it was not done")
             continue
+        if action.action == "notify" and not notify:
+            return [action]
         state = _run_attempts(ground, action)
         if state == "queued":
-            return
+            return []
         if state == "failed":
             stopped = action.action
+    return []
 
 
 def _run_attempts(ground: Ground, action: AutomationAction) -> str:
@@ -314,7 +325,15 @@ def _notify(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     for name in rule.notify or ():
         ground.check_stopping()
         try:
-            send(ground.home, channels[name], f"{_identity(action)}.{name}", f"LINNA: {action.text}", content)
+            identity = f"{_identity(action)}.{name}"
+            send(
+                ground.home,
+                channels[name],
+                identity,
+                f"LINNA: {action.text}",
+                content,
+                networks=ground.networks,
+            )
         except GroundError as error:
             faults[name] = public_text(error)
     if faults:

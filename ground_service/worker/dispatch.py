@@ -12,7 +12,7 @@ from typing import Any
 from ground_service.errors import PASSING
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.jobs.service import enter_job, unfinished_jobs
+from ground_service.jobs.service import enter_job, get_job, unfinished_jobs
 from ground_service.settings import Settings
 from ground_service.worker.jobs import run_job
 
@@ -46,11 +46,15 @@ class InlineDispatcher:
 
 
 class ThreadDispatcher:
-    """Does jobs one after another in a thread of this process, as a server without workers does."""
+    """Does jobs one after another in a thread of this process, as a server without workers does.
+
+    Notifications wait for other people's computers, and have a thread of their own.
+    """
 
     def __init__(self, ground: Ground) -> None:
         self._ground = ground
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="job")
+        self._senders = ThreadPoolExecutor(max_workers=1, thread_name_prefix="notification")
         self._waiting: set[str] = set()
         self._held: dict[str, tuple[float, float]] = {}
         self._lock = threading.Lock()
@@ -65,7 +69,8 @@ class ThreadDispatcher:
             if job_id in self._waiting:
                 return
             self._waiting.add(job_id)
-        self._pool.submit(self._run, job_id)
+        kind = get_job(self._ground, job_id).kind
+        (self._senders if kind == "notification" else self._pool).submit(self._run, job_id)
 
     def resume(self) -> None:
         for identity in unfinished_jobs(self._ground):
@@ -90,7 +95,8 @@ class ThreadDispatcher:
 
     def close(self) -> None:
         self._ground.stopping.set()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        for pool in (self._pool, self._senders):
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 class CeleryDispatcher:

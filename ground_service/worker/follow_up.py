@@ -122,6 +122,8 @@ def _after_decision(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = AutomationChanged.of(logged)
     if event.state in ("queued", "refused"):
         yield "act", event.event
+    elif event.state == "sending":
+        yield "notify", event.event
 
 
 def _after_window(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -205,6 +207,13 @@ def _act(ground: Ground, number: int, event: int) -> str:
         return add_job(connection, "automation", {"event": number}, job_id=identity)
 
 
+def _notify(ground: Ground, number: int, event: int) -> str:
+    """Add the job of the notifications of event `number` that are due."""
+    with ground.database.writing() as connection:
+        identity = _job_id("notification", number, event)
+        return add_job(connection, "notification", {"event": number}, job_id=identity)
+
+
 def _plan(ground: Ground, _key: int, event: int) -> str | None:
     """Add the job that brings the plan of standing requests up to date, if there is anything to plan."""
     if not needs_plan(ground):
@@ -221,6 +230,7 @@ DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "decode": _decode,
     "match rules": _match_rules,
     "act": _act,
+    "notify": _notify,
     "plan": _plan,
 }
 """Functions of the work in the order in which they run; each returns the id of a job to start, or None."""

@@ -85,8 +85,12 @@ def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dic
     return {"rows": rows + apply_definition(ground, vehicle)}
 
 
-def _automation(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    return run_actions(ground, int(arguments["event"]), job_id)
+def _automation(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    return run_actions(ground, int(arguments["event"]))
+
+
+def _notification(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    return run_actions(ground, int(arguments["event"]), notify=True)
 
 
 def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
@@ -126,6 +130,7 @@ WORK: dict[str, Work] = {
     "redecode": _redecode,
     "re-evaluation": _reevaluate,
     "automation": _automation,
+    "notification": _notification,
 }
 """Functions of the jobs by kind (`jobs.KINDS`). Each may be run twice with the same arguments and job without harm."""
 

@@ -9,28 +9,21 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-import smtplib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from email.message import EmailMessage
 from pathlib import Path
 from typing import Any
 
-import httpx
-
-from ground_service.errors import GroundError, InvalidInput, storage_error
+from ground_service.errors import InvalidInput, storage_error
 from ground_service.missions.rules import Channel
+from ground_service.worker.outgoing import DEADLINE_S, Network, NotDelivered, Unreachable, post, send_mail
 
 ATTEMPTS = 3
 FIRST_WAIT_S = 1.0
-TIMEOUT_S = 10.0
 SIGNATURE_HEADER = "X-Linna-Signature"
 SECRETS = "secrets"
 """Folder under the home of the service with the keys of signatures."""
-
-
-class NotDelivered(GroundError):
-    """A receiver did not accept a message."""
 
 
 def send(
@@ -40,14 +33,21 @@ def send(
     subject: str,
     content: Mapping[str, Any],
     *,
+    networks: Sequence[Network] = (),
+    deadline_s: float = DEADLINE_S,
     wait: Callable[[float], object] = time.sleep,
 ) -> int:
     """Send a message over a channel; return the number of attempts.
 
+    Parameters
+    ----------
+    networks
+        Networks that are not public and may be connected to.
+
     Raises
     ------
     NotDelivered
-        The receiver has refused it, or was not available in any attempt.
+        The receiver is not permitted, has refused it, or was not available in any attempt.
     InvalidInput
         The key of the signature is missing.
     """
@@ -56,14 +56,12 @@ def send(
     for attempt in range(1, ATTEMPTS + 1):
         try:
             if channel.webhook is not None:
-                _post(channel.webhook, identity, content, key)
+                _post(channel.webhook, identity, content, key, networks, deadline_s)
             else:
-                _mail(channel, identity, subject, content)
+                send_mail(channel.smtp, _mail(channel, identity, subject, content), networks, deadline_s)
             return attempt
-        except (httpx.TransportError, smtplib.SMTPException, OSError) as error:
-            if isinstance(error, smtplib.SMTPResponseException) and error.smtp_code >= 500:
-                raise NotDelivered(f"the mail server refuses the message: status {error.smtp_code}") from None
-            reason = f"{type(error).__name__}: {error}"
+        except Unreachable as error:
+            reason = str(error)
         if attempt < ATTEMPTS:
             wait(FIRST_WAIT_S * 2.0 ** (attempt - 1))
     raise NotDelivered(f"not delivered in {ATTEMPTS} attempts: {reason}")
@@ -74,31 +72,33 @@ def signature(key: bytes, body: bytes) -> str:
     return hmac.new(key, body, hashlib.sha256).hexdigest()
 
 
-def _post(url: str, identity: str, content: Mapping[str, Any], key: bytes | None) -> None:
+def _post(
+    url: str,
+    identity: str,
+    content: Mapping[str, Any],
+    key: bytes | None,
+    networks: Sequence[Network],
+    deadline_s: float,
+) -> None:
     body = json.dumps(content, sort_keys=True).encode()
     headers = {"Content-Type": "application/json", "Idempotency-Key": identity}
     if key is not None:
         headers[SIGNATURE_HEADER] = signature(key, body)
-    try:
-        response = httpx.post(url, content=body, headers=headers, timeout=TIMEOUT_S)
-    except httpx.InvalidURL as error:
-        raise NotDelivered(str(error)) from None
-    if response.status_code >= 500:
-        raise httpx.TransportError(f"status {response.status_code}")
-    if response.status_code >= 300:
-        raise NotDelivered(f"the webhook refuses the message: status {response.status_code}")
+    status = post(url, body, headers, networks, deadline_s)
+    if status >= 500:
+        raise Unreachable(f"status {status}")
+    if status >= 300:
+        raise NotDelivered(f"the webhook refuses the message: status {status}")
 
 
-def _mail(channel: Channel, identity: str, subject: str, content: Mapping[str, Any]) -> None:
+def _mail(channel: Channel, identity: str, subject: str, content: Mapping[str, Any]) -> EmailMessage:
     message = EmailMessage()
     message["Subject"] = subject
     message["From"] = channel.sender
     message["To"] = ", ".join(channel.email or ())
     message["Message-ID"] = f"<{identity}@linna>"
     message.set_content("\n".join(f"{name}: {value}" for name, value in content.items() if value is not None))
-    host, _, port = channel.smtp.rpartition(":")
-    with smtplib.SMTP(host, int(port), timeout=TIMEOUT_S) as server:
-        server.send_message(message)
+    return message
 
 
 def _key(home: Path, name: str) -> bytes:

@@ -4,9 +4,11 @@ import json
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.commanding.service import enter_command, release_command
 from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
@@ -327,6 +329,40 @@ def test_only_an_administrator_changes_which_telecommands_need_a_second_person(g
 def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line: str, message: str) -> None:
     faults = mission_faults(approval_text(line).decode())
     assert len(faults) == 1 and message in faults[0]
+
+
+def test_viewers_see_neither_passwords_nor_tokens_of_webhooks(tmp_path: Path) -> None:
+    secret = "https://user:p4ss@hooks.example/services/T0KEN"
+    text = f'''
+name = "m"
+[spacecraft]
+id = 76
+[[automation.rules]]
+name = "gate"
+on = "gate done"
+do = ["notify"]
+notify = ["hook", "escaped"]
+[automation.channels.hook]
+webhook = "{secret}"
+[automation.channels.escaped]
+webhook = "https://hooks.example/\\u0054WO"
+'''
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
+        ground = client.app.state.ground
+        revision = add_mission(ground, text.encode()).revision
+        tokens = {role: add_user(ground, role, role) for role in ("viewer", "operator")}
+
+        def shown(role: str) -> Any:
+            headers = {"Authorization": f"Bearer {tokens[role]}"}
+            return client.get(f"/api/v1/missions/{revision}", headers=headers).json()
+
+        assert shown("operator")["text"] == text
+        assert shown("operator")["document"]["automation"]["channels"]["hook"]["webhook"] == secret
+        found = shown("viewer")
+        channels = found["document"]["automation"]["channels"]
+        assert {one["webhook"] for one in channels.values()} == {"https://hooks.example/..."}
+        assert not any(word in str(found) for word in ("p4ss", "T0KEN", "TWO", "u0054"))
+        assert found["revision"] == revision
 
 
 def test_descriptions_are_entered_and_read_over_http(tmp_path: Path) -> None:

@@ -336,14 +336,14 @@ def test_a_failed_action_is_repeated_by_an_operator(
         decide(either, align.id, approve=True, actor="ann")
     # Nobody does the work here yet: the request is recorded once, however often it is made.
     with monkeypatch.context() as patched:
-        patched.setattr(actions, "_run_chain", lambda *_: None)
+        patched.setattr(actions, "_run_chain", lambda *_: [])
         queued = repeat(either, align.id, actor="ann")
         assert (queued.state, queued.attempts, queued.error) == ("queued", 0, None)
         assert repeat(either, align.id, actor="ann") == queued
     with local_client(either, "ann") as service:
         entries = [one for one in service.list_audit() if one.action == "repeat automation"]
     assert [(one.actor, one.target) for one in entries] == [("ann", str(align.id))]
-    actions.run_actions(either, align.event, "job")
+    actions.run_actions(either, align.event)
     assert {one[2] for one in recorded(either)} == {"done"}
     assert either.read(get_window, window_id).state == "processed"
     with pytest.raises(StateConflict, match="expected state failed, found done"):

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import socket
 import socketserver
 import threading
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +20,27 @@ from ground_service.automation.model import ActionFilter
 from ground_service.automation.store import list_actions
 from ground_service.errors import InvalidInput
 from ground_service.events import RegressionJudged, publish
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
+from ground_service.jobs.model import JobFilter
+from ground_service.jobs.service import get_job
+from ground_service.jobs.store import list_jobs
 from ground_service.missions.rules import Channel
 from ground_service.missions.service import add_mission
-from ground_service.worker.notifications import ATTEMPTS, NotDelivered, send, signature
+from ground_service.settings import load_settings
+from ground_service.worker import outgoing
+from ground_service.worker.dispatch import ThreadDispatcher
+from ground_service.worker.follow_up import follow_in_process
+from ground_service.worker.notifications import ATTEMPTS, signature
+from ground_service.worker.notifications import send as send_to
+from ground_service.worker.outgoing import NotDelivered, permitted_address
+from tests.ground_service.conftest import wait_for
+
+HERE = (ip_network("127.0.0.1"),)
+
+
+def send(*given: Any, networks: Any = HERE, **how: Any) -> int:
+    """Send over a channel; the receivers of these tests are on this machine."""
+    return send_to(*given, networks=networks, **how)
 
 
 class Webhook:
@@ -163,7 +184,123 @@ def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox: Mailbox, 
         send(tmp_path, channel, "id", "s", {}, wait=no_wait)
 
 
-def test_a_rule_notifies_its_channels(webhook: Webhook, mailbox: Mailbox, ground: Ground) -> None:
+@pytest.fixture
+def local(tmp_path: Path) -> Iterator[Ground]:
+    """A service that may send to this machine."""
+    with open_ground(tmp_path / "home") as opened:
+        yield replace(opened, networks=HERE)
+
+
+class Dripping(socketserver.StreamRequestHandler):
+    """A receiver that sends an octet now and then, so that no read of the sender times out."""
+
+    octets = b"HTTP/1.1 200 OK\r\nX: "
+
+    def handle(self) -> None:
+        try:
+            self.wfile.write(self.octets)
+            for _ in range(200):
+                time.sleep(0.05)
+                self.wfile.write(b"x")
+        except OSError:
+            pass
+
+
+class DrippingMail(Dripping):
+    octets = b"220 "
+
+
+@pytest.mark.parametrize("handler", [Dripping, DrippingMail])
+def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping], tmp_path: Path) -> None:
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+        place = f"127.0.0.1:{server.server_address[1]}"
+        mail = Channel(email=("a@b.example",), smtp=place)
+        channel = Channel(webhook=f"http://{place}/") if handler is Dripping else mail
+        began = time.monotonic()
+        with pytest.raises(NotDelivered, match="not delivered in 3 attempts"):
+            send(tmp_path, channel, "id", "s", {}, deadline_s=0.3, wait=no_wait)
+        assert time.monotonic() - began < 5.0
+        server.shutdown()
+
+
+def test_the_body_of_an_answer_is_not_read(tmp_path: Path) -> None:
+    sent = 0
+
+    class Endless(socketserver.StreamRequestHandler):
+        def handle(self) -> None:
+            nonlocal sent
+            self.rfile.readline()
+            self.wfile.write(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000\r\n\r\n")
+            try:
+                while sent < 1_000_000_000:
+                    sent += self.connection.send(bytes(1 << 16))
+            except OSError:
+                pass
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Endless) as server:
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+        url = f"http://127.0.0.1:{server.server_address[1]}/"
+        assert send(tmp_path, Channel(webhook=url), "id", "s", {}) == 1
+        server.shutdown()
+    assert sent < 50_000_000  # what the buffers of the connection hold
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "127.0.0.1",
+        "localhost",
+        "::1",
+        "::ffff:10.0.0.1",
+        "10.1.2.3",
+        "169.254.169.254",
+        "0.0.0.0",
+        "224.0.0.1",
+    ],
+)
+def test_an_address_that_is_not_public_is_refused(host: str) -> None:
+    with pytest.raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
+        permitted_address(host, 80, ())
+
+
+def test_a_public_address_and_a_listed_network_are_permitted() -> None:
+    assert permitted_address("1.1.1.1", 443, ()) == "1.1.1.1"
+    assert permitted_address("10.1.2.3", 443, (ip_network("10.0.0.0/8"),)) == "10.1.2.3"
+
+
+def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_is_used(
+    webhook: Webhook, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name server could answer the second question with another address."""
+    asked: list[str] = []
+    answers = [["1.1.1.1", "10.0.0.1"], ["127.0.0.1"]]
+    resolve = socket.getaddrinfo
+
+    def found(host: Any, port: int, *given: Any, **how: Any) -> list[Any]:
+        if host != "ops.example":
+            return resolve(host, port, *given, **how)
+        asked.append(host)
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (one, port)) for one in answers.pop(0)]
+
+    monkeypatch.setattr(outgoing.socket, "getaddrinfo", found)
+    url = webhook.url.replace("127.0.0.1", "ops.example")
+    with pytest.raises(NotDelivered, match=r"found 10\.0\.0\.1"):
+        send(tmp_path, Channel(webhook=url), "id", "s", {}, networks=())
+    assert send(tmp_path, Channel(webhook=url), "id", "s", {}) == 1
+    assert asked == ["ops.example"] * 2 and webhook.received[0][0]["Host"].startswith("ops.example:")
+
+
+def test_the_networks_are_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINNA_NOTIFY_NETWORKS", "127.0.0.1, 10.0.0.0/8")
+    assert load_settings().notify_networks == ("127.0.0.1", "10.0.0.0/8")
+    monkeypatch.delenv("LINNA_NOTIFY_NETWORKS")
+    assert load_settings().notify_networks == ()
+
+
+def test_a_rule_notifies_its_channels(webhook: Webhook, mailbox: Mailbox, local: Ground) -> None:
+    follow_in_process(local)
     text = f"""
 name = "m"
 [spacecraft]
@@ -180,10 +317,10 @@ webhook = "{webhook.url}"
 email = ["a@b.example"]
 smtp = "{mailbox.address}"
 """
-    add_mission(ground, text.encode())
-    with ground.database.writing() as connection:
+    add_mission(local, text.encode())
+    with local.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
-    [action] = ground.read(list_actions, ActionFilter()).items
+    [action] = local.read(list_actions, ActionFilter()).items
     assert (action.state, action.result) == ("done", {"hook": "delivered", "people": "delivered"})
     [(_, body)] = webhook.received
     document = json.loads(body)
@@ -191,9 +328,52 @@ smtp = "{mailbox.address}"
     assert document["text"] == f"regression {'1' * 32}: fail" and len(mailbox.received) == 1
 
 
+def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
+    """The embedded service does notifications in a thread of their own."""
+    held = threading.Event()
+
+    class Slow(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            held.wait(60.0)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    dispatcher = ThreadDispatcher(local)
+    follow_in_process(local, dispatcher.start)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Slow)
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+    try:
+        rule = '[[automation.rules]]\nname = "gate"\non = "gate done"\ndo = ["notify"]\nnotify = ["hook"]\n'
+        hook = f'[automation.channels.hook]\nwebhook = "http://127.0.0.1:{server.server_port}/"\n'
+        add_mission(local, f'name = "m"\n[spacecraft]\nid = 76\n{rule}{hook}'.encode())
+        with local.database.writing() as connection:
+            publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
+
+        def kinds(state: str) -> list[str]:
+            return [one.kind for one in local.read(list_jobs, JobFilter()).items if one.state == state]
+
+        wait_for(lambda: "notification" in kinds("running"), "the notification", 30.0)
+        job = dispatcher.submit("plan", {})
+        wait_for(lambda: get_job(local, job).state == "done", "another job", 30.0)
+        assert kinds("running") == ["notification"]
+        held.set()
+        wait_for(lambda: kinds("running") == [], "the end of the notification", 30.0)
+        [action] = local.read(list_actions, ActionFilter()).items
+        assert (action.state, action.result) == ("done", {"hook": "delivered"})
+    finally:
+        held.set()
+        dispatcher.close()
+        server.shutdown()
+        server.server_close()
+
+
 def test_a_channel_that_fails_does_not_keep_others_from_the_message(
-    webhook: Webhook, mailbox: Mailbox, ground: Ground
+    webhook: Webhook, mailbox: Mailbox, local: Ground
 ) -> None:
+    follow_in_process(local)
     webhook.statuses = [404]
     text = f"""
 name = "m"
@@ -210,9 +390,9 @@ webhook = "{webhook.url}"
 email = ["a@b.example"]
 smtp = "{mailbox.address}"
 """
-    add_mission(ground, text.encode())
-    with ground.database.writing() as connection:
+    add_mission(local, text.encode())
+    with local.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="pass"))
-    [action] = ground.read(list_actions, ActionFilter()).items
+    [action] = local.read(list_actions, ActionFilter()).items
     assert action.state == "failed" and "hook: the webhook refuses the message" in (action.error or "")
     assert len(mailbox.received) == 1
