@@ -82,7 +82,9 @@ class Pair(NamedTuple):
 
 
 @pytest.mark.parametrize(
-    "value", [lambda: None, Path("x"), Pair(1), np.array([None]), np.zeros(2, "i4,f8")], ids=repr
+    "value",
+    [lambda: None, Path("x"), Pair(1), np.array([None]), np.zeros(2, "i4,f8")],
+    ids=lambda one: type(one).__name__,
 )
 def test_what_cannot_be_kept_is_refused_in_one_line(value: Any) -> None:
     with pytest.raises(RecordError, match=r"state: expected .*, found"):
