@@ -183,7 +183,7 @@ def random_pieces(octets: bytes, seed: int, count: int, smallest: int = 1) -> li
     return [pieces[i] for i in order]
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("frame_length", [223, 1115])
 def test_a_stream_of_frames_may_be_cut_at_any_octet(
     ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, seed: int, frame_length: int
@@ -428,7 +428,7 @@ def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]], placed: 
 
 
 @pytest.mark.parametrize("placed", [True, False])
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.campaign)])
 def test_two_workers_give_the_same_archive(
     packets: list[bytes],
     expected: str,
