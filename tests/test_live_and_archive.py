@@ -11,24 +11,18 @@ import hashlib
 import json
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 
-from ground_service.access.service import add_user
-from ground_service.app import create_app
 from ground_service.client import Client
-from ground_service.ground import ground_from_settings, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.missions import store as missions
 from ground_service.planning.model import Window
-from ground_service.server import bind
 from ground_service.settings import Settings
 from ground_service.store import repository
 from linna.cli import run
@@ -41,6 +35,7 @@ from payload_emulator.session.live import LivePayload
 from payload_emulator.session.mission import mission_text
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world import build_world
+from tests.serving import served, wait_for
 
 SCENARIO = """
 name = "live and archive"
@@ -87,30 +82,6 @@ class Both:
     rows: dict[str, list[dict[str, Any]]]
     revisions: dict[int, str]
     mission: str
-
-
-@contextmanager
-def served(settings: Settings) -> Iterator[tuple[str, str]]:
-    with ground_from_settings(settings) as ground:
-        token = add_user(ground, "ann", "operator")
-    listener = bind("127.0.0.1", 0)
-    service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
-    thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
-    thread.start()
-    wait_for(lambda: service.started or not thread.is_alive(), "the server")
-    try:
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}", token
-    finally:
-        service.should_exit = True
-        thread.join(60)
-        listener.close()
-
-
-def wait_for(reached: Callable[[], bool], what: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not reached():
-        assert time.monotonic() < until, f"{what}: not reached within {PATIENCE_S} s"
-        time.sleep(0.05)
 
 
 def receive(port: int) -> tuple[bytearray, threading.Thread]:
@@ -195,7 +166,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
                 target=lambda: codes.append(run(["ingest", *tcp, *mission_port, *where]))
             )
             station.start()
-            wait_for(lambda: len(live._servers["telemetry"].clients) == 2, "both receivers")
+            wait_for(lambda: len(live._servers["telemetry"].clients) == 2, "both receivers", PATIENCE_S)
             uplink = ["--tcp", f"127.0.0.1:{live.ports['telecommand']}"]
             assert run(["command", "uplink", "--spacecraft-id", str(SPACECRAFT_ID), *uplink, *where]) == 0
             with socket.create_connection(

@@ -20,7 +20,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from tests.ground_service.conftest import free_port, wait_for
+from tests.ground_service.conftest import free_port
+from tests.serving import wait_for
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = {

@@ -37,6 +37,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
@@ -433,16 +434,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def wait_for(ready: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
-    """Wait until `ready` says so; fail when it never does."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        if ready():
-            return
-        time.sleep(0.02)
-    pytest.fail(f"{what} was not ready within {seconds:.0f} s")
 
 
 def _postgres_binaries() -> Path | None:

@@ -4,7 +4,6 @@ import asyncio
 import json
 import math
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from ground_service.app import create_app
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc
+from tests.serving import wait_for
 from tmtc.downlink import DownlinkEncoder
 from tmtc.frames import Clcw, pack_clcw
 
@@ -547,9 +547,8 @@ def test_a_night_that_was_slept_through_is_made_up_for(
     monkeypatch.setattr(scheduler, "TICK_S", 0.05)
     monkeypatch.setattr(scheduler, "utc_now_ns", lambda: noon)
     with TestClient(create_app(Settings(home=tmp_path))) as opened:
-        path, until = f"{V1}/jobs/{nightly_job_id(noon)}", time.monotonic() + 60.0
-        while opened.get(path).status_code == 404 and time.monotonic() < until:
-            time.sleep(0.05)
+        path = f"{V1}/jobs/{nightly_job_id(noon)}"
+        wait_for(lambda: opened.get(path).status_code != 404, "the nightly job")
         assert opened.get(path).json()["kind"] == "nightly"
 
 

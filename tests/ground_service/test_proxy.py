@@ -18,7 +18,8 @@ from websockets.sync.client import connect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
-from tests.ground_service.conftest import free_port, wait_for
+from tests.ground_service.conftest import free_port
+from tests.serving import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -6,21 +6,15 @@ import json
 import re
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 
 from ground_service.access.service import add_user
-from ground_service.app import create_app
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
-from ground_service.server import bind
 from ground_service.settings import Settings
 from linna.cli import GROUPS, run
 from linna.parser import LinnaParser
@@ -28,6 +22,7 @@ from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
+from tests.serving import served
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -69,31 +64,11 @@ def downlink(tmp_path: Path) -> Path:
     return path
 
 
-@contextmanager
-def served(home: Path, role: str) -> Iterator[list[str]]:
-    """Serve a service with the user ann; yield the options that name it."""
-    settings = Settings(home=home)
-    with open_ground(settings.home) as ground:
-        token = add_user(ground, "ann", role)
-    listener = bind("127.0.0.1", 0)
-    service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
-    thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
-    thread.start()
-    while not service.started and thread.is_alive():
-        time.sleep(0.01)
-    try:
-        yield ["--server", f"http://127.0.0.1:{listener.getsockname()[1]}", "--token", token]
-    finally:
-        service.should_exit = True
-        thread.join(30)
-        listener.close()
-
-
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[list[str]]:
     """A served service with one operator: the options that name it."""
-    with served(tmp_path / "served", "operator") as options:
-        yield options
+    with served(Settings(home=tmp_path / "served")) as (url, token):
+        yield ["--server", url, "--token", token]
 
 
 def asked(capsys: pytest.CaptureFixture[str], *words: Any, status: int = 0) -> Any:
@@ -205,8 +180,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
     outputs: list[list[tuple[Any, ...]]] = []
     with open_ground(tmp_path / "here") as ground:
         add_user(ground, "ann", "admin")
-    with served(tmp_path / "served", "admin") as options:
-        for where in (["--home", tmp_path / "here", "--as", "ann"], options):
+    with served(Settings(home=tmp_path / "served"), "admin") as (url, token):
+        for where in (["--home", tmp_path / "here", "--as", "ann"], ["--server", url, "--token", token]):
             said: list[tuple[Any, ...]] = []
 
             def ask(*words: Any, said: list[Any] = said, where: list[Any] = where, text: bool = True) -> Any:

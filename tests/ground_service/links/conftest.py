@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import pytest
 
@@ -18,14 +16,6 @@ from ground_service.links.runner import LinkRunner
 from ground_service.missions.service import add_mission
 
 PATIENCE_S = 20.0
-
-
-def until(reached: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> None:
-    """Wait until a condition holds; fail if it never does."""
-    end = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < end, f"{what}: not reached within {seconds} s"
-        time.sleep(0.02)
 
 
 @dataclass

@@ -29,7 +29,7 @@ from ground_service.store import repository
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
-from tests.ground_service.links.conftest import Station, declare, operated, until
+from tests.ground_service.links.conftest import Station, declare, operated
 from tests.ground_service.links.test_links import (
     CADU,
     PLACES,
@@ -39,6 +39,7 @@ from tests.ground_service.links.test_links import (
     released,
     stream,
 )
+from tests.serving import wait_for
 
 __all__ = ["expected", "stream"]
 
@@ -70,7 +71,7 @@ def test_a_block_received_while_the_database_is_busy_is_kept(
     monkeypatch.setattr(service, "start_contact", failing(service.start_contact, {1, 2}))
     with operated(ground) as runner:
         station.accept().sendall(stream)
-        until(lambda: runner.octets_received == len(stream), "all octets")
+        wait_for(lambda: runner.octets_received == len(stream), "all octets")
         assert hash_of(ground) == expected
 
 
@@ -81,7 +82,7 @@ def test_a_block_held_at_the_stop_is_in_the_spool(
     monkeypatch.setattr(service, "start_contact", failing(service.start_contact, set(range(1, 10_000))))
     with operated(ground) as runner:
         station.accept().sendall(stream[: 3 * CADU])
-        until(lambda: runner._block is not None, "the block")
+        wait_for(lambda: runner._block is not None, "the block")
         held = len(runner._block or b"")
     assert runner.octets_received == held
 
@@ -100,10 +101,10 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(
     monkeypatch.setattr(os, "fdatasync", fdatasync)
     with operated(ground) as runner:
         connection = station.accept()
-        until(lambda: service.get_link(ground, "lab").state == "connected", "the connection")
+        wait_for(lambda: service.get_link(ground, "lab").state == "connected", "the connection")
         full[0] = True
         connection.sendall(stream)
-        until(lambda: service.get_link(ground, "lab").state == "failed", "the state")
+        wait_for(lambda: service.get_link(ground, "lab").state == "failed", "the state")
         assert "no space left" in (service.get_link(ground, "lab").reason or "")
         threading.Event().wait(0.3)
         states = [
@@ -111,9 +112,9 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(
         ]
         assert states.count("failed") == 1
         full[0] = False
-        until(lambda: runner.octets_received == len(stream), "all octets")
+        wait_for(lambda: runner.octets_received == len(stream), "all octets")
         assert hash_of(ground) == expected
-        until(lambda: service.get_link(ground, "lab").state != "failed", "the state after it")
+        wait_for(lambda: service.get_link(ground, "lab").state != "failed", "the state after it")
         connection.settimeout(10.0)
         counts = [0]
         while counts[-1] < len(stream):
@@ -191,8 +192,8 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
     monkeypatch.setattr(service, "find_open_contact", failing(service.find_open_contact, {1, 2}))
     monkeypatch.setattr(service, "acquire", failing(service.acquire, {2}))
     with operated(ground) as runner:
-        until(lambda: runner.octets_received == len(stream), "the segment")
-        until(lambda: contact_events(ground)[-1] == "contact ended", "the end of the contact")
+        wait_for(lambda: runner.octets_received == len(stream), "the segment")
+        wait_for(lambda: contact_events(ground)[-1] == "contact ended", "the end of the contact")
         assert runner.alive
 
 
@@ -233,13 +234,13 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         assert entered.wait(20)
         service.release(ground, "lab", "first")
         assert service.acquire(ground, declared, "second", 60 * NS)
-        until(lambda: first.lost, "the lost lease")
+        wait_for(lambda: first.lost, "the lost lease")
         second = LinkRunner(ground, declared, "second")
         threading.Event().wait(0.3)
         held_by_second = second._hold_spool()
         go_on.set()
         assert not held_by_second
-        until(second._hold_spool, "the lock")
+        wait_for(second._hold_spool, "the lock")
         assert not list((ground.home / "incoming" / "link-lab").glob("*.segment"))
         assert first.octets_received == 3 * CADU
         assert second._lock is not None
@@ -270,7 +271,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
             fcntl.flock(lock, fcntl.LOCK_EX)
             assert not is_taken()
         assert is_taken() and service.get_link(ground, "lab").owner == supervisor.owner
-        until(lambda: held.read_text() == supervisor.owner, "the name of the next owner")
+        wait_for(lambda: held.read_text() == supervisor.owner, "the name of the next owner")
         assert ended_holder(ground.home, "lab") is None
     finally:
         supervisor.stop()
@@ -288,7 +289,9 @@ def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
     with (folder / "lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with operated(ground):
-            until(lambda: "holds the spool" in (service.get_link(ground, "lab").reason or ""), "the reason")
+            wait_for(
+                lambda: "holds the spool" in (service.get_link(ground, "lab").reason or ""), "the reason"
+            )
         assert segment.exists()
 
 

@@ -27,7 +27,8 @@ from ground_service.links.stream import ACKNOWLEDGEMENT, TRANSMISSION
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
 from tests.ground_service.archive_hash import archive_hash
-from tests.ground_service.links.conftest import Station, declare, operated, until
+from tests.ground_service.links.conftest import Station, declare, operated
+from tests.serving import wait_for
 from tmtc.uplink import UplinkDecoder
 
 CADU = 1279
@@ -89,9 +90,9 @@ def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
         first.close()
         second = station.accept()
         second.sendall(stream[cut:])
-        until(lambda: runner.octets_received >= len(stream) - CADU, "the archive")
+        wait_for(lambda: runner.octets_received >= len(stream) - CADU, "the archive")
         second.close()
-        until(lambda: hash_of(ground) == expected, "the same archive")
+        wait_for(lambda: hash_of(ground) == expected, "the same archive")
     assert service.get_link(ground, "lab").octets <= len(stream)
 
 
@@ -106,7 +107,7 @@ def test_octets_that_show_no_frame_are_ingested_after_a_rest_and_joined(
         start = 0
         for stop in (5 * CADU, 6 * CADU, len(stream)):
             connection.sendall(stream[start:stop])
-            until(lambda stop=stop: received_of(ground) == stop, f"{stop} octets in the archive")
+            wait_for(lambda stop=stop: received_of(ground) == stop, f"{stop} octets in the archive")
             start = stop
     assert hash_of(ground) == expected
 
@@ -122,14 +123,14 @@ def test_a_lone_frame_after_whole_frames_is_ingested_without_a_rest(
         connection = station.accept()
         for start, stop in ((0, 5), (5, 6), (6, 7)):
             connection.sendall(stream[start * CADU : stop * CADU])
-            until(lambda stop=stop: received_of(ground) == stop * CADU, f"{stop} frames in the archive")
+            wait_for(lambda stop=stop: received_of(ground) == stop * CADU, f"{stop} frames in the archive")
         connection.sendall(stream[7 * CADU : 8 * CADU - 9])
-        until(lambda: runner._spool.size == CADU - 9, "a part of a frame in the spool")
+        wait_for(lambda: runner._spool.size == CADU - 9, "a part of a frame in the spool")
         looks: list[float] = []
         monkeypatch.setattr(runner, "_show_state", lambda: looks.append(0.0))
-        until(lambda: len(looks) > 9, "looks at the connection")
+        wait_for(lambda: len(looks) > 9, "looks at the connection")
         connection.sendall(stream[8 * CADU - 9 : 8 * CADU])
-        until(lambda: received_of(ground) == 8 * CADU, "8 frames in the archive")
+        wait_for(lambda: received_of(ground) == 8 * CADU, "8 frames in the archive")
     with ground.database.reading() as connection_:
         octets = [one.octets for one in connection_.execute(select(repository.PIECES.c.octets))]
     assert octets[-3:] == [CADU, CADU, CADU]
@@ -145,7 +146,7 @@ def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
     (folder / "000000000003.segment").write_bytes(stream[: 4 * CADU + 9])
     (folder / "current").write_bytes(stream[4 * CADU + 9 :])
     with operated(either) as runner:
-        until(lambda: runner.octets_received == len(stream), "all octets")
+        wait_for(lambda: runner.octets_received == len(stream), "all octets")
     assert hash_of(either) == expected
 
 
@@ -173,18 +174,20 @@ def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
     keys = released(either, 3)
     with operated(either) as runner:
         connection = station.accept()
-        until(lambda: service.get_link(either, "lab").state == "connected", "the connection")
+        wait_for(lambda: service.get_link(either, "lab").state == "connected", "the connection")
         time.sleep(0.5)
         assert not station.telecommands and runner.commands_unsent == 3
         connection.sendall(stream)
-        until(lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands")
-        until(lambda: runner.commands_unsent == 0, "the record of the transmission")
-        until(lambda: contact_events(either)[-1] == "contact ended", "the end of the contact")
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
+        )
+        wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
+        wait_for(lambda: contact_events(either)[-1] == "contact ended", "the end of the contact")
         more = released(either)
         time.sleep(0.5)
         assert len(packets_of(bytes(station.telecommands))) == 3
         connection.sendall(stream[: 2 * CADU])
-        until(
+        wait_for(
             lambda: packets_of(bytes(station.telecommands))[3:] == octets_of(either, more), "the next contact"
         )
     assert contact_events(either).count("contact started") == 2
@@ -199,11 +202,13 @@ def test_manual_links_send_on_request_only(ground: Ground, station: Station, str
     keys = released(ground)
     with operated(ground):
         station.accept().sendall(stream[: 3 * CADU])
-        until(lambda: service.get_link(ground, "lab").state == "contact", "the contact")
+        wait_for(lambda: service.get_link(ground, "lab").state == "contact", "the contact")
         time.sleep(0.5)
         assert not station.telecommands
         assert service.request_send(ground, "lab", actor="ann").unsent == 1
-        until(lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, keys), "the telecommand")
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, keys), "the telecommand"
+        )
         later = released(ground)
         time.sleep(0.5)
         assert len(packets_of(bytes(station.telecommands))) == 1
@@ -227,7 +232,9 @@ def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
     assert service.get_link(either, "lab").unconfirmed == 1
     with operated(either, "living"):
         station.accept().sendall(stream[: 3 * CADU])
-        until(lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands")
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
+        )
         time.sleep(0.5)
         assert len(packets_of(bytes(station.telecommands))) == 2
     assert service.get_link(either, "lab").unconfirmed == 0
@@ -258,10 +265,10 @@ def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_conta
             rows = [stream[k * CADU : (k + 1) * CADU] for k in range(4 * contact, 4 * contact + 4)]
             connection.sendall(rows[0] + rows[1])
             wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
-            until(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
+            wait_for(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
             time.sleep(0.2)
             connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
-            until(
+            wait_for(
                 lambda n=contact: contact_events(ground).count("contact ended") > n, "the end of the contact"
             )
         sent = packets_of(bytes(station.telecommands))
@@ -313,7 +320,7 @@ def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Stati
             runner._follow_contact()
             return contact_events(ground) == ["contact started", "contact ended"]
 
-        until(ended, "the end of the contact")
+        wait_for(ended, "the end of the contact")
     finally:
         set_mission_clock(None)
         runner._stopping.set()
@@ -333,10 +340,10 @@ def test_expired_telecommands_are_not_sent(ground: Ground, station: Station, str
             repository.change(connection, repository.TELECOMMANDS, key, send_before_utc_ns=before)
     with operated(ground) as runner:
         station.accept().sendall(stream[: 3 * CADU])
-        until(
+        wait_for(
             lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, [timely]), "the telecommand"
         )
-        until(lambda: runner.commands_unsent == 0, "the record of the transmission")
+        wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
     assert get_command(ground, late).state == "released"
 
 
@@ -357,8 +364,8 @@ def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(
     )
     with operated(ground):
         station.accept().sendall(records(stream, utc_now_ns() + hours * 3600 * 10**9))
-        until(lambda: hash_of(ground) == expected, "the same archive")
-        until(lambda: service.get_link(ground, "lab").clock_offset_s is not None, "the offset")
+        wait_for(lambda: hash_of(ground) == expected, "the same archive")
+        wait_for(lambda: service.get_link(ground, "lab").clock_offset_s is not None, "the offset")
         link = service.get_link(ground, "lab")
     assert link.clock_offset_s == pytest.approx(hours * 3600, abs=PATIENCE_OF_CLOCK_S)
     assert (link.reason is not None and "the clock of the station differs" in link.reason) == wrong
@@ -372,7 +379,7 @@ def test_states_say_why_a_link_waits(ground: Ground, station: Station) -> None:
     assert service.get_link(ground, "lab").reason == "no process operates it"
     station.down.close()
     with operated(ground):
-        until(lambda: "refused" in (service.get_link(ground, "lab").reason or ""), "the reason")
+        wait_for(lambda: "refused" in (service.get_link(ground, "lab").reason or ""), "the reason")
         assert service.get_link(ground, "lab").state == "waiting"
 
 
@@ -384,7 +391,7 @@ def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(
         connection = station.accept()
         connection.sendall(stream[: 3 * CADU])
         connection.close()
-        until(lambda: service.get_link(ground, "lab").state == "failed", "the state")
+        wait_for(lambda: service.get_link(ground, "lab").state == "failed", "the state")
         assert service.get_link(ground, "lab").reason == "closed by the station"
 
 
@@ -396,13 +403,13 @@ def test_folders_are_watched_and_telecommands_written(
         ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n'
     )
     with operated(ground) as runner:
-        until(lambda: "expected a folder" in (service.get_link(ground, "lab").reason or ""), "the reason")
+        wait_for(lambda: "expected a folder" in (service.get_link(ground, "lab").reason or ""), "the reason")
         incoming.mkdir()
         outgoing.mkdir()
         (incoming / "pass.cadu").write_bytes(stream)
         keys = released(ground, 2)
-        until(lambda: list(outgoing.glob("*.cltu")), "the file")
-        until(lambda: runner.octets_received == len(stream), "the telemetry")
+        wait_for(lambda: list(outgoing.glob("*.cltu")), "the file")
+        wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
         assert hash_of(ground) == expected
     assert [path.name for path in outgoing.iterdir()] == ["lab-00000001.cltu"]
     assert packets_of((outgoing / "lab-00000001.cltu").read_bytes()) == octets_of(ground, keys)
@@ -416,7 +423,7 @@ def test_the_file_is_not_read_again_by_the_next_process(
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "pass.cadu").write_bytes(stream)
     with operated(ground) as runner:
-        until(lambda: runner.octets_received == len(stream), "the telemetry")
+        wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
     with operated(ground, "another") as runner:
         time.sleep(1.5)
         assert runner.octets_received == 0
@@ -512,7 +519,7 @@ def test_the_lease_is_kept_while_the_link_is_operated(ground: Ground, station: S
     with operated(ground):
         with ground.database.reading() as connection:
             first = store.find_link(connection, "lab")
-        until(
+        wait_for(
             lambda: service.get_link(ground, "lab").owner == "here" and _lease(ground) > first.lease_utc_ns,
             "a longer lease",
         )
@@ -556,7 +563,7 @@ def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_i
         keys = released(either, 2)
         with operated(either) as runner:
             station.accept().sendall(stream[: 2 * CADU])
-            until(lambda: runner.commands_unsent == 0, "the record of the transmission")
+            wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
         numbers, octets = zip(*station.transmissions, strict=True)
         assert len(numbers) == 3 and len(set(numbers)) == 1 and numbers[0] > 0
         assert packets_of(octets[-1]) == octets_of(either, keys)
@@ -584,16 +591,16 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
             other.start()
             try:
                 first.accept().sendall(stream[: 2 * CADU])
-                until(lambda: service.find_open_contact(either, "lab"), "the first contact")
+                wait_for(lambda: service.find_open_contact(either, "lab"), "the first contact")
                 keys = released(either, 2)
-                until(lambda: first.transmissions, "the refused transmission")
+                wait_for(lambda: first.transmissions, "the refused transmission")
                 # Also when its contact has ended, the station is asked.
-                until(
+                wait_for(
                     lambda: service.find_open_contact(either, "lab") is None, "the end of the first contact"
                 )
                 assert not second.transmissions and runner.commands_unsent == 2
                 second.accept().sendall(stream[2 * CADU : 4 * CADU])
-                until(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
+                wait_for(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
             finally:
                 other.stop()
         ((_, octets),) = second.transmissions
@@ -631,11 +638,11 @@ def test_telecommands_do_not_overtake_those_that_another_link_has(either: Ground
         transmission, earlier, later = held_elsewhere(either, station)
         with operated(either) as runner:
             station.accept().sendall(stream[: 2 * CADU])
-            until(lambda: runner.waits_for_others, "telecommands that wait")
+            wait_for(lambda: runner.waits_for_others, "telecommands that wait")
             assert not station.transmissions
             other = service.declared_links(either)["other"]
             assert service.hand_over(either, other, transmission) == "lab"
-            until(lambda: runner.commands_unsent == 0, "both transmissions")
+            wait_for(lambda: runner.commands_unsent == 0, "both transmissions")
             assert not runner.waits_for_others
         assert [packets_of(octets) for _, octets in station.transmissions] == [
             octets_of(either, earlier),
@@ -656,7 +663,7 @@ def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
         transmission, _, later = held_elsewhere(either, station)
         with operated(either) as runner:
             station.accept().sendall(stream[: 2 * CADU])
-            until(lambda: runner.commands_unsent == 0, "the later telecommands")
+            wait_for(lambda: runner.commands_unsent == 0, "the later telecommands")
         assert [packets_of(octets) for _, octets in station.transmissions] == [octets_of(either, later)]
         assert [one.id for one in service.pending_transmissions(either, "other")] == [transmission.id]
         assert log.warning.call_args.args[1:] == ("lab", later, "other")
@@ -705,13 +712,13 @@ def test_the_next_owner_knows_when_a_contact_was_heard_last(
     try:
         with operated(either) as runner:
             station.accept().sendall(stream)
-            until(lambda: runner.octets_received == len(stream), "all octets")
+            wait_for(lambda: runner.octets_received == len(stream), "all octets")
         assert service.find_open_contact(either, "lab") is not None
         now[0] += 2_000_000_000
         assert service.silent_contacts(either) == ["lab"]
         with operated(either, "next"):
             station.accept()
-            until(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
+            wait_for(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
         assert service.silent_contacts(either) == []
     finally:
         set_mission_clock()

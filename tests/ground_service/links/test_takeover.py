@@ -16,6 +16,7 @@ from ground_service.ground import open_ground
 from ground_service.links import service
 from tests.ground_service.links.conftest import Station, declare, until
 from tests.ground_service.links.test_links import hash_of, octets_of, packets_of, released
+from tests.serving import wait_for
 
 CADU = 1279
 
@@ -36,7 +37,7 @@ def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
         processes = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) for _ in range(2)]
         try:
             first = station.accept(60.0)
-            until(lambda: service.get_link(ground, "lab").owner is not None, "an owner", 60.0)
+            wait_for(lambda: service.get_link(ground, "lab").owner is not None, "an owner", 60.0)
             owner = service.get_link(ground, "lab").owner or ""
             (killed,) = [one for one in processes if f":{one.pid}:" in owner]
             before = released(ground, 2)
@@ -45,7 +46,7 @@ def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
             stored = 0
             while stored < 6 * CADU + 100:
                 stored = int.from_bytes(first.recv(8), "big")
-            until(
+            wait_for(
                 lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, before),
                 "the telecommands",
             )
@@ -54,10 +55,10 @@ def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
             after = released(ground)
             second = station.accept(60.0)
             second.sendall(stream[stored:])
-            until(
+            wait_for(
                 lambda: hash_of(ground) == expected_hash(tmp_path, synthetic_pass), "the same archive", 60.0
             )
-            until(
+            wait_for(
                 lambda: packets_of(bytes(station.telecommands))[2:] == octets_of(ground, after),
                 "the later telecommand",
                 60.0,

@@ -18,7 +18,8 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
-from tests.ground_service.links.conftest import Station, declare, operated, until
+from tests.ground_service.links.conftest import Station, declare, operated
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.link import LinkSettings
@@ -84,8 +85,8 @@ def test_the_clock_is_correlated_from_time_reports_of_a_link(
     octets = downlink(orbit, station_clock_s * NS)
     with operated(either) as runner:
         station.accept().sendall(octets)
-        until(lambda: runner.octets_received == len(octets), "the telemetry")
-        until(lambda: service.get_link(either, "lab").octets == len(octets), "its account")
+        wait_for(lambda: runner.octets_received == len(octets), "the telemetry")
+        wait_for(lambda: service.get_link(either, "lab").octets == len(octets), "its account")
     rows = [one for one in spacecraft_correlations(either, 76, "flight") if one.in_force]
     reports = spacecraft_time_reports(either, 76, "flight")
     if not is_used:

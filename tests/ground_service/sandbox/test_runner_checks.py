@@ -18,6 +18,7 @@ from ground_service.regression import runner
 from ground_service.sandbox import kernel, launcher
 from ground_service.sandbox.host import SandboxRefused
 from ground_service.sandbox.runner_checks import build_remains
+from tests.serving import wait_for
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can run processes as other users")
 
@@ -97,9 +98,7 @@ def process_of_build(program: Callable[[], None]) -> Iterator[int]:
     finally:
         launcher.kill_user(UID)
         os.waitpid(process, 0)
-        deadline = time.monotonic() + 20.0
-        while processes_of(UID) and time.monotonic() < deadline:  # until process 1 has reaped the orphans
-            time.sleep(0.01)
+        wait_for(lambda: not processes_of(UID), "orphans reaped by process 1")
 
 
 def share_memory() -> None:
@@ -182,11 +181,8 @@ def test_processes_of_another_pid_namespace_are_not_those_of_the_runner(shared: 
     ]
     with subprocess.Popen(command) as process:
         try:
-            deadline = time.monotonic() + 20.0
-            found: list[str] = []
-            while not found and time.monotonic() < deadline:
-                found = processes_of(UID)
-            assert found
+            wait_for(lambda: processes_of(UID), "the process")
+            found = processes_of(UID)
             assert not {f"process {number}" for number in found} & set(build_remains())
         finally:
             process.kill()

@@ -30,6 +30,7 @@ from ground_service.store.snapshot import create_schema
 from tests.ground_service.conftest import wait_for
 from tests.ground_service.schema import described_schema
 from tests.ground_service.store.schema_rules import RULE, breaking_changes
+from tests.serving import wait_for
 
 HEAD = known_revisions()[0]
 EXPANSION = f"9.1_works_with_{HEAD}"

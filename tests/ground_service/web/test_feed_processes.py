@@ -3,7 +3,6 @@
 import asyncio
 import shutil
 import threading
-import time
 import urllib.error
 import urllib.request
 import warnings
@@ -21,6 +20,7 @@ from ground_service.settings import Settings
 from ground_service.store import wakeups
 from ground_service.web import sockets
 from tests.ground_service.links.conftest import HEAD, Station
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -71,14 +71,6 @@ def keep_sending(connection: Any, stop: threading.Event) -> None:
         second += 1
 
 
-def until(reached: Callable[[], bool], what: str) -> None:
-    """Wait for a state, with patience."""
-    end = time.monotonic() + 60.0
-    while not reached():
-        assert time.monotonic() < end, what
-        time.sleep(0.02)
-
-
 def temperature_after(socket: Any) -> float:
     """Return the temperature of the next message with values."""
     while (message := socket.receive_json())["kind"] != "values":
@@ -119,7 +111,7 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
             assert temperature_after(socket) == 21.0  # by a wake-up: this process does not poll
 
             processes.parts["broker"].kill()
-            until(lambda: log.warning.called, "the loss of Redis is noticed")
+            wait_for(lambda: log.warning.called, "the loss of Redis is noticed")
             monkeypatch.setattr(sockets, "POLL_S", 0.1)
             client.app.state.sockets._committed.set()  # polls from now on
             connection.sendall(housekeeping(2, temperature_c=22.0))
@@ -127,7 +119,7 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
 
             monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
             processes.parts["broker"].start()
-            until(lambda: log.info.called, "the return of Redis is noticed")
+            wait_for(lambda: log.info.called, "the return of Redis is noticed")
             # The process that receives tries Redis again some time after its last attempt.
             stop = threading.Event()
             sender = threading.Thread(target=keep_sending, args=(connection, stop))

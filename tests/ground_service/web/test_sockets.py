@@ -1,7 +1,6 @@
 """WebSockets: closed after loss of authorisation, limited in number, and served from one feed."""
 
 import asyncio
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.settings import Settings
 from ground_service.store.events import publish
 from ground_service.web import sockets
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -210,9 +210,7 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
     ground = ground_of(client)
     with client.websocket_connect(LIVE) as socket:
         hub = client.app.state.sockets
-        until = time.monotonic() + 30.0
-        while not hub._readers and time.monotonic() < until:
-            time.sleep(0.01)
+        wait_for(lambda: hub._readers, "the session")
         (session,) = hub._readers
         monkeypatch.setattr(sockets, "QUEUED_LIMIT", 2)
 

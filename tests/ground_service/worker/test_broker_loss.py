@@ -16,7 +16,7 @@ from ground_service.worker.app import queued_jobs
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.scheduler import Scheduler
 from studies.mission_run.parts import RedisServer
-from tests.ground_service.conftest import wait_for
+from tests.serving import wait_for
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,6 +36,7 @@ from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import _lock_key, run_job
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.schema import described_schema
+from tests.serving import wait_for
 
 SPACECRAFT = 76
 
@@ -46,14 +46,11 @@ def job_row(ground: Ground, job_id: str) -> dict[str, Any]:
         return repository.get(connection, repository.JOBS, job_id, "job")
 
 
-def finished(ground: Ground, job_id: str, seconds: float = 180.0) -> dict[str, Any]:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        row = job_row(ground, job_id)
-        if row["state"] in ("done", "failed"):
-            return row
-        time.sleep(0.2)
-    raise AssertionError(f"job {job_id} did not end: {job_row(ground, job_id)}")
+def finished(ground: Ground, job_id: str) -> dict[str, Any]:
+    wait_for(
+        lambda: job_row(ground, job_id)["state"] in ("done", "failed"), f"the end of job {job_id}", 180.0
+    )
+    return job_row(ground, job_id)
 
 
 @pytest.fixture(scope="module")

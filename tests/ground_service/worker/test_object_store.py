@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator
@@ -33,6 +32,7 @@ from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
 from ground_service.worker.jobs import run_job
 from tests.ground_service.object_server import ObjectServer, running_objects
+from tests.serving import wait_for
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -87,15 +87,11 @@ def job_of(ground: Ground, key: str) -> dict[str, Any]:
         return repository.get(connection, repository.JOBS, key, "job")
 
 
-def result_of(ground: Ground, key: str, seconds: float = 180.0) -> dict[str, Any]:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        row = job_of(ground, key)
-        if row["state"] in ("done", "failed"):
-            assert row["state"] == "done", row
-            return dict(row["result"])
-        time.sleep(0.2)
-    raise AssertionError(f"job {key} did not end: {job_of(ground, key)}")
+def result_of(ground: Ground, key: str) -> dict[str, Any]:
+    wait_for(lambda: job_of(ground, key)["state"] in ("done", "failed"), f"the end of job {key}", 180.0)
+    row = job_of(ground, key)
+    assert row["state"] == "done", row
+    return dict(row["result"])
 
 
 @pytest.mark.campaign

@@ -18,12 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import uvicorn
 
-from ground_service.access.service import add_user
-from ground_service.app import create_app
-from ground_service.ground import ground_from_settings
-from ground_service.server import bind
 from ground_service.settings import Settings
 from linna.cli import run
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
@@ -34,6 +29,7 @@ from payload_emulator.flight.payload import FlightParameters, FlightTables, Payl
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft import new_board
+from tests.serving import served
 from tmtc.downlink import encode_cadus
 from tmtc.uplink import UplinkDecoder
 
@@ -77,25 +73,6 @@ class Spacecraft:
             packets += self.payload.step(image, attitude, int(ticks_from_utc_ns(self.utc_ns)), orders)
             orders = b""
         return encode_cadus(packets, spacecraft_id=SPACECRAFT)
-
-
-@contextmanager
-def served(settings: Settings) -> Iterator[list[str]]:
-    """A server of the deployment with one operator: the options that name it."""
-    with ground_from_settings(settings) as ground:
-        token = add_user(ground, "ann", "operator")
-    listener = bind("127.0.0.1", 0)
-    service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
-    thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
-    thread.start()
-    while not service.started and thread.is_alive():
-        time.sleep(0.05)
-    try:
-        yield ["--server", f"http://127.0.0.1:{listener.getsockname()[1]}", "--token", token]
-    finally:
-        service.should_exit = True
-        thread.join(60)
-        listener.close()
 
 
 @contextmanager
@@ -153,9 +130,11 @@ def reference_ephemeris(path: Path) -> Path:
     return path
 
 
-def operate(capsys: pytest.CaptureFixture[str], where: list[str], folder: Path) -> None:
+def operate(capsys: pytest.CaptureFixture[str], service: tuple[str, str], folder: Path) -> None:
+    url, token = service
+
     def linna(*words: Any) -> Any:
-        code = run([*map(str, words), *where, "--json"])
+        code = run([*map(str, words), "--server", url, "--token", token, "--json"])
         printed = capsys.readouterr()
         assert code == 0, printed.err
         return json.loads(printed.out)
@@ -198,8 +177,8 @@ def operate(capsys: pytest.CaptureFixture[str], where: list[str], folder: Path) 
 
 def test_a_day_on_a_laptop(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "operator"))
-    with served(Settings(home=tmp_path / "home")) as where:
-        operate(capsys, where, tmp_path)
+    with served(Settings(home=tmp_path / "home")) as service:
+        operate(capsys, service, tmp_path)
 
 
 @pytest.mark.campaign

@@ -20,6 +20,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.store import audit
 from ground_service.store.database import empty_database, open_database, prepare_database
 from tests.ground_service.conftest import free_port
+from tests.serving import wait_for
 
 SYSTEM = "/usr/sbin:/usr/bin:/sbin:/bin"
 DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
@@ -138,10 +139,7 @@ def server_time(ground: Ground) -> datetime:
 def next_second(ground: Ground) -> datetime:
     """Return the next full second, when it has passed."""
     chosen = server_time(ground).replace(microsecond=0) + timedelta(seconds=1)
-    until = time.monotonic() + 60.0
-    while server_time(ground) <= chosen:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    wait_for(lambda: server_time(ground) > chosen, "the next second")
     return chosen
 
 
@@ -149,14 +147,13 @@ def archive_all(ground: Ground) -> None:
     """Have the log so far archived, and wait until it is."""
     with ground.database.writing() as connection:
         segment = connection.execute(text("SELECT pg_walfile_name(pg_switch_wal())")).scalar_one()
-    until = time.monotonic() + 120.0
-    while True:
+
+    def is_archived() -> bool:
         with ground.database.reading() as connection:
             last = connection.execute(text("SELECT last_archived_wal FROM pg_stat_archiver")).scalar()
-        if last is not None and not last.endswith(".backup") and last >= segment:
-            return
-        assert time.monotonic() < until, f"{segment} was not archived; the last is {last}"
-        time.sleep(0.1)
+        return last is not None and not last.endswith(".backup") and last >= segment
+
+    wait_for(is_archived, f"{segment} in the archive", 120.0)
 
 
 def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
@@ -210,13 +207,12 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
     assert Path(base).name in server.script("restore-to.sh", str(server.data), target).stdout
     server.start()
     with open_ground(tmp_path / "home", database_url=server.url) as ground:
-        until = time.monotonic() + 120.0
-        while True:
+
+        def is_recovered() -> bool:
             with ground.database.snapshot() as connection:
-                if not connection.execute(text("SELECT pg_is_in_recovery()")).scalar():
-                    break
-            assert time.monotonic() < until
-            time.sleep(0.02)
+                return not connection.execute(text("SELECT pg_is_in_recovery()")).scalar()
+
+        wait_for(is_recovered, "the end of the recovery", 120.0)
         assert [one.name for one in users.list_users(ground)] == ["before", "in-the-backup"]
         with ground.database.snapshot() as connection:
             assert list(audit.broken_entries(connection)) == []

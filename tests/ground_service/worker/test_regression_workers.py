@@ -19,7 +19,7 @@ from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import run_job
-from tests.ground_service.conftest import wait_for
+from tests.serving import wait_for
 
 
 @pytest.fixture

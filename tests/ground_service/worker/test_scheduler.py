@@ -20,7 +20,7 @@ from ground_service.worker.scheduler import LEASE, LEASE_NS, Scheduler, has_sche
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
 from linna import cli
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import wait_for
+from tests.serving import wait_for
 
 
 class Recorder:

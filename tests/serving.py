@@ -1,0 +1,43 @@
+"""Waiting for a condition, and a service on a private port, for all tests."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import uvicorn
+
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.ground import ground_from_settings
+from ground_service.server import bind
+from ground_service.settings import Settings
+
+
+def wait_for(reached: Callable[[], Any], what: str, seconds: float = 60.0) -> None:
+    """Wait until a condition holds; fail if it never does."""
+    until = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < until, f"{what}: not reached within {seconds} s"
+        time.sleep(0.01)
+
+
+@contextmanager
+def served(settings: Settings, role: str = "operator") -> Iterator[tuple[str, str]]:
+    """Serve a deployment with the user ann; yield its URL and her token."""
+    with ground_from_settings(settings) as ground:
+        token = add_user(ground, "ann", role)
+    listener = bind("127.0.0.1", 0)
+    service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
+    thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        wait_for(lambda: service.started or not thread.is_alive(), "the server")
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", token
+    finally:
+        service.should_exit = True
+        thread.join(60)
+        listener.close()
