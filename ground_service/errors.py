@@ -158,7 +158,7 @@ class FileDamaged(StoreError):
 
 
 class NotFound(GroundError):
-    """No such thing in the database."""
+    """No such thing in the database: raised by every function that is given an id or a name of none."""
 
     def __init__(self, kind: str, key: object) -> None:
         super().__init__(f"{kind} {key}: not found")

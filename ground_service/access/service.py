@@ -161,13 +161,7 @@ def list_users(ground: Ground) -> list[User]:
 
 
 def get_user(ground: Ground, name: str) -> User:
-    """Return one user.
-
-    Raises
-    ------
-    NotFound
-        If there is no such user.
-    """
+    """Return one user."""
     with ground.database.reading() as connection:
         return User.of(dict(store.get_user(connection, name)))
 

@@ -58,13 +58,7 @@ def find_provider_user(connection: Connection, issuer: str, subject: str) -> Use
 
 
 def get_user(connection: Connection, name: str) -> UserRecord:
-    """Return a user.
-
-    Raises
-    ------
-    NotFound
-        There is no such user.
-    """
+    """Return a user."""
     user = find_user(connection, name)
     if user is None:
         raise NotFound("user", repr(name)[1:-1][:80])
@@ -131,13 +125,7 @@ def find_token(connection: Connection, sha256: str) -> TokenRecord | None:
 
 
 def get_token(connection: Connection, token_id: int, *, lock: bool = False) -> TokenRecord:
-    """Return a token and its user; `lock`: until the transaction ends.
-
-    Raises
-    ------
-    NotFound
-        There is no such token.
-    """
+    """Return a token and its user; `lock`: until the transaction ends."""
     query = _tokens().where(TOKENS.c.id == token_id)
     row = connection.execute(query.with_for_update() if lock else query).mappings().first()
     if row is None:

@@ -200,13 +200,7 @@ def _condition(row: AlarmRow) -> Condition:
 
 
 def get_alarm(connection: Connection, alarm_id: int) -> AlarmDetail:
-    """Return an alarm with its history.
-
-    Raises
-    ------
-    NotFound
-        There is no such alarm.
-    """
+    """Return an alarm with its history."""
     alarm = _alarm(connection, store.get(connection, alarm_id), utc_now_ns())
     return AlarmDetail(**alarm.model_dump(), history=store.history(connection, alarm_id))
 

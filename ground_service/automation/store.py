@@ -144,13 +144,7 @@ def add_action(
 
 
 def get_action(connection: Connection, action_id: int) -> AutomationAction:
-    """Return an action.
-
-    Raises
-    ------
-    NotFound
-        There is no such action.
-    """
+    """Return an action."""
     return _action(repository.get(connection, ACTIONS, action_id, "automation action"))
 
 

@@ -236,11 +236,6 @@ def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> UplinkSta
     """Return the telecommand channels of a spacecraft as the ingest that was entered last shows them.
 
     Telemetry that is ingested late counts as new: `received` states its time of reception.
-
-    Raises
-    ------
-    NotFound
-        There is no such spacecraft.
     """
     with ground.database.reading() as connection:
         find_vehicle(connection, spacecraft_id, instance)

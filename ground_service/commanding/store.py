@@ -144,13 +144,7 @@ def note_timeout(connection: Connection, command_id: int, now_utc_ns: int) -> bo
 
 
 def get_record(connection: Connection, command_id: int) -> CommandRecord:
-    """Return the row of a telecommand.
-
-    Raises
-    ------
-    NotFound
-        There is no such telecommand.
-    """
+    """Return the row of a telecommand."""
     return CommandRecord.of(repository.get(connection, TELECOMMANDS, command_id, TELECOMMAND.kind))
 
 

@@ -49,13 +49,7 @@ def keep_display(ground: Ground, key: str, given: DisplayIn, *, actor: str) -> D
 
 
 def delete_display(ground: Ground, key: str, *, actor: str) -> None:
-    """Delete a stored object.
-
-    Raises
-    ------
-    NotFound
-        There is no such object.
-    """
+    """Delete a stored object."""
     with ground.database.writing() as connection:
         if not store.remove(connection, key):
             raise NotFound("display", key)

@@ -30,13 +30,7 @@ def list_displays(connection: Connection, asked: Paging) -> PageOf[DisplaySummar
 
 
 def get(connection: Connection, key: str) -> Display:
-    """Return a stored object.
-
-    Raises
-    ------
-    NotFound
-        There is no such object.
-    """
+    """Return a stored object."""
     row = connection.execute(select(_OBJECTS).where(_OBJECTS.c.key == key)).mappings().first()
     if row is None:
         raise NotFound("display", key)

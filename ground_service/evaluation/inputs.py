@@ -103,13 +103,7 @@ def read_image(octets: bytes, name: str) -> NDArray[np.uint8]:
 
 
 def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassInputs:
-    """Everything that the evaluation of a pass needs, as stored now.
-
-    Raises
-    ------
-    NotFound
-        If there is no such pass.
-    """
+    """Everything that the evaluation of a pass needs, as stored now."""
     with ground.database.reading() as connection:
         record = passes.get_pass(connection, pass_id)
         span = pass_span(connection, record)

@@ -27,11 +27,6 @@ def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOv
 
     The columns of a series have equal length: UTC in seconds at the middle of each interval, minimum, maximum and mean
     error in metres, and whether a gap precedes the interval.
-
-    Raises
-    ------
-    NotFound
-        If the report does not exist.
     """
     sha256 = ground.read(store.get_report, report_id).json_sha256
     return ReportOverview(report_id=report_id, **_overview(ground.files, sha256, max_points))

@@ -16,13 +16,7 @@ _MISSIONS = repository.MISSIONS
 
 
 def get_report(connection: Connection, report_id: str) -> StoredReport:
-    """Return a report.
-
-    Raises
-    ------
-    NotFound
-        There is no such report.
-    """
+    """Return a report."""
     return StoredReport.of(repository.get(connection, _REPORTS, report_id, "report"))
 
 
@@ -51,13 +45,7 @@ def newest_reports(connection: Connection, pass_ids: Sequence[int]) -> list[Stor
 
 
 def list_reports(connection: Connection, pass_id: int, asked: Paging) -> PageOf[Report]:
-    """Return a page of the reports of a pass, newest first.
-
-    Raises
-    ------
-    NotFound
-        If the pass does not exist.
-    """
+    """Return a page of the reports of a pass, newest first."""
     get_pass(connection, pass_id)
     query = (
         select(

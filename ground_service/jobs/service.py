@@ -130,12 +130,6 @@ def unfinished_jobs(ground: Ground) -> list[str]:
 
 
 def get_job(ground: Ground, job_id: str) -> Job:
-    """Return a job.
-
-    Raises
-    ------
-    NotFound
-        There is no such job.
-    """
+    """Return a job."""
     with ground.database.reading() as connection:
         return store.get_job(connection, job_id)

@@ -48,13 +48,7 @@ def find_job(connection: Connection, job_id: str) -> Job | None:
 
 
 def get_job(connection: Connection, job_id: str) -> Job:
-    """Return a job.
-
-    Raises
-    ------
-    NotFound
-        There is no such job.
-    """
+    """Return a job."""
     return Job.of(repository.get(connection, JOBS, job_id, "job"))
 
 

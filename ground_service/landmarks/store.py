@@ -29,13 +29,7 @@ def landmarks_of_spacecraft(connection: Connection, spacecraft_id: int) -> list[
 
 
 def get_landmark(connection: Connection, landmark_id: int) -> LandmarkDetail:
-    """Return a landmark with its sightings.
-
-    Raises
-    ------
-    NotFound
-        There is no such landmark.
-    """
+    """Return a landmark with its sightings."""
     return LandmarkDetail.of(repository.get(connection, _LANDMARKS, landmark_id, "landmark"))
 
 

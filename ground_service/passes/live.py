@@ -36,26 +36,14 @@ def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
 
 
 def live_parameters(ground: Ground, spacecraft_id: int, instance: str) -> list[LiveParameter]:
-    """Return the newest value of every parameter.
-
-    Raises
-    ------
-    NotFound
-        There is no such spacecraft.
-    """
+    """Return the newest value of every parameter."""
     with ground.database.reading() as connection:
         newest = _newest(connection, find_vehicle(connection, spacecraft_id, instance))
     return [_described(packet, value) for packet in newest for value in packet.values]
 
 
 def newest_packets(ground: Ground, vehicle_id: int) -> list[NewestPacket]:
-    """Return the values of the newest packet of each kind of a vehicle.
-
-    Raises
-    ------
-    NotFound
-        There is no such vehicle.
-    """
+    """Return the values of the newest packet of each kind of a vehicle."""
     with ground.database.reading() as connection:
         return _newest(connection, get_vehicle(connection, vehicle_id))
 

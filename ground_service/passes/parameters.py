@@ -179,13 +179,7 @@ class InstrumentSamples:
 
 
 def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
-    """Return the parameters of a pass.
-
-    Raises
-    ------
-    NotFound
-        There is no such pass.
-    """
+    """Return the parameters of a pass."""
     with ground.database.reading() as connection:
         record = store.get_pass(connection, pass_id)
         span = pass_span(connection, record)
@@ -212,13 +206,7 @@ def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
 
 
 def spacecraft_parameters(ground: Ground, spacecraft_id: int, instance: str) -> list[ParameterInfo]:
-    """Return the parameters of a spacecraft with series, those of its mission description last.
-
-    Raises
-    ------
-    NotFound
-        There is no such spacecraft.
-    """
+    """Return the parameters of a spacecraft with series, those of its mission description last."""
     with ground.database.reading() as connection:
         found = declared_reading(connection, find_vehicle(connection, spacecraft_id, instance).id)
     declared = () if found is None else found.parameters.values()
@@ -306,13 +294,7 @@ def declared_parameters(definitions: PacketDefinitions) -> dict[str, DeclaredPar
 def series_source(
     connection: Connection, span: PassSpan, parameter: str
 ) -> tuple[SampleSource, PassSpan, str, str]:
-    """Return the source of the series of a parameter, its span, the name of its value there, and its unit.
-
-    Raises
-    ------
-    NotFound
-        There is no such parameter.
-    """
+    """Return the source of the series of a parameter, its span, the name of its value there, and its unit."""
     if parameter in PARAMETERS:
         unit = DICTIONARY.packet(OWN_PACKET).field(parameter).unit
         return KindSamples(OWN_PACKET, span.dictionary_version), span, parameter, unit

@@ -67,13 +67,7 @@ TREND_POINTS = 60
 
 
 def get_pass(ground: Ground, pass_id: int) -> PassDetail:
-    """Return a pass with its spacecraft, mission and newest reports.
-
-    Raises
-    ------
-    NotFound
-        There is no such pass.
-    """
+    """Return a pass with its spacecraft, mission and newest reports."""
     with ground.database.reading() as connection:
         return store.pass_detail(connection, pass_id)
 
@@ -159,13 +153,7 @@ def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Event]:
 
 
 def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEvent]:
-    """Return a page of the event reports of a spacecraft that match, newest first.
-
-    Raises
-    ------
-    NotFound
-        There is no such spacecraft.
-    """
+    """Return a page of the event reports of a spacecraft that match, newest first."""
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, asked.spacecraft_id, asked.instance).id
         span = vehicle_span(connection, vehicle, ns_of(asked.start), ns_of(asked.stop))
@@ -363,13 +351,7 @@ def trend_series(
 
 
 def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[Trend]:
-    """Return the trends of the housekeeping parameters of a spacecraft; see `vehicle_trends`.
-
-    Raises
-    ------
-    NotFound
-        There is no such spacecraft.
-    """
+    """Return the trends of the housekeeping parameters of a spacecraft; see `vehicle_trends`."""
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id
     return vehicle_trends(ground, vehicle)

@@ -28,13 +28,7 @@ _REPORTS_LISTED = 20
 
 
 def get_pass(connection: Connection, pass_id: int) -> PassRecord:
-    """Return a pass.
-
-    Raises
-    ------
-    NotFound
-        There is no such pass.
-    """
+    """Return a pass."""
     return PassRecord.of(repository.get(connection, _PASSES, pass_id, "pass"))
 
 

@@ -68,13 +68,7 @@ def add_request(
 
 
 def get_request(connection: Connection, request_id: int) -> StandingRequest:
-    """Return a request.
-
-    Raises
-    ------
-    NotFound
-        There is no such request.
-    """
+    """Return a request."""
     return _request(connection, repository.get(connection, _REQUESTS, request_id, "request"))
 
 
@@ -135,13 +129,7 @@ def set_plan(connection: Connection, plan: RequestPlan) -> None:
 
 
 def get_plan(connection: Connection, request_id: int) -> RequestPlan:
-    """Return the last plan of a request; an empty one before the first.
-
-    Raises
-    ------
-    NotFound
-        There is no such request.
-    """
+    """Return the last plan of a request; an empty one before the first."""
     found = repository.get(connection, _REQUESTS, request_id, "request")["plan"]
     if found is None:
         return RequestPlan(

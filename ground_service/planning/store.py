@@ -113,13 +113,7 @@ def delete_window(connection: Connection, window_id: int) -> None:
 
 
 def get_window(connection: Connection, window_id: int) -> Window:
-    """Return a window.
-
-    Raises
-    ------
-    NotFound
-        There is no such window.
-    """
+    """Return a window."""
     return _one(connection, window_id, Window)
 
 

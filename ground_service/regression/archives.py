@@ -303,25 +303,13 @@ def kept_archives(ground: Ground) -> list[KeptArchive]:
 
 
 def kept_archive(ground: Ground, digest: str) -> KeptArchive:
-    """Return a kept archive.
-
-    Raises
-    ------
-    NotFound
-        There is no such archive.
-    """
+    """Return a kept archive."""
     with ground.database.reading() as connection:
         return _shown(store.get_archive(connection, digest))
 
 
 def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
-    """Write a kept archive into a folder, checked again.
-
-    Raises
-    ------
-    NotFound
-        No archive of this identity is kept.
-    """
+    """Write a kept archive into a folder, checked again."""
     with ground.database.writing() as connection:
         record = store.use_archive(connection, digest, utc_now_ns())
     files = store_of(ground)

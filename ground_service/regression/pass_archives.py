@@ -80,13 +80,7 @@ def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArch
 
 
 def archive_of_pass(ground: Ground, pass_id: int) -> KeptArchive:
-    """Return the kept archive of a pass, which is kept now if there is none.
-
-    Raises
-    ------
-    NotFound
-        There is no such pass.
-    """
+    """Return the kept archive of a pass, which is kept now if there is none."""
     with ground.database.reading() as connection:
         kept = store.archives_of_pass(connection, pass_id)
     return kept_archive(ground, kept[0].digest) if kept else keep_pass(ground, pass_id)

@@ -283,13 +283,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
 
 
 def report_of(ground: Ground, regression_id: str) -> bytes:
-    """Return the HTML report of a regression.
-
-    Raises
-    ------
-    NotFound
-        There is no such regression.
-    """
+    """Return the HTML report of a regression."""
     with ground.database.reading() as connection:
         sha256 = store.get_report(connection, regression_id)
     return ground.files.get(sha256)

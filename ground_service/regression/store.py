@@ -46,13 +46,7 @@ def file_of_build(connection: Connection, digest: str) -> str:
 
 
 def get_build(connection: Connection, digest: str) -> Build:
-    """Return a registered build.
-
-    Raises
-    ------
-    NotFound
-        There is no such build.
-    """
+    """Return a registered build."""
     return _build(repository.get(connection, BUILDS, digest, "build"))
 
 
@@ -110,13 +104,7 @@ def remove_replaced(connection: Connection, pass_id: int, digest: str) -> list[A
 
 
 def get_archive(connection: Connection, digest: str) -> ArchiveRecord:
-    """Return a kept archive.
-
-    Raises
-    ------
-    NotFound
-        There is no such archive.
-    """
+    """Return a kept archive."""
     return _archive(repository.get(connection, ARCHIVES, digest, "archive"))
 
 
@@ -142,26 +130,14 @@ def list_archives(connection: Connection) -> list[ArchiveRecord]:
 
 
 def use_archive(connection: Connection, digest: str, now_utc_ns: int) -> ArchiveRecord:
-    """Note the use of a kept archive, which postpones its removal, and return it.
-
-    Raises
-    ------
-    NotFound
-        There is no such archive.
-    """
+    """Note the use of a kept archive, which postpones its removal, and return it."""
     if not change_if(connection, ARCHIVES, digest, {}, used_utc_ns=now_utc_ns):
         raise NotFound("archive", digest)
     return get_archive(connection, digest)
 
 
 def pin_archive(connection: Connection, digest: str, pinned: bool) -> None:
-    """Exclude an archive from removal, or include it again.
-
-    Raises
-    ------
-    NotFound
-        There is no such archive.
-    """
+    """Exclude an archive from removal, or include it again."""
     if not change_if(connection, ARCHIVES, digest, {}, pinned=int(pinned)):
         raise NotFound("archive", digest)
 
@@ -258,24 +234,12 @@ def add_regression(
 
 
 def get_regression(connection: Connection, regression_id: str) -> Regression:
-    """Return a regression.
-
-    Raises
-    ------
-    NotFound
-        There is no such regression.
-    """
+    """Return a regression."""
     return Regression.of(repository.get(connection, REGRESSIONS, regression_id, "regression"))
 
 
 def get_report(connection: Connection, regression_id: str) -> str:
-    """Return the SHA-256 of the report of a regression.
-
-    Raises
-    ------
-    NotFound
-        There is no such regression.
-    """
+    """Return the SHA-256 of the report of a regression."""
     return str(repository.get(connection, REGRESSIONS, regression_id, "regression")["html_sha256"])
 
 

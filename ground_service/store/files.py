@@ -226,13 +226,7 @@ class FileArchive:
         return octets
 
     def read(self, sha256: str, start: int, stop: int) -> bytes:
-        """Return octets [start, stop) of a stored file, fewer if it ends before.
-
-        Raises
-        ------
-        NotFound
-            If no file with this hash is stored.
-        """
+        """Return octets [start, stop) of a stored file, fewer if it ends before."""
         path = self.path(sha256)
         try:
             with path.open("rb") as stream:

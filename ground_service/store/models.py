@@ -32,6 +32,8 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
+from tmtc.dictionary import DICTIONARY
+
 NO_TICKS = -1
 """On-board time of a packet that carries none."""
 
@@ -228,7 +230,6 @@ STREAM_EDGES = Table(
 def samples(name: str, *columns: Column[Any]) -> Table:
     """Return a table of decoded samples.
 
-
     Packets and samples carry no foreign keys: they are written in bulk, in one transaction with what they
     point to, and a check per row would cost more than the row.
     """
@@ -244,50 +245,35 @@ def samples(name: str, *columns: Column[Any]) -> Table:
     )
 
 
+_COLUMN_TYPES = {"u8": SmallInteger, "u16": Integer, "u32": BigInteger}
+
 HOUSEKEEPING = samples(
     "housekeeping",
-    column("boot_count", Integer),
-    column("mode", SmallInteger),
-    column("frames_processed", BigInteger),
-    column("frames_bad", BigInteger),
-    column("detections_total", BigInteger),
-    column("packets_sent", BigInteger),
-    column("anchor_reads", BigInteger),
-    column("events_sent", BigInteger),
-    column("telecommands_accepted", Integer),
-    column("telecommands_rejected", Integer),
-    column("last_image_quality", SmallInteger),
-    column("temperature_c", Double),
-    column("bus_voltage_v", Double),
-    column("power_w", Double),
-    column("memory_used_kib", BigInteger),
-    column("queue_depth", Integer),
-    column("storage_used_permille", Integer),
-    column("model_hash", BigInteger),
-    column("parameters_hash", BigInteger),
-    column("catalogue_hash", BigInteger),
-    column("anchor_table_hash", BigInteger),
-    column("clock_status", SmallInteger),
-    column("watchdog_resets", Integer),
+    *(
+        column(one.name, Double if one.is_calibrated else _COLUMN_TYPES[one.type])
+        for one in DICTIONARY.packet("housekeeping").fields
+        if one.name != "structure_id"
+    ),
 )
 """Engineering values of a housekeeping report; `ticks` is the packet's time."""
 
 
-DETECTIONS = samples(
+def image_samples(name: str, *columns: Column[Any]) -> Table:
+    """Return a table of samples of an image; their `ticks` is the time of the image."""
+    return samples(name, column("packet_ticks", BigInteger), column("frame_number", BigInteger), *columns)
+
+
+DETECTIONS = image_samples(
     "detections",
-    column("packet_ticks", BigInteger),
-    column("frame_number", BigInteger),
     column("image_quality", SmallInteger),
     column("count", SmallInteger),
     column("items", LargeBinary),
 )
-"""Detections of one image; `ticks` is the image's time, `items` packed as `store.codec.DETECTION_ITEM`."""
+"""Detections of one image; `items` packed as `store.codec.DETECTION_ITEM`."""
 
 
-NAVIGATION_STATES = samples(
+NAVIGATION_STATES = image_samples(
     "navigation_states",
-    column("packet_ticks", BigInteger),
-    column("frame_number", BigInteger),
     column("estimator", SmallInteger),
     column("outcome", SmallInteger),
     optional("latitude_deg", Double),
@@ -302,13 +288,11 @@ NAVIGATION_STATES = samples(
     optional("nis", Float),
     column("matched", SmallInteger),
 )
-"""State of one on-board estimator; `ticks` is the image's time."""
+"""State of one on-board estimator."""
 
 
-FRAME_OUTCOMES = samples(
+FRAME_OUTCOMES = image_samples(
     "frame_outcomes",
-    column("packet_ticks", BigInteger),
-    column("frame_number", BigInteger),
     column("estimator", SmallInteger),
     column("outcome", SmallInteger),
     column("reset_trigger", SmallInteger),
@@ -319,7 +303,7 @@ FRAME_OUTCOMES = samples(
     optional("shift_north_m", Float),
     column("anchor_reads", BigInteger),
 )
-"""What one estimator made of one image; `ticks` is the image's time."""
+"""What one estimator made of one image."""
 
 
 EVENTS = samples(
@@ -351,28 +335,24 @@ VERIFICATIONS = samples(
 """A telecommand verification report (service 1); `ticks` is the packet's time."""
 
 
-FILTER_STATES = samples(
+FILTER_STATES = image_samples(
     "filter_states",
-    column("packet_ticks", BigInteger),
-    column("frame_number", BigInteger),
     column("values", LargeBinary),
     optional("innovation_degrees", Integer),
 )
-"""Estimate of the navigation filter with its covariance; `ticks` is the image's time.
+"""Estimate of the navigation filter with its covariance.
 
 `values` holds the state and its covariance as `store.codec.pack_filter_states` packs them; `innovation_degrees`
 are those of the NIS of the frame, None if the packet does not contain it (dictionary version 2).
 """
 
 
-IDENTIFICATIONS = samples(
+IDENTIFICATIONS = image_samples(
     "identifications",
-    column("packet_ticks", BigInteger),
-    column("frame_number", BigInteger),
     column("count", SmallInteger),
     column("items", LargeBinary),
 )
-"""Which catalogued crater each used detection of an image was taken for; `ticks` is the image's time.
+"""Which catalogued crater each used detection of an image was taken for.
 
 `items` packs pairs of detection (uint16) and crater (uint32), little-endian.
 """

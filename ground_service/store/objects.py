@@ -78,13 +78,7 @@ class ObjectStore:
             self._client().upload_fileobj(stream, *place.values(), ExtraArgs=extra, Config=parts)
 
     def read(self, sha256: str) -> Iterator[bytes]:
-        """Yield the octets of an object, block by block.
-
-        Raises
-        ------
-        NotFound
-            If there is no such object.
-        """
+        """Yield the octets of an object, block by block."""
         with self._errors():
             try:
                 found = self._client().get_object(Bucket=self.bucket, Key=self.key(sha256))

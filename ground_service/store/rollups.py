@@ -17,19 +17,12 @@ from sqlalchemy import Connection, LargeBinary, and_, bindparam, delete, func, o
 
 from ground_service.store.bulk import FEW_ROWS, insert_columns
 from ground_service.store.counters import hold
-from ground_service.store.models import ROLLUPS, SAMPLE_TABLES
+from ground_service.store.models import HOUSEKEEPING, NAVIGATION_STATES, ROLLUPS
 from lunar.arrays import FloatArray, IntArray
 
-STATE_VALUES = (
-    "latitude_deg", "longitude_deg", "altitude_m", "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
-    "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
-)  # fmt: skip
-HOUSEKEEPING_VALUES = (
-    "boot_count", "mode", "frames_processed", "frames_bad", "detections_total", "packets_sent", "anchor_reads",
-    "events_sent", "telecommands_accepted", "telecommands_rejected", "last_image_quality", "temperature_c",
-    "bus_voltage_v", "power_w", "memory_used_kib", "queue_depth", "storage_used_permille", "model_hash",
-    "parameters_hash", "catalogue_hash", "anchor_table_hash", "clock_status", "watchdog_resets",
-)  # fmt: skip
+HOUSEKEEPING_VALUES = tuple(one.name for one in HOUSEKEEPING.c if not one.primary_key)
+STATE_VALUES = tuple(one.name for one in NAVIGATION_STATES.c)[8:]
+"""Values of roll-ups: the columns after those of the image, the estimator and the outcome."""
 
 KINDS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
     "housekeeping": (1, None, HOUSEKEEPING_VALUES),
@@ -51,8 +44,6 @@ STATISTICS = 4
 """Numbers kept of each value: count, sum, least, greatest."""
 
 _TABLE: Any = ROLLUPS
-_SAMPLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
-_BLOCK_ROWS = 50_000
 
 _KEY = ("vehicle_id", "dictionary_version", "kind", "part", "level")
 _BUCKET = (_TABLE.c.bucket, _TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics)
@@ -191,33 +182,6 @@ def rolled_extent(
         )
     ).one()
     return int(row[0]), int(row[1] or 0), int(row[2] or 0)
-
-
-def build_rollups(connection: Connection) -> int:
-    """Make the roll-ups of all samples of a database that has none yet; how many samples were counted."""
-    if connection.execute(select(_TABLE.c.bucket).limit(1)).first() is not None:
-        return 0
-    counted = 0
-    for kind, (_, part_column, names) in KINDS.items():
-        table = _SAMPLES[kind]
-        wanted = [table.c.vehicle_id, table.c.dictionary_version, table.c.ticks]
-        wanted += [table.c[part_column]] if part_column else []
-        rows = connection.execution_options(yield_per=_BLOCK_ROWS).execute(
-            select(*wanted, *(table.c[name] for name in names)).order_by(
-                table.c.vehicle_id, table.c.dictionary_version
-            )
-        )
-        for block in rows.partitions(_BLOCK_ROWS):
-            found = np.array([tuple(row) for row in block], dtype=np.float64)
-            heads = np.array([(row[0], row[1], row[2]) for row in block], dtype=np.int64)
-            labels = [*([part_column] if part_column else []), *names]
-            for vehicle, version in np.unique(heads[:, :2], axis=0).tolist():
-                mine = (heads[:, 0] == vehicle) & (heads[:, 1] == version)
-                columns: dict[str, Any] = {"ticks": heads[mine, 2]}
-                columns.update({name: found[mine, 3 + i] for i, name in enumerate(labels)})
-                add_to_rollups(connection, vehicle, version, kind, columns)
-            counted += len(block)
-    return counted
 
 
 _Level = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]

@@ -43,13 +43,7 @@ def get_vehicle(connection: Connection, vehicle: int, kind: str = "vehicle") -> 
 
 
 def find_vehicle(connection: Connection, ccsds_id: int, instance: str) -> Vehicle:
-    """Return the vehicle of a spacecraft in one instance.
-
-    Raises
-    ------
-    NotFound
-        There is none.
-    """
+    """Return the vehicle of a spacecraft in one instance."""
     row = repository.find(connection, repository.VEHICLES, ccsds_id=ccsds_id, instance=instance)
     if row is None:
         raise NotFound("spacecraft", f"{ccsds_id} ({instance})")

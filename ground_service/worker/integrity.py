@@ -200,8 +200,6 @@ def _rebuild(connection: Connection, ground: Ground, good: set[str], found: _Fin
             ground.check_stopping()
             if one.state not in ("done", "failed"):
                 found.skip("unfinished ingests")
-            elif not one.has_piece:
-                found.damage("ingests", one.id, "expected the row of its piece, found none")
             elif one.sha256 in good:
                 found.count("raw files ingested again")
                 try:

@@ -7,12 +7,13 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import Connection, and_, func, select, text
+from sqlalchemy import Connection, and_, func, literal, select, text
 from sqlalchemy import Table as Table
 
 from ground_service.store import models
 from ground_service.store.rollups import PARAMETERS_CODE
 from ground_service.store.rows import insert_rows, row_blocks
+from ground_service.store.vehicles import FLOWN
 from tmtc.dictionary import DICTIONARY
 
 DERIVED = (models.PACKETS, models.PARAMETER_SAMPLES, *models.SAMPLE_TABLES, models.ROLLUPS)
@@ -23,6 +24,9 @@ ENTERED = (
     models.PASSES, models.RECEPTIONS, models.PACKET_DEFINITIONS,
 )  # fmt: skip
 """Tables that decide what follows from the raw files."""
+
+COUNTS = ("packets_stored", "packets_joined", "samples_stored")
+"""Columns of a piece that count what it gave."""
 
 FETCHED_ROWS = 20_000
 ROUNDING = 1e-9
@@ -44,7 +48,6 @@ class RecordedIngest(NamedTuple):
     id: int
     sha256: str
     state: str
-    has_piece: bool
 
 
 def database_faults(connection: Connection) -> list[str]:
@@ -87,12 +90,8 @@ def packets(connection: Connection) -> Iterator[tuple[int, bytes, bytes]]:
 
 def ingests(connection: Connection) -> list[RecordedIngest]:
     """Return all ingests, oldest first."""
-    table, pieces = models.INGESTS, models.PIECES
-    query = (
-        select(table.c.id, table.c.file_sha256, table.c.state, pieces.c.ingest_id.is_not(None))
-        .outerjoin(pieces, pieces.c.ingest_id == table.c.id)
-        .order_by(table.c.id)
-    )
+    table = models.INGESTS
+    query = select(table.c.id, table.c.file_sha256, table.c.state).order_by(table.c.id)
     return [RecordedIngest(*row) for row in connection.execute(query)]
 
 
@@ -101,10 +100,28 @@ def copy_entered(connection: Connection, writing: Connection) -> None:
     for table in models.METADATA.sorted_tables:
         if table in ENTERED:
             insert_rows(writing, table, row_blocks(connection, table))
+    ingests, pieces, vehicles, stored = models.INGESTS, models.PIECES, models.VEHICLES, models.FILES
+    # Ingests before version 1.0 have no piece: what their sender stated is not known.
+    piece = {
+        "ingest_id": ingests.c.id,
+        "scope": func.coalesce(vehicles.c.instance, FLOWN),
+        "spacecraft_id": vehicles.c.ccsds_id,
+        "file_sha256": ingests.c.file_sha256,
+        "octets": stored.c.octets,
+        "stream": literal(""),
+        "position": ingests.c.id,
+        "station": literal(""),
+    }
+    query = (
+        select(*piece.values(), *(literal(0) for _ in COUNTS))
+        .join(stored, stored.c.sha256 == ingests.c.file_sha256)
+        .outerjoin(vehicles, vehicles.c.id == ingests.c.vehicle_id)
+        .where(ingests.c.id.not_in(select(pieces.c.ingest_id)))
+    )
+    writing.execute(pieces.insert().from_select([*piece, *COUNTS], query))
     fresh = ("decoded_version", "redecoding_version", "redecoded_to", "redecode_until")
-    writing.execute(models.VEHICLES.update().values(dict.fromkeys(fresh)))
-    counts = dict.fromkeys(("packets_stored", "packets_joined", "samples_stored"), 0)
-    writing.execute(models.PIECES.update().values(links_tried=None, **counts))
+    writing.execute(vehicles.update().values(dict.fromkeys(fresh)))
+    writing.execute(pieces.update().values(links_tried=None, **dict.fromkeys(COUNTS, 0)))
 
 
 def rows(connection: Connection, table: Table) -> Rows:
