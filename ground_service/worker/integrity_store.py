@@ -121,7 +121,7 @@ def copy_entered(connection: Connection, writing: Connection) -> None:
     writing.execute(pieces.insert().from_select([*piece, *COUNTS], query))
     fresh = ("decoded_version", "redecoding_version", "redecoded_to", "redecode_until")
     writing.execute(vehicles.update().values(dict.fromkeys(fresh)))
-    writing.execute(pieces.update().values(links_tried=None, **dict.fromkeys(COUNTS, 0)))
+    writing.execute(pieces.update().values(waits=None, **dict.fromkeys(COUNTS, 0)))
 
 
 def rows(connection: Connection, table: Table) -> Rows:

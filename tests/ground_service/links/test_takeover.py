@@ -14,7 +14,7 @@ import pytest
 
 from ground_service.ground import open_ground
 from ground_service.links import service
-from tests.ground_service.links.conftest import Station, declare, until
+from tests.ground_service.links.conftest import Station, declare
 from tests.ground_service.links.test_links import hash_of, octets_of, packets_of, released
 from tests.serving import wait_for
 
