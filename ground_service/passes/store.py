@@ -69,7 +69,7 @@ def pass_detail(connection: Connection, pass_id: int) -> PassDetail:
 
 
 def list_passes(connection: Connection, asked: PassFilter) -> PageOf[PassSummary]:
-    """Return a page of the passes, newest first."""
+    """List the passes, newest first."""
     vehicles = repository.VEHICLES
     query = select(_PASSES, vehicles.c.ccsds_id.label("spacecraft_id"), vehicles.c.instance).join(
         vehicles, vehicles.c.id == _PASSES.c.vehicle_id
