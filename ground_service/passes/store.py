@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,16 @@ from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
 from ground_service.http.model import PageOf, Paging
 from ground_service.passes.model import PassDetail, PassFilter, PassRecord, PassSummary
 from ground_service.passes.samples import DetectionSamples, no_detections
-from ground_service.passes.span import PassSpan
 from ground_service.store import repository, telemetry
 from ground_service.store.codec import DETECTION_ITEM, unpack_detections
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import IntArray
-from reports.values import PassEvent
 from tmtc.dictionary import DICTIONARY
 from tmtc.event_texts import event_text
+
+if TYPE_CHECKING:
+    from ground_service.passes.span import PassSpan
+    from reports.values import PassEvent
 
 _PASSES = repository.PASSES
 _FRAMES = repository.PASS_FRAMES
@@ -363,6 +365,8 @@ def event_page(
 
 def _pass_events(rows: Sequence[tuple[Any, ...]], span: PassSpan) -> list[PassEvent]:
     """Return event reports of rows of `_EVENT_COLUMNS`."""
+    from reports.values import PassEvent  # a list of passes does not need it
+
     labels = DICTIONARY.labels("event_info", "event_id")
     utc_ns, correlation_ids = utc_ns_of_ticks(
         np.array([row[0] for row in rows], dtype=np.int64), span.correlations
