@@ -339,7 +339,7 @@ class Operations(Connection):
 
     @operation("GET /missions/{revision}")
     def get_mission(self, revision: str) -> missions.MissionDetail:
-        """Show a revision with its document."""
+        """Show a revision with its document; viewers see the hosts of webhooks only, not what may be a token."""
 
     @operation("GET /catalogues", reads="missions.store.list_catalogues")
     def list_catalogues(self) -> Listing[missions.HeldCatalogue]:
