@@ -51,6 +51,8 @@ class LocalClient(Client):
         return LocalTransport(self._ground, actor, background=background)
 
     def _page(self, reads: str, item: Any, path: str, query: dict[str, Any]) -> PageOf[Any]:
+        if not reads:
+            return super()._page(reads, item, path, query)
         module, _, name = reads.rpartition(".")
         work = getattr(import_module(f"ground_service.{module}"), name)
         _, asked = inspect.signature(work, eval_str=True).parameters.values()
