@@ -69,7 +69,7 @@ class Settings(BaseSettings):
     )
     clock_file: Path | None = Field(
         default=None,
-        description="File with the mission time of a simulated mission, written by `linna emulate --continuous`; "
+        description="File with the mission time of a simulated mission, written by `linna emulate --live`; "
         "default: the wall clock",
     )
     host: str = Field(default="127.0.0.1", description="Address that the HTTP server binds to")

@@ -7,21 +7,27 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
+
+from linna.parser import option
 
 Item = TypeVar("Item")
 _PLAIN_LINE_INTERVAL_S = 5.0
 
 
 def add_json_flag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout, everything else on stderr"
-    )
+    option(parser, "--json", bool, "print one JSON object on stdout, everything else on stderr")
 
 
-def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | None = None) -> None:
-    """Print `figures` as one JSON object if --json was given, else `text` (or the figures, a line each)."""
+def finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespace], int]) -> None:
+    """Add --json and the handler, after the options of a command."""
+    add_json_flag(parser)
+    parser.set_defaults(handler=handler)
+
+
+def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | None = None) -> int:
+    """Print `figures` as one JSON object if --json was given, else `text` (or the figures, a line each); return 0."""
     if getattr(arguments, "json", False):
         print(as_json(figures))
     elif text is not None:
@@ -29,6 +35,7 @@ def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | 
     else:
         for key, value in figures.items():
             print(f"{key}: {value}")
+    return 0
 
 
 def as_json(figures: Mapping[str, Any]) -> str:

@@ -82,6 +82,30 @@ class _Subcommands(argparse._SubParsersAction):  # type: ignore[type-arg]  # gen
         return super().add_parser(name, **options)
 
 
+def option(
+    parser: argparse._ActionsContainer, name: str, kind: Any = str, help: str = "", **words: Any
+) -> argparse.Action:
+    """Add an argument to a parser.
+
+    Parameters
+    ----------
+    name
+        As in the usage line, such as ``--step S``; the attribute comes first if the argument has no dash.
+    kind
+        Type of the value, `bool` for a switch, or the choices.
+    """
+    flags = [word for word in name.split() if word.startswith("-")] or name.split()[:1]
+    shown = tuple(name.split()[len(flags) :])
+    if shown:
+        words["metavar"] = shown if len(shown) > 1 else shown[0]
+        words |= {"nargs": len(shown)} if len(shown) > 1 else {}
+    if kind is bool:
+        words["action"] = "store_true"
+    else:
+        words["type" if callable(kind) else "choices"] = kind
+    return parser.add_argument(*flags, help=help, **words)
+
+
 def uses_colors() -> bool:
     """True if stdout is a terminal that shows colours and the user has not switched them off."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lunar.errors import DataFileError
-from lunar.frames import IauOrientation, Orientation, load_orientation
 
 if TYPE_CHECKING:
+    from lunar.frames import Orientation
     from lunar.gravity import GravityField
 
 
@@ -94,6 +94,8 @@ def find_data(path: Path | str | None) -> DataFolder:
 
 def default_orientation(data: DataFolder) -> Orientation:
     """Return the DE421 orientation if its file is present, otherwise the IAU series."""
+    from lunar.frames import IauOrientation, load_orientation
+
     if data.orientation_bpc is None:
         return IauOrientation()
     return load_orientation(data.orientation_bpc, data.orientation_tf)

@@ -36,9 +36,10 @@ from payload_emulator.flight.navigation.lost_in_space import (
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.session.camera import expose
 from payload_emulator.session.loading import onboard_catalogue
 from payload_emulator.session.scenario import DisturbancesSection, Scenario
-from payload_emulator.session.world import World, expose_frame
+from payload_emulator.session.world import World
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
@@ -161,12 +162,12 @@ def see_frames(
     world.terrain.release_thread()
     with ThreadPoolExecutor(max_workers=1) as renderer:
         # No more than a few frames lie ready at a time.
-        waiting = [renderer.submit(expose_frame, world, int(number)) for number in numbers[:2]]
+        waiting = [renderer.submit(expose, world, int(world.frame_utc_ns[number])) for number in numbers[:2]]
         rows = range(numbers.size)
         for row in progress(rows, numbers.size) if progress else rows:
             exposure = waiting.pop(0).result()
             if row + 2 < numbers.size:
-                waiting.append(renderer.submit(expose_frame, world, int(numbers[row + 2])))
+                waiting.append(renderer.submit(expose, world, int(world.frame_utc_ns[numbers[row + 2]])))
             seen = detector.detect(exposure.image, exposure.attitude[4:7])
             attitudes.append(exposure.camera_from_mcmf)
             owners.append(np.full(len(seen), row))

@@ -19,12 +19,13 @@ from pydantic import BaseModel, ValidationError
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
-from payload_emulator.session.flying import fly, timeline
 from payload_emulator.session.loading import network_octets
 from payload_emulator.session.mission import level_of, level_text, unseen_share
 from payload_emulator.session.scenario import Scenario, format_scenario
+from payload_emulator.session.schedule import fly_scenario, timeline
 from payload_emulator.session.scoring import JudgedSession, judge_session
+from payload_emulator.session.spacecraft import new_spacecraft
+from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.terrain.curation import Region
 
@@ -113,10 +114,10 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
     spacecraft = new_spacecraft(world, loaded)
     attitudes = np.full((world.frame_utc_ns.size, 3, 3), np.nan)
     packets: list[bytes] = []
-    for moment in progress(fly(world, spacecraft), len(timeline(world))):
-        packets += moment.packets
-        if moment.exposure is not None:
-            attitudes[moment.moment.frame] = moment.exposure.camera_from_mcmf
+    for turn in progress(fly_scenario(world, spacecraft), len(timeline(world))):
+        packets += turn.packets
+        if turn.exposure is not None:
+            attitudes[turn.moment.frame] = turn.exposure.camera_from_mcmf
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
     if judged is None:
         raise ScenarioError(

@@ -1,8 +1,8 @@
 """One pass twice: flown live over TCP and planned over the API, and the same downlink imported as an archive.
 
 The payload is the emulator's live session in accelerated time, without an operator of its own; nothing but the ground
-commands it. Its mission description comes from its mission port at the first contact. The archive holds the octets that
-a second receiver took from the same telemetry port, the same reference ephemeris and mission description.
+commands it, over the link of its mission description. The archive holds the octets that a second receiver took from the
+same telemetry port, the same reference ephemeris and mission description.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from ground_service.missions import store as missions
 from ground_service.planning.model import Window
 from ground_service.settings import Settings
 from ground_service.store import repository
-from linna.cli import run
 from lunar.datafolder import find_data
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc
-from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
-from payload_emulator.session.flying import SPACECRAFT_ID
-from payload_emulator.session.live import LivePayload
-from payload_emulator.session.mission import mission_text
+from payload_emulator.session.live import LiveSession
+from payload_emulator.session.mission import live_mission_text
 from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.spacecraft import SPACECRAFT_ID
+from payload_emulator.session.starting import load_scenario_payload
+from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import build_world
 from tests.serving import served, wait_for
+from tmtc.link import LinkSettings
 
 SCENARIO = """
 name = "live and archive"
@@ -68,6 +69,9 @@ OF_THE_IMPORT = {
     "created_utc": "time at which the report was made",
     "provenance.spacecraft": "an archive has an instance of the spacecraft of its own",
     "provenance.archive": "a live pass has no archive",
+    "packets.receptions": "the archive does not name the station",
+    "packets.octets": "records of the station have headers",
+    "packets.octets_skipped": "records of the station have headers",
 }
 """Fields that must differ, with the reason; all others are equal."""
 
@@ -97,6 +101,31 @@ def receive(port: int) -> tuple[bytearray, threading.Thread]:
     thread = threading.Thread(target=take)
     thread.start()
     return octets, thread
+
+
+def received(port: int) -> bytes:
+    """Return all that a port sends."""
+    octets, thread = receive(port)
+    thread.join(PATIENCE_S)
+    return bytes(octets)
+
+
+def without_headers(records: bytes) -> bytes:
+    """Return the CADUs of records."""
+    length = LinkSettings().cadu_length
+    starts = range(RECORD_HEADER.size, len(records), RECORD_HEADER.size + length)
+    return b"".join(records[start : start + length] for start in starts)
+
+
+def fly_until(live: LiveSession, utc_ns: int) -> None:
+    """Let simulated time pass until an instant, and wait for it."""
+    with socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=PATIENCE_S) as console:
+        console.sendall(f"until {format_utc(utc_ns)}\n".encode())
+        with console.makefile("r") as lines:
+            for line in lines:
+                if json.loads(line)["kind"] == "paused":
+                    return
+    raise AssertionError("the console ended")
 
 
 def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, window: Window) -> Path:
@@ -132,22 +161,24 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     world = build_world(parse_scenario(SCENARIO), data)
     loaded, reference, _ = load_scenario_payload(world, data)
     save_oem(reference, folder / "reference.oem")
-    mission = mission_text(world, data)
-    live = LivePayload(
+    live = LiveSession(
         world,
-        new_spacecraft(world, loaded),
-        rate=0.0,
+        loaded,
         paused=True,
-        has_operator=False,
-        mission=mission,
+        mission=lambda world, ports: live_mission_text(world, data, "127.0.0.1", ports),
     )
     flying = threading.Thread(target=live.run)
     flying.start()
     settings = Settings(home=folder / "home", allowed_hosts=("testserver",))
     try:
-        with served(settings) as (server, token), Client(server, token) as api:
-            where = ["--server", server, "--token", token]
+        with served(settings, "admin") as (server, token), Client(server, token) as api:
+            mission = received(live.ports["mission"]).decode()
+            captured, receiving = receive(live.ports["telemetry earth"])
+            api.add_mission(mission.encode())
             api.add_ephemeris(folder / "reference.oem")
+            clients = live.stations["earth"].telemetry.clients
+            wait_for(lambda: len(clients) == 2, "both receivers")
+            fly_until(live, START)
             window = api.add_window(
                 {
                     "name": "both",
@@ -158,35 +189,21 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
             ).id
             api.change_window(window, {"state": "approved"})
             api.uplink_window(window)
-            captured, receiving = receive(live.ports["telemetry"])
-            tcp = ["--tcp", f"127.0.0.1:{live.ports['telemetry']}"]
-            mission_port = ["--mission", f"127.0.0.1:{live.ports['mission']}"]
-            codes: list[int] = []
-            station = threading.Thread(
-                target=lambda: codes.append(run(["ingest", *tcp, *mission_port, *where]))
-            )
-            station.start()
-            wait_for(lambda: len(live._servers["telemetry"].clients) == 2, "both receivers", PATIENCE_S)
-            uplink = ["--tcp", f"127.0.0.1:{live.ports['telecommand']}"]
-            assert run(["command", "uplink", "--spacecraft-id", str(SPACECRAFT_ID), *uplink, *where]) == 0
-            with socket.create_connection(
-                ("127.0.0.1", live.ports["console"]), timeout=PATIENCE_S
-            ) as console:
-                console.sendall(b"run\n")
-                with console.makefile("r") as lines:
-                    for line in lines:
-                        message = json.loads(line)
-                        if "utc" in message and parse_utc(message["utc"]) >= UNTIL:
-                            break
-                console.sendall(b"quit\n")
+            wait_for(lambda: bool(live._uplinked), "telecommands")
+            wait_for(lambda: not any(one.unsent for one in api.list_links()), "all telecommands")
+            fly_until(live, UNTIL)
+            live.stopping.set()
             flying.join(PATIENCE_S)
             receiving.join(PATIENCE_S)
-            station.join(PATIENCE_S)
-            assert codes == [0]
+            wait_for(lambda: api.get_window(window).state == "processed", "the report of the window")
             planned = api.get_window(window)
             of_live = report_of(api, planned.pass_id, folder / "live.json")
             archive = write_archive(
-                folder / "archive", bytes(captured), folder / "reference.oem", mission, planned
+                folder / "archive",
+                without_headers(bytes(captured)),
+                folder / "reference.oem",
+                mission,
+                planned,
             )
             imported = api.import_archive(archive)
             of_archive = report_of(api, imported, folder / "archive.json")

@@ -20,12 +20,12 @@ from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
+from payload_emulator.session.regions import Box, in_boxes, observed_boxes
 from payload_emulator.session.scenario import parse_scenario
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import compare_reports, largest_relative
 from studies.mission_run.figures import _missing, contacts_until, trend
 from studies.mission_run.ground import EmbeddedGround
-from studies.mission_run.regions import Box, in_boxes, observed_boxes
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
 
@@ -210,7 +210,7 @@ def test_a_spacecraft_whose_port_was_taken_starts_with_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faults: int, starts: int | None
 ) -> None:
     """Between the choice of a port and its use another process can take it."""
-    files = SpacecraftFiles(*(tmp_path / name for name in "scdolej"))
+    files = SpacecraftFiles(*(tmp_path / name for name in "scdlej"))
     ours, theirs = socket.socketpair()
     started = []
 

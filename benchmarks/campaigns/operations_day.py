@@ -28,13 +28,11 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.campaigns._deployment import Deployment, Laptop, connected, service_environment, wait_until
+from benchmarks.campaigns._deployment import Deployment, Laptop, wait_until
 from ground_service.access.model import AuditFilter
 from ground_service.access.service import add_user
 from ground_service.access.store import list_audit
@@ -43,19 +41,19 @@ from ground_service.ground import Ground, open_ground
 from ground_service.worker.integrity import verify
 from linna.cli import run
 from lunar.timescales import format_utc, parse_utc
-from payload_emulator.session.flying import SPACECRAFT_ID
 from payload_emulator.session.scenario import load_scenario
+from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.parts import free_port, listens
 
 NS = 1_000_000_000
 DAY_NS = 86_400 * NS
-LEAD_S = 180
+LEAD_S = 300
 """From the payload's first moment to the first planned one: time for the telecommands to take effect."""
 
 AFTER_S = 90
 SLOW_RATE = 3
 """While the operators look; a pause would make the payload's odometries start again."""
-PATIENCE_S = 300.0
+PATIENCE_S = 120.0
 
 
 @dataclass(slots=True)
@@ -90,34 +88,24 @@ class Transcript:
             raise SystemExit(f"linna {' '.join(typed)}: exit status {code}: {told.getvalue().strip()}")
 
 
-class Payload:
-    """`linna emulate --live`, watched on its console."""
+OPERATIONS = "[automation]\nevaluate = true\n"
+"""Windows and critical telecommands need a second person, as without a statement of the mission."""
 
-    def __init__(self, scenario: str, log: Path) -> None:
-        self.telemetry, self.telecommands, console = free_port(), free_port(), free_port()
-        self.mission = free_port()
-        command = [
-            sys.executable,
-            "-m",
-            "linna",
-            "emulate",
-            scenario,
-            "--live",
-            "--no-operator",
-            "--paused",
-            "--rate",
-            "0",
-            "--port",
-            str(self.telemetry),
-            "--tc-port",
-            str(self.telecommands),
-            "--console-port",
-            str(console),
-            "--mission-port",
-            str(self.mission),
-        ]
+
+class Payload:
+    """`linna emulate --live --no-operator`, watched on its console."""
+
+    def __init__(self, scenario: str, folder: Path) -> None:
+        self.mission, telemetry, telecommands, console = (free_port() for _ in range(4))
+        (folder / "operations.toml").write_text(OPERATIONS)
+        words = [scenario, "--live", "--no-operator", "--paused", "--rate", "0", "--port", telemetry]
+        words += ["--tc-port", telecommands, "--console-port", console, "--mission-port", self.mission]
+        words += ["--operations", folder / "operations.toml"]
+        log = folder / "payload.log"
         with log.open("ab") as stream:
-            self.process = subprocess.Popen(command, stdout=stream, stderr=stream)
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "linna", "emulate", *map(str, words)], stdout=stream, stderr=stream
+            )
         wait_until(
             lambda: listens(console) or self.process.poll() is not None,
             f"payload ({log.read_text()[-300:]})",
@@ -125,6 +113,12 @@ class Payload:
         )
         self._console = socket.create_connection(("127.0.0.1", console), timeout=PATIENCE_S)
         self._messages = self._console.makefile("r")
+        self.order("watch")
+
+    def mission_text(self) -> bytes:
+        """Return the mission description with the links to the stations."""
+        with socket.create_connection(("127.0.0.1", self.mission), timeout=PATIENCE_S) as connection:
+            return connection.makefile("rb").read()
 
     def order(self, word: str) -> None:
         """A word to the console."""
@@ -156,41 +150,6 @@ class Payload:
             self.process.wait()
 
 
-@contextmanager
-def station(port: int, mission: int, server: str, token: str, home: Path, log: Path) -> Iterator[None]:
-    """`linna ingest --tcp`: telemetry is ingested as it arrives, after the mission description."""
-    command = [
-        sys.executable,
-        "-m",
-        "linna",
-        "ingest",
-        "--tcp",
-        f"127.0.0.1:{port}",
-        "--mission",
-        f"127.0.0.1:{mission}",
-        "--follow",
-        "--server",
-        server,
-    ]
-    with log.open("ab") as stream:
-        process = subprocess.Popen(
-            command,
-            stdout=stream,
-            stderr=stream,
-            env=service_environment(LINNA_HOME=str(home), LINNA_TOKEN=token),
-        )
-    try:
-        wait_until(lambda: connected(port), "the station's connection to the payload")
-        yield
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(60)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
 def rehearse(
     scenario: str, folder: Path, *, distributed: bool, minutes: float, echo: bool
 ) -> tuple[list[str], dict[str, Any]]:
@@ -201,25 +160,27 @@ def rehearse(
     try:
         with open_ground(service.home, database_url=service.url) as ground:
             tokens = {name: add_user(ground, name, "operator") for name in ("ann", "bob")}
+            tokens["eve"] = add_user(ground, "eve", "admin")
         desk = Transcript(["--server", service.api], tokens, echo)
         desk.say(f"# processes: payload, {', '.join(service.parts)}; users: {', '.join(tokens)}")
         refusals = [refuse_strangers(desk, api) for api in service.apis]
-        payload = Payload(scenario, folder / "payload.log")
+        payload = Payload(scenario, folder)
         now, mode = payload.fly()
         desk.say(
             f"# the payload is alive at {format_utc(now)[:19]}Z, mode {mode}; telemetry and telecommands over TCP"
         )
         with Client(service.apis[-1], tokens["bob"]) as api:
+            (folder / "mission.toml").write_bytes(payload.mission_text())
+            desk.linna("mission", "add", folder / "mission.toml", by="eve")
+            for state in ("connected", "contact"):
+                wait_until(
+                    lambda wanted=state: {one.state for one in api.list_links()} == {wanted},
+                    f"link: {state}",
+                    PATIENCE_S,
+                )
+                now, _ = payload.fly()
             window = plan(desk, api, scenario, folder, now, minutes)
-            with station(
-                payload.telemetry,
-                payload.mission,
-                service.api,
-                tokens["ann"],
-                folder / "station",
-                folder / "station.log",
-            ):
-                execute(desk, api, payload, window)
+            execute(desk, api, payload, window)
             payload.stop()
             figures = evaluate(desk, api, window, folder)
         with open_ground(service.home, database_url=service.url) as ground:
@@ -313,12 +274,11 @@ def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns:
 
 
 def execute(desk: Transcript, api: Client, payload: Payload, window: int) -> None:
-    """Uplink to the payload, and its flight through the window, followed by its telemetry."""
+    """Fly the payload through the window; the link sends it telecommands and receives its telemetry."""
     planned = api.get_window(window)
     start, stop = parse_utc(str(planned.start)), parse_utc(str(planned.stop))
-    desk.linna(
-        "command", "uplink", "--spacecraft-id", SPACECRAFT_ID, "--tcp", f"127.0.0.1:{payload.telecommands}"
-    )
+    wait_until(lambda: not any(one.unsent for one in api.list_links()), "telecommands sent", PATIENCE_S)
+    desk.linna("link", "list")
     for until, state in (((start + stop) // 2, "executing"), (stop + AFTER_S * NS, "downlinked")):
         now, mode = payload.fly(until)
         desk.say(f"# the payload at {format_utc(now)[:19]}Z: mode {mode}")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import inspect
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from sqlalchemy import Connection
 
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.errors import Forbidden, NotAuthorised
+from ground_service.http.common import GroundOf, linked
+from ground_service.http.model import PageOf
 from ground_service.http.uploads import Upload, UploadPool
 
 SESSION_COOKIE = "linna_session"
@@ -52,6 +57,27 @@ def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:
 Viewer = Annotated[Caller, Depends(requires("viewer"))]
 Operator = Annotated[Caller, Depends(requires("operator"))]
 Admin = Annotated[Caller, Depends(requires("admin"))]
+
+
+def add_list(
+    router: APIRouter, path: str, work: Callable[[Connection, Any], PageOf[Any]], role: Any = Viewer
+) -> None:
+    """Add the operation of a list: the name, docstring, filter and entity of the function that reads it.
+
+    A client in process calls the function without HTTP.
+    """
+    signature = inspect.signature(work, eval_str=True)
+    asked = list(signature.parameters.values())[1].annotation
+
+    def endpoint(ground: GroundOf, request: Request, asked: Any, **_: Any) -> PageOf[Any]:
+        return linked(request, ground.read(work, asked))
+
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    kinds = {"ground": GroundOf, "caller": role, "request": Request, "asked": Annotated[asked, Query()]}
+    parameters = [inspect.Parameter(name, keyword, annotation=kind) for name, kind in kinds.items()]
+    endpoint.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    functools.update_wrapper(endpoint, work, ("__name__", "__doc__"), ())
+    router.add_api_route(path, endpoint, methods=["GET"])
 
 
 async def upload_of(request: Request, _: Operator) -> AsyncIterator[Upload]:

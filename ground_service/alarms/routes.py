@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import Query, Request
-
-from ground_service.access.security import Operator, Viewer
+from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.alarms import service
-from ground_service.alarms.model import Acknowledgement, Alarm, AlarmDetail, AlarmFilter, Shelving
-from ground_service.http.common import GroundOf, RowId, linked
-from ground_service.http.model import PageOf
+from ground_service.alarms.model import Acknowledgement, AlarmDetail, Shelving
+from ground_service.http.common import GroundOf, RowId
 from ground_service.http.requests import operations
 
 alarms = operations("alarms")
 
 
-@alarms.get("/alarms")
-def list_alarms(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[AlarmFilter, Query()]
-) -> PageOf[Alarm]:
-    """List the alarms of all spacecraft, open ones first and the latest first."""
-    return linked(request, ground.read(service.list_alarms, asked))
+add_list(alarms, "/alarms", service.list_alarms)
 
 
 @alarms.get("/alarms/{alarm_id}")

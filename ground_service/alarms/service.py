@@ -67,7 +67,7 @@ def examine_packets(ground: Ground, vehicle: int) -> int:
 
 
 def list_alarms(connection: Connection, asked: AlarmFilter) -> PageOf[Alarm]:
-    """Return a page of the alarms, open ones first."""
+    """List the alarms of all spacecraft, open ones first and the latest first."""
     now = utc_now_ns()
     rows, total = store.list_alarms(connection, asked, now)
     return asked.page([_alarm(connection, row, now) for row in rows], total)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import Query, Request
-
-from ground_service.access.security import Operator, Viewer
+from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.automation import service, store
-from ground_service.automation.model import ActionFilter, AutomationAction, RuleInForce
-from ground_service.http.common import GroundOf, RowId, linked
+from ground_service.automation.model import AutomationAction, RuleInForce
+from ground_service.http.common import GroundOf, RowId
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
 
@@ -22,12 +18,7 @@ def list_automation_rules(ground: GroundOf, _: Viewer) -> PageOf[RuleInForce]:
     return PageOf.all_of(service.list_rules(ground))
 
 
-@automation.get("/automation/actions")
-def list_automation_actions(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[ActionFilter, Query()]
-) -> PageOf[AutomationAction]:
-    """List the actions of rules with their causes and results, newest first."""
-    return linked(request, ground.read(store.list_actions, asked))
+add_list(automation, "/automation/actions", store.list_automation_actions)
 
 
 @automation.post("/automation/actions/{action_id}/approve", responses=problems(404, 409))

@@ -158,8 +158,8 @@ def actions_of_event(connection: Connection, event: int) -> list[AutomationActio
     return [_action(dict(row)) for row in connection.execute(query).mappings()]
 
 
-def list_actions(connection: Connection, asked: ActionFilter) -> PageOf[AutomationAction]:
-    """Return a page of the actions, newest first."""
+def list_automation_actions(connection: Connection, asked: ActionFilter) -> PageOf[AutomationAction]:
+    """List the actions of rules with their causes and results, newest first."""
     rows, total = repository.newest(connection, ACTIONS, asked, state=asked.state, pass_id=asked.pass_id)
     return asked.page(map(_action, rows), total)
 

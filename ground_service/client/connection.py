@@ -9,17 +9,20 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, cast, get_args, get_origin, get_type_hints
 from urllib.parse import quote
 
-import httpx
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ground_service.client.problems import ServiceProblem, Unreachable, problem_of
 from ground_service.errors import InvalidInput
 from ground_service.http.model import PageOf
+
+if TYPE_CHECKING:
+    import httpx
 
 API_PREFIX = "/api/v1"
 
@@ -60,12 +63,23 @@ class Connection:
         if not server.startswith(("http://", "https://")):
             raise InvalidInput("--server", "", "a URL such as http://127.0.0.1:8042", repr(server))
         self._server = server.rstrip("/")
-        self._http = httpx.Client(
-            headers={"Accept": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {}),
+        self._token = token
+        self._given = transport
+
+    @cached_property
+    def _http(self) -> httpx.Client:
+        import httpx
+
+        token = {"Authorization": f"Bearer {self._token}"} if self._token else {}
+        return httpx.Client(
+            headers={"Accept": "application/json"} | token,
             timeout=TIMEOUT_S,
-            transport=transport,
-            verify=server.startswith("https://"),  # certificates take time to load
+            transport=self._transport(),
+            verify=self._server.startswith("https://"),  # certificates take time to load
         )
+
+    def _transport(self) -> httpx.BaseTransport | None:
+        return self._given
 
     def __enter__(self) -> Self:
         return self
@@ -75,9 +89,10 @@ class Connection:
 
     def close(self) -> None:
         """Close the connections."""
-        self._http.close()
+        if "_http" in vars(self):
+            self._http.close()
 
-    def _answer(self, kind: Any, verb: str, path: str, **request: Any) -> Any:
+    def _answer(self, kind: Any, verb: str, path: str, *, reads: str = "", **request: Any) -> Any:
         """Return the response to a request as an entity, a list of entities, a listing, or nothing."""
         if kind is type(None):
             self._send(verb, path, **request)
@@ -88,14 +103,15 @@ class Connection:
             return found.items if isinstance(found, PageOf) else found
         if get_origin(kind) is not Listing:
             return self._validated(kind, self._send(verb, path, **request))
-        query = request.pop("query")
+        query = request["query"]
+        return Listing(
+            lambda limit, offset: self._page(reads, item, path, query | {"limit": limit, "offset": offset})
+        )
 
-        def fetch(limit: int, offset: int) -> PageOf[Any]:
-            span = {"limit": limit, "offset": offset}
-            response = self._send(verb, path, query=query | span, **request)
-            return cast("PageOf[Any]", self._validated(PageOf[item], response))  # type: ignore[valid-type]
-
-        return Listing(fetch)
+    def _page(self, reads: str, item: Any, path: str, query: dict[str, Any]) -> PageOf[Any]:
+        """Return a page of a list; `reads` is the function of the service that reads it, if one alone does."""
+        found: PageOf[Any] = self._validated(PageOf[item], self._send("GET", path, query=query))
+        return found
 
     def _validated(self, kind: Any, response: httpx.Response) -> Any:
         try:
@@ -135,6 +151,8 @@ class Connection:
         Responses with Retry-After (the request was not processed) are repeated for `BUSY_S`. After a broken connection
         only safe requests and requests with an idempotency key are repeated: others may have been processed.
         """
+        import httpx
+
         repeatable = method == "GET" or key is not None
         given = dict(headers or {}) | ({} if key is None else {"Idempotency-Key": key})
         if isinstance(body, (bytes, Path)):
@@ -202,7 +220,7 @@ class Listing(Generic[Item]):
         return self._fetch(1, 0).total
 
 
-def operation(request: str, body: str | tuple[str, ...] = ()) -> Callable[[Method], Method]:
+def operation(request: str, body: str | tuple[str, ...] = (), reads: str = "") -> Callable[[Method], Method]:
     """Return a decorator of a method without statements, which then sends the request of an operation.
 
     Parameters
@@ -211,6 +229,8 @@ def operation(request: str, body: str | tuple[str, ...] = ()) -> Callable[[Metho
         Verb and path, such as ``GET /passes/{pass_id}``.
     body
         Argument that is the JSON body, or arguments that are its fields; None is left out.
+    reads
+        Function of the service that reads the list.
 
     Notes
     -----
@@ -248,7 +268,8 @@ def operation(request: str, body: str | tuple[str, ...] = ()) -> Callable[[Metho
             out = arguments.pop("out", None)
             if out is not None:
                 return self._download(verb, where, out, query=arguments, **options)
-            return self._answer(get_type_hints(method)["return"], verb, where, query=arguments, **options)
+            kind = get_type_hints(method)["return"]
+            return self._answer(kind, verb, where, reads=reads, query=arguments, **options)
 
         return cast("Method", send)
 

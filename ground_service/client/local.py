@@ -2,38 +2,29 @@
 
 from __future__ import annotations
 
-import asyncio
-import sys
-import threading
+import inspect
 import weakref
-from collections.abc import AsyncIterator, Iterator, Mapping
-from contextlib import ExitStack
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-import httpx
-from fastapi import FastAPI
-from starlette.routing import Match
-from starlette.types import ASGIApp, Receive, Scope, Send
+from pydantic import ValidationError
 
-from ground_service.access.service import Caller
-from ground_service.client.connection import API_PREFIX
 from ground_service.client.tasks import Client
-from ground_service.ground import Ground
-from ground_service.http import problems
-from ground_service.http.requests import PlainText
-from ground_service.http.uploads import UploadPool
-from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.routers import OPERATIONS
-from ground_service.store.events import Notify
+from ground_service.errors import GroundError
+
+if TYPE_CHECKING:
+    import httpx
+
+    from ground_service.ground import Ground
+    from ground_service.http.model import PageOf
 
 LOCAL_URL = "http://localhost"
-LOCAL_UPLOADS = 2
 
 
-def local_client(ground: Ground, actor: str, *, background: bool = False) -> Client:
-    """Return a client of an open ground service; closing the client closes the ground service.
+class LocalClient(Client):
+    """Client of an open ground service in this process, as administrator `actor`; closing it closes the service.
 
-    The client acts as administrator `actor`, because access to the local database implies full access.
+    Access to the local database implies full access. Lists are read directly, which takes no HTTP libraries.
 
     Parameters
     ----------
@@ -41,139 +32,36 @@ def local_client(ground: Ground, actor: str, *, background: bool = False) -> Cli
         Run jobs in a thread, so that their progress can be followed; otherwise each job finishes before its request
         returns.
     """
-    return Client(LOCAL_URL, transport=LocalTransport(ground, actor, background=background))
-
-
-def local_app(ground: Ground, actor: str, dispatcher: Dispatcher) -> ASGIApp:
-    """Return the ASGI application of the API for in-process callers, who act as administrator `actor`.
-
-    There are no network limits, and error messages are complete.
-    """
-    app = FastAPI()
-    app.state.ground = ground
-    app.state.local_caller = Caller(actor, "admin")
-    app.state.dispatcher = dispatcher
-    app.state.uploads = UploadPool(LOCAL_UPLOADS)
-    app.state.upload_limit_octets = sys.maxsize
-    app.state.operations = []
-    problems.install(app)
-    app.add_middleware(PlainText)
-    return OperationsOnDemand(app)
-
-
-class OperationsOnDemand:
-    """ASGI application that includes a router on the first request for one of its operations."""
-
-    def __init__(self, app: FastAPI) -> None:
-        self._app = app
-        self._missing = list(OPERATIONS)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        segment = scope["path"].removeprefix(f"{API_PREFIX}/").partition("/")[0]
-        self._missing.sort(key=lambda router: router.segment != segment)
-        while self._missing and not self._has_operation(scope):
-            routes = self._missing.pop(0).load()
-            self._app.include_router(routes)
-            self._app.state.operations += routes.routes
-        await self._app(scope, receive, send)
-
-    def _has_operation(self, scope: Scope) -> bool:
-        return any(route.matches(scope)[0] is Match.FULL for route in self._app.state.operations)
-
-
-class LocalDispatcher:
-    """Dispatcher that finishes every job before its request returns."""
-
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        """Submit a job and run it to completion."""
-        from ground_service.worker.dispatch import InlineDispatcher
-
-        return InlineDispatcher(self._ground).submit(kind, arguments, job_id=job_id)
-
-    def start(self, job_id: str) -> None:
-        """Run a submitted job to completion."""
-        from ground_service.worker.dispatch import InlineDispatcher
-
-        InlineDispatcher(self._ground).start(job_id)
-
-    def resume(self) -> None:
-        """Leave unfinished jobs of other processes to the server."""
-
-    def close(self) -> None:
-        """Do nothing: no job is running."""
-
-
-class FollowUpOnDemand:
-    """In-process follow-up work of events; its code is imported on the first event."""
-
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-        self._follow_up: Notify | None = None
-
-    def __call__(self, kinds: frozenset[str]) -> None:
-        if self._follow_up is None:
-            from ground_service.worker.follow_up import FollowUp
-
-            self._follow_up = FollowUp(self._ground, None)
-        self._follow_up(kinds)
-
-
-class LocalTransport(httpx.BaseTransport):
-    """HTTPX transport to an in-process application, with streamed request bodies and response bodies in memory.
-
-    The application runs in a daemon thread, so that a transport that is not closed does not keep Python from ending;
-    it is closed then.
-    """
 
     def __init__(self, ground: Ground, actor: str, *, background: bool = False) -> None:
+        super().__init__(LOCAL_URL)
         self._ground = ground
-        dispatcher = _background_dispatcher(ground) if background else LocalDispatcher(ground)
-        ground.database.listeners.add(FollowUpOnDemand(ground))
-        self._asgi = httpx.ASGITransport(local_app(ground, actor, dispatcher))
-        self._loop = asyncio.new_event_loop()
-        thread = threading.Thread(target=self._loop.run_forever, name="in-process service", daemon=True)
-        thread.start()
-        opened = ExitStack()
-        for close in (self._loop.close, ground.close, dispatcher.close, thread.join):
-            opened.callback(close)
-        opened.callback(self._loop.call_soon_threadsafe, self._loop.stop)
-        self._end = weakref.finalize(self, opened.close)
-
-    def handle_request(self, request: httpx.Request) -> httpx.Response:
-        try:
-            return asyncio.run_coroutine_threadsafe(self._exchange(request), self._loop).result()
-        except KeyboardInterrupt:
-            self._ground.stopping.set()  # a job stops between two transactions
-            raise
+        self._caller = (actor, background)
+        self._end = weakref.finalize(self, ground.close)
 
     def close(self) -> None:
+        """Close the service."""
+        super().close()
         self._end()
 
-    async def _exchange(self, request: httpx.Request) -> httpx.Response:
-        assert isinstance(request.stream, httpx.SyncByteStream)
-        passed = httpx.Request(
-            request.method, request.url, headers=request.headers, stream=_Blocks(request.stream)
-        )
-        response = await self._asgi.handle_async_request(passed)
-        octets = await response.aread()
-        return httpx.Response(response.status_code, headers=response.headers, stream=httpx.ByteStream(octets))
+    def _transport(self) -> httpx.BaseTransport:
+        from ground_service.client.transport import LocalTransport
+
+        actor, background = self._caller
+        return LocalTransport(self._ground, actor, background=background)
+
+    def _page(self, reads: str, item: Any, path: str, query: dict[str, Any]) -> PageOf[Any]:
+        if not reads:
+            return super()._page(reads, item, path, query)
+        module, _, name = reads.rpartition(".")
+        work = getattr(import_module(f"ground_service.{module}"), name)
+        _, asked = inspect.signature(work, eval_str=True).parameters.values()
+        stated = {key: value for key, value in query.items() if value is not None}
+        try:
+            found: PageOf[Any] = self._ground.read(work, asked.annotation.model_validate(stated))
+        except (GroundError, ValidationError):  # the operation states the fault
+            return super()._page("", item, path, query)
+        return found
 
 
-def _background_dispatcher(ground: Ground) -> Dispatcher:
-    from ground_service.worker.dispatch import ThreadDispatcher
-
-    return ThreadDispatcher(ground)
-
-
-class _Blocks(httpx.AsyncByteStream):
-    """Blocks of a request body, read on demand."""
-
-    def __init__(self, stream: httpx.SyncByteStream) -> None:
-        self._blocks: Iterator[bytes] = iter(stream)
-
-    async def __aiter__(self) -> AsyncIterator[bytes]:
-        for block in self._blocks:
-            yield block
+local_client = LocalClient

@@ -50,7 +50,7 @@ class Operations(Connection):
     ) -> jobs.Job:
         """Import a zipped pass archive: manifest, downlink, reference, catalogue and images."""
 
-    @operation("GET /passes")
+    @operation("GET /passes", reads="passes.store.list_passes")
     def list_passes(
         self,
         *,
@@ -201,7 +201,7 @@ class Operations(Connection):
     ) -> ingest.IngestAccepted:
         """Ingest a downlink, or a piece of one cut at any octet."""
 
-    @operation("GET /ingests")
+    @operation("GET /ingests", reads="ingest.store.list_ingests")
     def list_ingests(self) -> Listing[ingest.Ingest]:
         """List the ingests, newest first."""
 
@@ -261,7 +261,7 @@ class Operations(Connection):
     ) -> performance.MonthlyReport:
         """Add the report of a month of one instance; the same content gives the same report."""
 
-    @operation("GET /monthly-reports")
+    @operation("GET /monthly-reports", reads="performance.store.list_monthly_reports")
     def list_monthly_reports(self, *, spacecraft_id: int | None = None) -> Listing[performance.MonthlyReport]:
         """List the monthly reports, newest month first."""
 
@@ -273,7 +273,7 @@ class Operations(Connection):
 
     # landmarks
 
-    @operation("GET /landmarks")
+    @operation("GET /landmarks", reads="landmarks.store.list_landmarks")
     def list_landmarks(
         self, *, spacecraft_id: int | None = None, state: landmarks.LandmarkState | None = None
     ) -> Listing[landmarks.Landmark]:
@@ -313,13 +313,13 @@ class Operations(Connection):
     ) -> ephemerides.Ephemeris:
         """Add a reference ephemeris: OEM (text or XML), STK .e or Horizons CSV as the body, also compressed."""
 
-    @operation("GET /ephemerides")
+    @operation("GET /ephemerides", reads="ephemerides.store.list_ephemerides")
     def list_ephemerides(self) -> Listing[ephemerides.Ephemeris]:
         """List the reference ephemerides, newest first."""
 
     # jobs
 
-    @operation("GET /jobs")
+    @operation("GET /jobs", reads="jobs.store.list_jobs")
     def list_jobs(self, *, kind: str | None = None) -> Listing[jobs.Job]:
         """List the jobs, newest first; `kind` selects jobs of one kind."""
 
@@ -329,7 +329,7 @@ class Operations(Connection):
 
     # missions
 
-    @operation("GET /missions")
+    @operation("GET /missions", reads="missions.store.list_missions")
     def list_missions(self) -> Listing[missions.MissionRevision]:
         """List the revisions of mission descriptions, newest first."""
 
@@ -339,9 +339,9 @@ class Operations(Connection):
 
     @operation("GET /missions/{revision}")
     def get_mission(self, revision: str) -> missions.MissionDetail:
-        """Show a revision with its document."""
+        """Show a revision with its document; viewers see the hosts of webhooks only, not what may be a token."""
 
-    @operation("GET /catalogues")
+    @operation("GET /catalogues", reads="missions.store.list_catalogues")
     def list_catalogues(self) -> Listing[missions.HeldCatalogue]:
         """List the crater catalogues that the ground holds, newest first."""
 
@@ -387,7 +387,7 @@ class Operations(Connection):
     def search_windows(self, constraints: Document) -> planning.SearchResult:
         """Search candidate windows by constraints over a reference ephemeris."""
 
-    @operation("GET /windows")
+    @operation("GET /windows", reads="planning.store.list_windows")
     def list_windows(self, *, state: planning.WindowState | None = None) -> Listing[planning.Window]:
         """List the planned windows, newest first."""
 
@@ -459,7 +459,7 @@ class Operations(Connection):
 
     # requests
 
-    @operation("GET /requests")
+    @operation("GET /requests", reads="planning.request_store.list_requests")
     def list_requests(self) -> Listing[request_model.StandingRequest]:
         """List the standing requests, newest first."""
 
@@ -485,7 +485,7 @@ class Operations(Connection):
 
     # telecommands
 
-    @operation("GET /telecommands")
+    @operation("GET /telecommands", reads="commanding.service.list_telecommands")
     def list_telecommands(
         self, *, state: Literal["queued", "carried", "released", "rejected", "sent"] | None = None
     ) -> Listing[commanding.Telecommand]:
@@ -522,7 +522,7 @@ class Operations(Connection):
 
     # alarms
 
-    @operation("GET /alarms")
+    @operation("GET /alarms", reads="alarms.service.list_alarms")
     def list_alarms(
         self,
         *,
@@ -547,7 +547,7 @@ class Operations(Connection):
 
     # displays
 
-    @operation("GET /displays")
+    @operation("GET /displays", reads="displays.store.list_displays")
     def list_displays(self) -> Listing[displays.DisplaySummary]:
         """List the stored objects of the telemetry displays, the one that changed last first."""
 
@@ -571,7 +571,7 @@ class Operations(Connection):
     def list_automation_rules(self) -> list[automation.RuleInForce]:
         """List the rules in force by spacecraft, and the default rules of spacecraft without a mission description."""
 
-    @operation("GET /automation/actions")
+    @operation("GET /automation/actions", reads="automation.store.list_automation_actions")
     def list_automation_actions(
         self, *, state: automation.ActionState | None = None, pass_id: int | None = None
     ) -> Listing[automation.AutomationAction]:
@@ -591,7 +591,7 @@ class Operations(Connection):
 
     # regression
 
-    @operation("GET /builds")
+    @operation("GET /builds", reads="regression.store.list_builds")
     def list_builds(self) -> Listing[regression.Build]:
         """List the registered builds, newest first."""
 
@@ -635,7 +635,7 @@ class Operations(Connection):
     def start_analysis(self, request: Document, *, key: str | None = None) -> jobs.Job:
         """Return the metrics of one build (candidate and baseline alike) as a job, without a verdict."""
 
-    @operation("GET /regressions")
+    @operation("GET /regressions", reads="regression.store.list_regressions")
     def list_regressions(self) -> Listing[regression.RegressionSummary]:
         """List the verdicts, newest first."""
 

@@ -13,10 +13,13 @@ ServiceProblem
 
 from __future__ import annotations
 
-import httpx
+from typing import TYPE_CHECKING
 
 from ground_service.errors import GroundError
 from ground_service.http.model import Problem
+
+if TYPE_CHECKING:
+    import httpx
 
 
 class ServiceProblem(GroundError):

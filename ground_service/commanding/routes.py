@@ -5,18 +5,15 @@ from __future__ import annotations
 import base64
 from typing import Annotated, Any, Literal
 
-from fastapi import Query, Request, Response
+from fastapi import Query, Response
 
 from ground_service.access.idempotency import once
-from ground_service.access.security import Operator, Viewer
-from ground_service.clock import utc_now_ns
+from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.commanding import service as commanding
-from ground_service.commanding import store
 from ground_service.commanding.model import (
     CommandEntry,
     Rejection,
     Telecommand,
-    TelecommandFilter,
     UplinkState,
 )
 from ground_service.http.common import (
@@ -25,21 +22,14 @@ from ground_service.http.common import (
     OnceKey,
     RowId,
     SpacecraftId,
-    linked,
 )
-from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
 from ground_service.store.vehicles import FLOWN
 
 telecommands = operations("telecommands")
 
 
-@telecommands.get("/telecommands")
-def list_telecommands(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[TelecommandFilter, Query()]
-) -> PageOf[Telecommand]:
-    """List the telecommands with their verification, newest first."""
-    return linked(request, ground.read(store.list_telecommands, asked, utc_now_ns()))
+add_list(telecommands, "/telecommands", commanding.list_telecommands)
 
 
 @telecommands.post("/telecommands", status_code=201)

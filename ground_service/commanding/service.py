@@ -19,10 +19,18 @@ from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding import store
 from ground_service.commanding.approval import DEFAULT_POLICY, ApprovalPolicy
-from ground_service.commanding.model import CommandOctets, CommandRecord, CommandView, UplinkState
+from ground_service.commanding.model import (
+    CommandOctets,
+    CommandRecord,
+    CommandView,
+    Telecommand,
+    TelecommandFilter,
+    UplinkState,
+)
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import CommandsSent, CommandStateChanged, publish
 from ground_service.ground import Ground
+from ground_service.http.model import PageOf
 from ground_service.missions.store import approval_in_force, in_force
 from ground_service.store.counters import lock_spacecraft, next_telecommand
 from ground_service.store.vehicles import FLOWN, find_vehicle, get_vehicle, vehicle_id
@@ -230,6 +238,12 @@ def get_command(ground: Ground, command_id: int) -> CommandView:
     """Return a telecommand and its verification."""
     with ground.database.reading() as connection:
         return store.get_view(connection, command_id, utc_now_ns())
+
+
+def list_telecommands(connection: Connection, asked: TelecommandFilter) -> PageOf[Telecommand]:
+    """List the telecommands with their verification, newest first."""
+    views, total = store.list_views(connection, asked, utc_now_ns())
+    return asked.page((view.telecommand for view in views), total)
 
 
 def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> UplinkState:

@@ -13,11 +13,9 @@ from ground_service.commanding.model import (
     CommandOctets,
     CommandRecord,
     CommandView,
-    Telecommand,
     TelecommandFilter,
     UplinkChannel,
 )
-from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version
 from ground_service.store import repository
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
@@ -153,13 +151,12 @@ def get_view(connection: Connection, command_id: int, now_utc_ns: int) -> Comman
     return _view(connection, get_record(connection, command_id), now_utc_ns)
 
 
-def list_telecommands(
+def list_views(
     connection: Connection, asked: TelecommandFilter, now_utc_ns: int
-) -> PageOf[Telecommand]:
-    """Return a page of the telecommands, newest first."""
+) -> tuple[list[CommandView], int]:
+    """Return a page of the telecommands, newest first, and their number."""
     rows, total = repository.newest(connection, TELECOMMANDS, asked, state=asked.state)
-    views = (_view(connection, CommandRecord.of(row), now_utc_ns) for row in rows)
-    return asked.page((view.telecommand for view in views), total)
+    return [_view(connection, CommandRecord.of(row), now_utc_ns) for row in rows], total
 
 
 def views_of_window(connection: Connection, window_id: int, now_utc_ns: int) -> list[CommandView]:

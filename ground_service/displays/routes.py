@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Path, Request, Response
+from fastapi import Path, Response
 
-from ground_service.access.security import Operator, Viewer
+from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.displays import service, store
-from ground_service.displays.model import KEY_PATTERN, Display, DisplayIn, DisplaySummary
-from ground_service.http.common import GroundOf, PagingOf, linked
-from ground_service.http.model import PageOf
+from ground_service.displays.model import KEY_PATTERN, Display, DisplayIn
+from ground_service.http.common import GroundOf
 from ground_service.http.requests import operations, problems
 
 DisplayKey = Annotated[str, Path(pattern=KEY_PATTERN)]
@@ -18,10 +17,7 @@ DisplayKey = Annotated[str, Path(pattern=KEY_PATTERN)]
 displays = operations("displays")
 
 
-@displays.get("/displays")
-def list_displays(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[DisplaySummary]:
-    """List the stored objects of the telemetry displays, the one that changed last first."""
-    return linked(request, ground.read(store.list_displays, asked))
+add_list(displays, "/displays", store.list_displays)
 
 
 @displays.get("/displays/{key}")

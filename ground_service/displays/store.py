@@ -23,7 +23,7 @@ def count(connection: Connection) -> int:
 
 
 def list_displays(connection: Connection, asked: Paging) -> PageOf[DisplaySummary]:
-    """Return a page of the stored objects, the one that changed last first."""
+    """List the stored objects of the telemetry displays, the one that changed last first."""
     order = (_OBJECTS.c.changed_utc_ns.desc(), _OBJECTS.c.key)
     rows, total = repository.page(connection, select(*_LISTED), asked, *order)
     return asked.page(map(DisplaySummary.of, rows), total)

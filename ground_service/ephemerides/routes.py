@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query, Request
+from fastapi import Query
 
-from ground_service.access.security import Operator, UploadOf, Viewer
+from ground_service.access.security import Operator, UploadOf, add_list
 from ground_service.ephemerides import service, store
 from ground_service.ephemerides.model import Ephemeris
-from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, linked, upload_body
-from ground_service.http.model import PageOf
+from ground_service.http.common import API_PREFIX, GroundOf, Name, upload_body
 from ground_service.http.requests import operations
 
 EPHEMERIS_FILE = "CCSDS OEM (text or XML), STK .e or Horizons CSV file; also as .gz or .zip"
@@ -40,7 +39,4 @@ async def add_ephemeris(
     return await upload.run(add)
 
 
-@ephemerides.get("/ephemerides")
-def list_ephemerides(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[Ephemeris]:
-    """List the reference ephemerides, newest first."""
-    return linked(request, ground.read(store.list_ephemerides, asked))
+add_list(ephemerides, "/ephemerides", store.list_ephemerides)

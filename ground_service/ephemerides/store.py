@@ -54,7 +54,7 @@ def get_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
 
 
 def list_ephemerides(connection: Connection, asked: Paging) -> PageOf[Ephemeris]:
-    """Return a page of the ephemerides, newest first."""
+    """List the reference ephemerides, newest first."""
     rows, total = repository.newest(connection, EPHEMERIDES, asked)
     return asked.page(map(_ephemeris, rows), total)
 

@@ -28,15 +28,16 @@ from ground_service.ground import Ground
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
+from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.packet_accounting import packet_accounting
+from ground_service.passes.sample_store import code_labels, detection_samples, event_list
 from ground_service.passes.samples import (
     NavigationSamples,
     OutcomeSamples,
 )
 from ground_service.passes.span import PassSpan, pass_span
-from ground_service.passes.store import code_labels, detection_samples, event_list
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import Vehicle, get_vehicle
@@ -171,7 +172,7 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
         "ticks", "estimator", "frame_number", "outcome", "latitude_deg", "longitude_deg", "altitude_m",
         "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
     )  # fmt: skip
-    columns = passes.sample_arrays(connection, span, "navigation_states", names)
+    columns = sample_store.sample_arrays(connection, span, "navigation_states", names)
     outcomes = DICTIONARY.labels("navigation_state", "outcome")
     return tuple(
         NavigationSamples(
@@ -192,7 +193,7 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
 
 def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
     """Return the estimates of the navigation filter with their covariances, in time order; None without any."""
-    rows = passes.samples(connection, span, "filter_states", ("ticks", "values", "innovation_degrees"))
+    rows = sample_store.samples(connection, span, "filter_states", ("ticks", "values", "innovation_degrees"))
     if not rows["ticks"]:
         return None
     ticks, first = np.unique(np.array(rows["ticks"], dtype=np.int64), return_index=True)
@@ -208,7 +209,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
 
 def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
     """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
-    rows = passes.samples(connection, span, "identifications", ("ticks", "items"))
+    rows = sample_store.samples(connection, span, "identifications", ("ticks", "items"))
     if not rows["ticks"]:
         return None
     by_image = dict(zip(reversed(rows["ticks"]), reversed(rows["items"]), strict=True))
@@ -223,14 +224,14 @@ def identification_samples(connection: Connection, span: PassSpan) -> Identifica
 
 def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
     """Every report of a crater that the payload mapped itself, in time order, out of the packets."""
-    octets = passes.packet_octets(connection, span, APID_DETECTIONS)
+    octets = sample_store.packet_octets(connection, span, APID_DETECTIONS)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
     return mapped_craters(tables.get("landmarks"))
 
 
 def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
     """Return the statistics of the optional instruments of the payload, out of the packets."""
-    octets = passes.packet_octets(connection, span, APID_INSTRUMENTS)
+    octets = sample_store.packet_octets(connection, span, APID_INSTRUMENTS)
     names = tuple(one.name for one in instrument_telemetry())
     return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets), only=names))
 
@@ -240,7 +241,7 @@ def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamp
     names = (
         "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
     )  # fmt: skip
-    columns = passes.sample_arrays(connection, span, "frame_outcomes", names)
+    columns = sample_store.sample_arrays(connection, span, "frame_outcomes", names)
     outcomes = DICTIONARY.labels("frame_outcome", "outcome")
     triggers = DICTIONARY.labels("frame_outcome", "reset_trigger")
     return tuple(
@@ -357,7 +358,7 @@ def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[s
 
 def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:
     names = ("ticks", *(name for name, _ in _TRENDS))
-    columns = passes.sample_arrays(connection, span, "housekeeping", names)
+    columns = sample_store.sample_arrays(connection, span, "housekeeping", names)
     if len(columns["ticks"]) == 0:
         return ()
     utc_ns = span.utc_ns(columns["ticks"].tolist())
@@ -368,7 +369,7 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
 
 def _onboard_build(connection: Connection, span: PassSpan) -> str:
     """Return the hashes of model and parameters in the last housekeeping packet of a pass; empty without any."""
-    columns = passes.sample_arrays(connection, span, "housekeeping", ("model_hash", "parameters_hash"))
+    columns = sample_store.sample_arrays(connection, span, "housekeeping", ("model_hash", "parameters_hash"))
     if len(columns["model_hash"]) == 0:
         return ""
     model, parameters = int(columns["model_hash"][-1]), int(columns["parameters_hash"][-1])
@@ -377,7 +378,7 @@ def _onboard_build(connection: Connection, span: PassSpan) -> str:
 
 def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
     """Return the largest processor time of a step over the cadence, in percent of one core; None if unknown."""
-    octets = passes.packet_octets(connection, span, APID_PERFORMANCE)
+    octets = sample_store.packet_octets(connection, span, APID_PERFORMANCE)
     table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("performance",)).get("performance")
     if table is None or not len(table) or not cadence_s:
         return None

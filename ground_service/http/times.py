@@ -10,7 +10,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from ground_service.errors import InvalidInput
 from lunar.errors import LunarError
-from lunar.timescales import format_utc, parse_utc
+from lunar.utc import format_utc, parse_utc
 
 LATEST_UTC_NS = parse_utc("2130-01-01T00:00:00Z")
 """The on-board clock (48 bits of 2^-16 s since 2000) ends in 2136."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query, Request, Response
+from fastapi import Query, Response
 
-from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
+from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
 from ground_service.errors import InvalidInput
 from ground_service.http.common import (
     API_PREFIX,
@@ -14,12 +14,9 @@ from ground_service.http.common import (
     IdempotencyKey,
     Instance,
     Name,
-    PagingOf,
     RowId,
-    linked,
     upload_body,
 )
-from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.ingest import store
 from ground_service.ingest.model import Ingest, IngestAccepted
@@ -104,10 +101,7 @@ async def upload_telemetry(
     return IngestAccepted(ingest_id=ingest_id, job_id=job, sha256=stored.sha256, octets=stored.octets)
 
 
-@ingests.get("/ingests")
-def list_ingests(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[Ingest]:
-    """List the ingests, newest first."""
-    return linked(request, ground.read(store.list_ingests, asked))
+add_list(ingests, "/ingests", store.list_ingests)
 
 
 @ingests.get("/ingests/{ingest_id}")

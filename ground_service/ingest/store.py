@@ -339,7 +339,7 @@ def get_ingest(connection: Connection, ingest_id: int) -> Ingest:
 
 
 def list_ingests(connection: Connection, asked: Paging) -> PageOf[Ingest]:
-    """Return a page of the ingests, newest first."""
+    """List the ingests, newest first."""
     rows, total = repository.newest(connection, _INGESTS, asked)
     return asked.page(map(_ingest, rows), total)
 

@@ -53,7 +53,7 @@ def get_job(connection: Connection, job_id: str) -> Job:
 
 
 def list_jobs(connection: Connection, asked: JobFilter) -> PageOf[Job]:
-    """Return a page of the jobs, newest first."""
+    """List the jobs, newest first; `kind` selects jobs of one kind."""
     rows, total = repository.newest(connection, JOBS, asked, kind=asked.kind)
     return asked.page(map(Job.of, rows), total)
 

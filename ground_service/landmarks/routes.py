@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from fastapi import Query, Request
-
-from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, PassId, RowId, linked
-from ground_service.http.model import PageOf
+from ground_service.access.security import Operator, Viewer, add_list
+from ground_service.http.common import GroundOf, PassId, RowId
 from ground_service.http.requests import operations, problems
 from ground_service.landmarks import service, store
 from ground_service.landmarks.model import (
-    Landmark,
     LandmarkDecision,
     LandmarkDetail,
-    LandmarkFilter,
     LandmarkUpdate,
 )
 
 landmarks = operations("landmarks")
 
 
-@landmarks.get("/landmarks")
-def list_landmarks(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[LandmarkFilter, Query()]
-) -> PageOf[Landmark]:
-    """List the landmarks learned from flight, most passes first."""
-    return linked(request, ground.read(store.list_landmarks, asked))
+add_list(landmarks, "/landmarks", store.list_landmarks)
 
 
 @landmarks.get("/landmarks/{landmark_id}", responses=problems(404))

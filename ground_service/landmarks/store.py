@@ -34,7 +34,7 @@ def get_landmark(connection: Connection, landmark_id: int) -> LandmarkDetail:
 
 
 def list_landmarks(connection: Connection, asked: LandmarkFilter) -> PageOf[Landmark]:
-    """Return a page of the landmarks, most passes first."""
+    """List the landmarks learned from flight, most passes first."""
     query = select(*(one for one in _LANDMARKS.c if one.name != "evidence"))
     if asked.spacecraft_id is not None:
         query = query.where(_LANDMARKS.c.spacecraft_id == asked.spacecraft_id)

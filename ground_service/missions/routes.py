@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Body, Path, Query, Request
+from fastapi import Body, Path, Query
 
-from ground_service.access.security import Operator, UploadOf, Viewer
-from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, linked, upload_body
-from ground_service.http.model import PageOf
+from ground_service.access.security import Operator, UploadOf, Viewer, add_list
+from ground_service.http.common import API_PREFIX, GroundOf, Name, upload_body
 from ground_service.http.requests import operations
 from ground_service.missions import catalogues, service, store
-from ground_service.missions.model import HeldCatalogue, MissionDetail, MissionRevision
+from ground_service.missions.model import HeldCatalogue, MissionDetail
 
 UPLOAD_PATHS = (f"{API_PREFIX}/catalogues",)
 
@@ -21,10 +20,7 @@ Text = Annotated[bytes, Body(media_type="application/octet-stream", description=
 Revision = Annotated[str, Path(pattern=r"^[0-9a-f]{8,64}$", description="Hash or its first digits")]
 
 
-@missions.get("/missions")
-def list_missions(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[MissionRevision]:
-    """List the revisions of mission descriptions, newest first."""
-    return linked(request, ground.read(store.list_revisions, asked))
+add_list(missions, "/missions", store.list_missions)
 
 
 @missions.post("/missions", status_code=201)
@@ -50,10 +46,7 @@ def get_mission(ground: GroundOf, caller: Viewer, revision: Revision) -> Mission
     return found if caller.may("operator") else service.without_tokens(found)
 
 
-@missions.get("/catalogues")
-def list_catalogues(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[HeldCatalogue]:
-    """List the crater catalogues that the ground holds, newest first."""
-    return linked(request, ground.read(store.list_catalogues, asked))
+add_list(missions, "/catalogues", store.list_catalogues)
 
 
 @missions.post(

@@ -97,8 +97,8 @@ def detail(connection: Connection, mission_id: int) -> MissionDetail:
     return _detail(repository.get(connection, MISSIONS, mission_id, "mission revision"))
 
 
-def list_revisions(connection: Connection, asked: Paging) -> PageOf[MissionRevision]:
-    """Return a page of the revisions, newest first."""
+def list_missions(connection: Connection, asked: Paging) -> PageOf[MissionRevision]:
+    """List the revisions of mission descriptions, newest first."""
     rows, total = repository.newest(connection, MISSIONS, asked)
     return asked.page((_revision(row, _document(row)) for row in rows), total)
 
@@ -213,7 +213,7 @@ def get_catalogue(connection: Connection, sha256: str) -> HeldCatalogue:
 
 
 def list_catalogues(connection: Connection, asked: Paging) -> PageOf[HeldCatalogue]:
-    """Return a page of the held crater catalogues, newest first."""
+    """List the crater catalogues that the ground holds, newest first."""
     files = repository.FILES
     query = select(files).where(files.c.kind == CATALOGUE_KIND)
     rows, total = repository.page(connection, query, asked, files.c.received_utc_ns.desc(), files.c.sha256)

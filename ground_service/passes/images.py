@@ -11,7 +11,7 @@ from sqlalchemy import Connection
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
-from ground_service.passes import store
+from ground_service.passes import sample_store, store
 from ground_service.passes.model import Image
 from ground_service.passes.span import PassSpan, pass_span, vehicle_span
 from ground_service.store.vehicles import find_vehicle
@@ -97,7 +97,7 @@ def archived_image(ground: Ground, pass_id: int, frame_number: int, *, detection
 
 def _circles(connection: Connection, span: PassSpan, frame_number: int) -> FloatArray:
     """Return the detections of a frame (n, 3): u, v and diameter in pixels."""
-    samples = store.detection_samples(connection, span)
+    samples = sample_store.detection_samples(connection, span)
     rows = [
         np.arange(samples.offsets[k], samples.offsets[k + 1])
         for k in np.flatnonzero(samples.frame_number == frame_number)
@@ -171,7 +171,7 @@ def _camera_width_px(connection: Connection, vehicle: int) -> int | None:
 def _archived(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int) -> Iterator[Image]:
     for record in store.passes_with_images(connection, vehicle, start_utc_ns, stop_utc_ns):
         span = pass_span(connection, record)
-        rows = store.samples(connection, span, "detections", ("frame_number", "ticks"))
+        rows = sample_store.samples(connection, span, "detections", ("frame_number", "ticks"))
         ticks = dict(zip(rows["frame_number"], rows["ticks"], strict=True))
         numbers = [number for number in store.frame_files(connection, record.id) if number in ticks]
         for number, time_ns in zip(
@@ -198,7 +198,7 @@ def _downlinked(
     stop_utc_ns: int,
 ) -> Iterator[Image]:
     span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns + DELAY_NS)
-    rows = store.samples(connection, span, "detections", ("frame_number", "ticks"))
+    rows = sample_store.samples(connection, span, "detections", ("frame_number", "ticks"))
     reported = np.array([rows["frame_number"], rows["ticks"]], dtype=np.int64)
     drawable = _camera_width_px(connection, vehicle) is not None
     for one in {found.ticks: found for found in _thumbnails(connection, span)}.values():
@@ -220,7 +220,7 @@ def _downlinked(
 def _thumbnails(connection: Connection, span: PassSpan) -> Iterator[Thumbnail]:
     """Yield the thumbnails that were received completely in a span."""
     receiver = LargeDataReceiver()
-    octets = store.packet_octets(connection, span, APID_LARGE_DATA)
+    octets = sample_store.packet_octets(connection, span, APID_LARGE_DATA)
     cut = cut_packets(octets)
     for start, length in zip(cut.offsets.tolist(), cut.lengths.tolist(), strict=True):
         name, values = DICTIONARY.unpack(octets[start : start + length])

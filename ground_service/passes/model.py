@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -12,7 +12,9 @@ from ground_service.http.model import Entity, Given, InstanceName, Paging, Space
 from ground_service.http.times import GivenTime, UtcTime
 from ground_service.store.vehicles import FLOWN
 from ground_service.text import LINE_PATTERN_JSON
-from reports.values import PacketAccounting
+
+if TYPE_CHECKING:
+    from reports.values import PacketAccounting
 
 CorrelationId = Annotated[int, Field(description="Time correlation used; 0 is an ideal clock")]
 

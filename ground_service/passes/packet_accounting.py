@@ -18,7 +18,7 @@ from sqlalchemy import Connection
 from ground_service.ingest.core import Gap, account_sequence
 from ground_service.ingest.model import ReceivedLink
 from ground_service.ingest.store import Received, recordings_of_vehicle
-from ground_service.passes import store
+from ground_service.passes import sample_store
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import PassSpan
@@ -239,10 +239,10 @@ class _Images:
 
 
 def _images(connection: Connection, record: PassRecord, span: PassSpan) -> _Images:
-    images = store.sample_arrays(connection, span, "detections", ("ticks", "frame_number"))
+    images = sample_store.sample_arrays(connection, span, "detections", ("ticks", "frame_number"))
     # An observation ends at the first frame time at or after its planned end: up to one cadence after the span.
     later = replace(span, stop_ticks=span.stop_ticks + cadence_ticks(record))
-    events = store.sample_arrays(connection, later, "events", ("event_id", "frame_number"))
+    events = sample_store.sample_arrays(connection, later, "events", ("event_id", "frame_number"))
     started = events["frame_number"][events["event_id"] == STARTED]
     stopped = events["frame_number"][events["event_id"] == STOPPED]
     return _Images(

@@ -14,7 +14,7 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
-from ground_service.passes import store
+from ground_service.passes import sample_store, store
 from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
 from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, SampleSource
 from ground_service.passes.span import PassSpan, pass_span
@@ -164,7 +164,7 @@ class InstrumentSamples:
         self, connection: Connection, span: PassSpan, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
         """Return ``ticks`` and values (n,) in a span, in order of time."""
-        octets = store.packet_octets(connection, span, APID_INSTRUMENTS)
+        octets = sample_store.packet_octets(connection, span, APID_INSTRUMENTS)
         tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(self.packet,))
         if self.packet not in tables:
             return {"ticks": np.zeros(0, dtype=np.int64), **{name: np.zeros(0) for name in names}}
@@ -382,7 +382,7 @@ def packets_by_name(connection: Connection, span: PassSpan) -> Iterator[tuple[st
 
 def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
     apid = DICTIONARY.packet(packet).apid
-    octets = store.packet_octets(connection, span, apid)
+    octets = sample_store.packet_octets(connection, span, apid)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet,))
     records = packet_records(tables)
     if len(records) > RECORDS_LIMIT:

@@ -8,7 +8,7 @@ from fastapi import Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from ground_service.access.idempotency import once
-from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
+from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
 from ground_service.errors import InvalidInput
 from ground_service.http.common import (
     API_PREFIX,
@@ -44,9 +44,7 @@ from ground_service.passes.model import (
     ParameterSeries,
     PassDefinition,
     PassDetail,
-    PassFilter,
     PassParameters,
-    PassSummary,
     SpacecraftEvent,
     SpacecraftInstance,
     States,
@@ -92,12 +90,7 @@ async def upload_archive(
     return job
 
 
-@passes.get("/passes")
-def list_passes(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[PassFilter, Query()]
-) -> PageOf[PassSummary]:
-    """List the passes, newest first."""
-    return linked(request, ground.read(store.list_passes, asked))
+add_list(passes, "/passes", store.list_passes)
 
 
 @passes.post("/passes", status_code=201)

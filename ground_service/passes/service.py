@@ -20,7 +20,7 @@ from ground_service.http.times import UtcTime, ns_of
 from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
-from ground_service.passes import store
+from ground_service.passes import sample_store, store
 from ground_service.passes.cache import Cache
 from ground_service.passes.model import (
     Completeness,
@@ -35,6 +35,7 @@ from ground_service.passes.model import (
 )
 from ground_service.passes.packet_accounting import cadence_ticks, packet_accounting
 from ground_service.passes.parameters import series_source, state_unit
+from ground_service.passes.sample_store import detection_frames, detection_samples
 from ground_service.passes.series import (
     PARAMETERS,
     STATE_VALUES,
@@ -50,7 +51,6 @@ from ground_service.passes.span import (
     pass_span,
     vehicle_span,
 )
-from ground_service.passes.store import detection_frames, detection_samples
 from ground_service.passes.trends import trend_of
 from ground_service.store import rollups
 from ground_service.store.files import StoredFile
@@ -148,7 +148,7 @@ def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Event]:
     """Return a page of the event reports of a pass, in time order."""
     with ground.database.reading() as connection:
         _, span, _ = _opened(ground, connection, pass_id)
-        found, total = store.event_page(connection, span, asked, newest_first=False)
+        found, total = sample_store.event_page(connection, span, asked, newest_first=False)
     return asked.page((Event.of(asdict(one), time=one.utc_ns) for one in found), total)
 
 
@@ -157,7 +157,9 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, asked.spacecraft_id, asked.instance).id
         span = vehicle_span(connection, vehicle, ns_of(asked.start), ns_of(asked.stop))
-        found, total = store.event_page(connection, span, asked, severities=asked.severity, name=asked.name)
+        found, total = sample_store.event_page(
+            connection, span, asked, severities=asked.severity, name=asked.name
+        )
         passes = store.passes_of_vehicle(connection, vehicle, reported=False)
     return asked.page(
         (

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import Path, Query, Request, Response
+from fastapi import Path, Query, Response
 
-from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, Key, linked
-from ground_service.http.model import InstanceName, PageOf
+from ground_service.access.security import Operator, Viewer, add_list
+from ground_service.http.common import GroundOf, Key
+from ground_service.http.model import InstanceName
 from ground_service.http.requests import operations
 from ground_service.http.times import GivenTime, ns_of
 from ground_service.performance import service, store
-from ground_service.performance.model import MonthlyReport, MonthlyReportFilter, Performance
+from ground_service.performance.model import MonthlyReport, Performance
 from ground_service.store.vehicles import FLOWN
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
@@ -57,12 +57,7 @@ def add_monthly_report(
     return service.make_monthly_report(ground, spacecraft_id, month, instance=instance)
 
 
-@reports.get("/monthly-reports")
-def list_monthly_reports(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[MonthlyReportFilter, Query()]
-) -> PageOf[MonthlyReport]:
-    """List the monthly reports, newest month first."""
-    return linked(request, ground.read(store.list_monthly_reports, asked))
+add_list(reports, "/monthly-reports", store.list_monthly_reports)
 
 
 @reports.get(

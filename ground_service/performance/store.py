@@ -79,7 +79,7 @@ def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyR
 
 
 def list_monthly_reports(connection: Connection, asked: MonthlyReportFilter) -> PageOf[MonthlyReport]:
-    """Return a page of the monthly reports, newest month first."""
+    """List the monthly reports, newest month first."""
     query = select(_MONTHLY)
     if asked.spacecraft_id is not None:
         query = query.where(_MONTHLY.c.spacecraft_id == asked.spacecraft_id)

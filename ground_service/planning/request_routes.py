@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import Request, Response
+from fastapi import Response
 
 from ground_service.access.idempotency import once
-from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PagingOf, PassId, linked
-from ground_service.http.model import PageOf
+from ground_service.access.security import Operator, Viewer, add_list
+from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PassId
 from ground_service.http.requests import operations, problems
 from ground_service.planning import request_store, standing
 from ground_service.planning.request_model import (
@@ -22,10 +21,7 @@ from ground_service.planning.request_model import (
 requests = operations("requests")
 
 
-@requests.get("/requests")
-def list_requests(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[StandingRequest]:
-    """List the standing requests, newest first."""
-    return linked(request, ground.read(request_store.list_requests, asked))
+add_list(requests, "/requests", request_store.list_requests)
 
 
 @requests.post("/requests", status_code=201)

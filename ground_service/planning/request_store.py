@@ -78,7 +78,7 @@ def get_request_record(connection: Connection, request_id: int) -> RequestRecord
 
 
 def list_requests(connection: Connection, asked: Paging) -> PageOf[StandingRequest]:
-    """Return a page of the requests, newest first."""
+    """List the standing requests, newest first."""
     rows, total = repository.newest(connection, _REQUESTS, asked)
     return asked.page((_request(connection, row) for row in rows), total)
 

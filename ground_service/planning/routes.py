@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import Header, Query, Request, Response
+from fastapi import Header, Query, Response
 
 from ground_service.access.idempotency import once
-from ground_service.access.security import Operator, Viewer
+from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.commanding import service as commanding
 from ground_service.commanding.model import Telecommand
 from ground_service.http.common import (
@@ -17,7 +17,6 @@ from ground_service.http.common import (
     Instance,
     OnceKey,
     PassId,
-    linked,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.problems import PreconditionFailed
@@ -32,7 +31,6 @@ from ground_service.planning.model import (
     SearchResult,
     Window,
     WindowChange,
-    WindowFilter,
     WindowIn,
     WindowSearch,
 )
@@ -50,12 +48,7 @@ def search_windows(ground: GroundOf, _: Viewer, constraints: WindowSearch) -> Se
     return service.search_windows(ground, constraints)
 
 
-@planning.get("/windows")
-def list_windows(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[WindowFilter, Query()]
-) -> PageOf[Window]:
-    """List the planned windows, newest first."""
-    return linked(request, ground.read(store.list_windows, asked))
+add_list(planning, "/windows", store.list_windows)
 
 
 @planning.post("/windows", status_code=201, responses=problems(404))

@@ -18,6 +18,7 @@ from ground_service.evaluation.inputs import reference_of
 from ground_service.ground import Ground
 from ground_service.missions.service import mission_of_pass
 from ground_service.missions.store import detail
+from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import pass_span
@@ -127,7 +128,7 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
     """Write the received data of a live pass into a folder."""
     span = pass_span(connection, record)
     octets = b"".join(
-        passes.packet_octets(connection, span, apid)
+        sample_store.packet_octets(connection, span, apid)
         for apid in sorted({definition.apid for definition in DICTIONARY.telemetry})
     )
     if not octets:
@@ -148,7 +149,7 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
     ):
         if sha256 is not None:
             shutil.copyfile(ground.files.path(sha256), folder / name)
-    frames = len(passes.detection_frames(connection, span)[0])
+    frames = len(sample_store.detection_frames(connection, span)[0])
     camera = mission.camera
     manifest = {
         "schema_version": 1,

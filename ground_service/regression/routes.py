@@ -5,9 +5,9 @@ from __future__ import annotations
 import uuid
 from typing import Annotated
 
-from fastapi import Path, Query, Request, Response
+from fastapi import Path, Query, Response
 
-from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
+from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
 from ground_service.access.service import Caller
 from ground_service.errors import Forbidden
 from ground_service.ground import Ground
@@ -16,12 +16,9 @@ from ground_service.http.common import (
     GroundOf,
     IdempotencyKey,
     Key,
-    PagingOf,
     PassId,
-    linked,
     upload_body,
 )
-from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
@@ -43,7 +40,6 @@ from ground_service.regression.model import (
     Pruned,
     Regression,
     RegressionRequest,
-    RegressionSummary,
 )
 from ground_service.regression.pass_archives import keep_pass
 from ground_service.store.files import StoredFile
@@ -55,10 +51,7 @@ Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$", description="Identity of
 regressions = operations("regression")
 
 
-@regressions.get("/builds")
-def list_builds(ground: GroundOf, _: Viewer, request: Request, asked: PagingOf) -> PageOf[Build]:
-    """List the registered builds, newest first."""
-    return linked(request, ground.read(store.list_builds, asked))
+add_list(regressions, "/builds", store.list_builds)
 
 
 @regressions.post("/builds", status_code=201, openapi_extra=upload_body("Zip file of a build"))
@@ -173,12 +166,7 @@ def start_analysis(
     return get_job(ground, job)
 
 
-@regressions.get("/regressions")
-def list_regressions(
-    ground: GroundOf, _: Viewer, request: Request, asked: PagingOf
-) -> PageOf[RegressionSummary]:
-    """List the verdicts, newest first."""
-    return linked(request, ground.read(store.list_regressions, asked))
+add_list(regressions, "/regressions", store.list_regressions)
 
 
 @regressions.get("/regressions/{regression_id}")

@@ -58,7 +58,7 @@ def find_build(connection: Connection, beginning: str) -> str | None:
 
 
 def list_builds(connection: Connection, asked: Paging) -> PageOf[Build]:
-    """Return a page of the builds, newest first."""
+    """List the registered builds, newest first."""
     rows, total = repository.newest(connection, BUILDS, asked)
     return asked.page(map(_build, rows), total)
 
@@ -244,7 +244,7 @@ def get_report(connection: Connection, regression_id: str) -> str:
 
 
 def list_regressions(connection: Connection, asked: Paging) -> PageOf[RegressionSummary]:
-    """Return a page of the regressions, newest first."""
+    """List the verdicts, newest first."""
     rows, total = repository.newest(connection, REGRESSIONS, asked)
     return asked.page((Regression.of(row).summary() for row in rows), total)
 

@@ -20,13 +20,14 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, BinaryIO
 
 from ground_service.errors import FileDamaged, NotFound, StoreError, storage_error
 from ground_service.store.objects import ObjectStore
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 BLOCK_OCTETS = 1 << 20
 
@@ -359,6 +360,8 @@ def read_blocks(path: Path, start: int = 0, stop: int | None = None) -> Iterator
 
 def mapped_octets(path: Path) -> NDArray[np.uint8]:
     """Return the octets of a file as a memory map, which is closed with the last reference to it."""
+    import numpy as np
+
     try:
         with path.open("rb") as stream:
             if not os.fstat(stream.fileno()).st_size:

@@ -55,6 +55,7 @@ async def _watched(session: Session) -> None:
             socket, f"no payload answers at {address[0]}:{address[1]}; start it with linna emulate --live"
         )
         return
+    writer.write(b"watch\n")
     await socket.send_json({"kind": "connected"})
     try:
         await _relay(session, reader, writer)

@@ -6,13 +6,12 @@ import argparse
 from pathlib import Path
 
 from linna.output import add_json_flag, emit
+from linna.parser import option
 
 
 def configure(landmarks: argparse.ArgumentParser) -> None:
-    landmarks.add_argument("downlink", type=Path, metavar="FILE", help="downlink (CADUs or packets)")
-    landmarks.add_argument(
-        "--catalogue", metavar="F", help="catalogue to compare with (default: the available one)"
-    )
+    option(landmarks, "downlink FILE", Path, "downlink (CADUs or packets)")
+    option(landmarks, "--catalogue F", str, "catalogue to compare with (default: the available one)")
     add_json_flag(landmarks)
     landmarks.set_defaults(handler=run, seed=1)
 
@@ -45,5 +44,4 @@ def run(arguments: argparse.Namespace) -> int:
             f", {result.median_horizontal_m:.0f} m from it (median); east and north squared over the claimed sigma: "
             f"{result.normalised_square:.2f}"
         )
-    emit(arguments, figures, text=text)
-    return 0
+    return emit(arguments, figures, text=text)

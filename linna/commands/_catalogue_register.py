@@ -6,38 +6,39 @@ import argparse
 from pathlib import Path
 
 from linna.commands._region import parse_region
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "catalogue",
+    option(
+        parser,
+        "catalogue CATALOGUE",
+        Path,
+        "crater list (CSV, plain or gzip; default: that of the data folder)",
         nargs="?",
-        type=Path,
-        metavar="CATALOGUE",
-        help="crater list (CSV, plain or gzip; default: that of the data folder)",
     )
-    parser.add_argument(
-        "--terrain",
+    option(
+        parser,
+        "--terrain F",
+        Path,
+        "height rasters in longitude and latitude (default: those of the data folder)",
         nargs="+",
-        type=Path,
-        metavar="F",
-        help="height rasters in longitude and latitude (default: those of the data folder)",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="F",
-        help="product to write (default: registration.json in the data folder, which terrain is then opened with)",
+    option(
+        parser,
+        "--out F",
+        Path,
+        "product to write (default: registration.json in the data folder, which terrain is then opened with)",
     )
-    parser.add_argument(
-        "--region",
+    option(
+        parser,
+        "--region W,E,S,N",
+        str,
+        "degrees, longitude east (default: 0,360,-80,80)",
         default="0,360,-80,80",
-        metavar="W,E,S,N",
-        help="degrees, longitude east (default: 0,360,-80,80)",
     )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -81,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         f"+- {tile.sigma_m:.0f} m, {tile.rims} rims"
         for tile in tiles
     ]
-    emit(
+    return emit(
         arguments,
         figures,
         text="\n".join(
@@ -92,4 +93,3 @@ def run(arguments: argparse.Namespace) -> int:
             ]
         ),
     )
-    return 0

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from linna.parser import option
+
 
 def add_model(parser: argparse.ArgumentParser) -> None:
     """Add --model."""
     from payload_emulator.flight.models import NETWORKS
 
-    parser.add_argument(
-        "--model",
-        type=Path,
+    option(
+        parser,
+        "--model M.onnx",
+        Path,
+        f"ONNX file or the name of a shipped network ({', '.join(NETWORKS)}); default: the first",
         default=None,
-        metavar="M.onnx",
-        help=f"ONNX file or the name of a shipped network ({', '.join(NETWORKS)}); default: the first",
     )
 
 

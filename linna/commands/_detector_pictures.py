@@ -8,52 +8,44 @@ from pathlib import Path
 from typing import Any
 
 from linna.commands._detector_common import add_model, model_octets
+from linna.output import finish
+from linna.parser import option
 
 
 def configure(verbs: Any) -> None:
     """Add the verb `detect`."""
-    from linna.output import add_json_flag
 
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF, JPEG or NPY")
-    detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
+    option(detect, "images IMAGE", Path, nargs="+")
     add_model(detect)
-    detect.add_argument(
-        "--altitude-km", type=float, default=None, help="above the ground; gives size classes"
-    )
-    detect.add_argument("--fov-deg", type=float, default=120.0)
-    detect.add_argument("--threshold", type=float, default=None)
+    option(detect, "--altitude-km", float, "above the ground; gives size classes", default=None)
+    option(detect, "--fov-deg", float, default=120.0)
+    option(detect, "--threshold", float, default=None)
     _add_search(detect)
-    add_json_flag(detect)
-    detect.set_defaults(handler=_detect)
+    finish(detect, _detect)
 
 
 def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
     """Add the options of an evaluation on a labelled set; `tested` holds what can be evaluated on."""
-    tested.add_argument(
-        "--coco", type=Path, metavar="DIR", help="a set of images with crater boxes or polygons in COCO files"
-    )
+    option(tested, "--coco DIR", Path, "a set of images with crater boxes or polygons in COCO files")
     of_set = evaluate.add_argument_group("with --coco")
     _add_search(of_set)
-    of_set.add_argument(
-        "--pixel-m", type=float, default=math.nan, help="ground covered by a pixel; gives classes in km"
-    )
-    of_set.add_argument(
-        "--altitude-km", type=float, default=math.nan, help="above the ground, with --fov-deg, instead"
-    )
-    of_set.add_argument("--fov-deg", type=float, default=120.0)
-    of_set.add_argument(
-        "--range-px",
-        type=float,
-        nargs=2,
+    option(of_set, "--pixel-m", float, "ground covered by a pixel; gives classes in km", default=math.nan)
+    option(of_set, "--altitude-km", float, "above the ground, with --fov-deg, instead", default=math.nan)
+    option(of_set, "--fov-deg", float, default=120.0)
+    option(
+        of_set,
+        "--range-px LOW HIGH",
+        float,
+        "diameters that are scored (default: 8 150)",
         default=(8.0, 150.0),
-        metavar=("LOW", "HIGH"),
-        help="diameters that are scored (default: 8 150)",
     )
-    of_set.add_argument(
+    option(
+        of_set,
         "--level",
-        choices=("2", "3s", "3", "4", "5"),
+        ("2", "3s", "3", "4", "5"),
+        "evidence level of the images (default: 5, photographs)",
         default="5",
-        help="evidence level of the images (default: 5, photographs)",
     )
 
 
@@ -97,8 +89,7 @@ def evaluate_set(arguments: argparse.Namespace) -> int:
         ),
         lambda pictures: progress(pictures, len(pictures), "evaluate", "images"),
     )
-    emit(arguments, figures, format_picture_figures(figures))
-    return 0
+    return emit(arguments, figures, format_picture_figures(figures))
 
 
 def refuse_options_of_sets(arguments: argparse.Namespace) -> None:
@@ -118,16 +109,18 @@ def refuse_options_of_sets(arguments: argparse.Namespace) -> None:
 
 
 def _add_search(parser: Any) -> None:
-    parser.add_argument(
+    option(
+        parser,
         "--sun-azimuth-deg",
-        type=float,
+        float,
+        "of the Sun in the image, clockwise from its top; without it, the azimuth is found from the image",
         default=None,
-        help="of the Sun in the image, clockwise from its top; without it, the azimuth is found from the image",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--two-scales",
-        action="store_true",
-        help="also search the image enlarged twice, for small craters; up to ten times the time",
+        bool,
+        "also search the image enlarged twice, for small craters; up to ten times the time",
     )
 
 
@@ -170,8 +163,7 @@ def _detect(arguments: argparse.Namespace) -> int:
     text = "\n".join(
         f"{item['file']}: {item['quality']}, {len(item['detections'])} craters" for item in images
     )
-    emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
-    return 0
+    return emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
 
 
 def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.output import log
+from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.client import Client
@@ -18,26 +19,22 @@ if TYPE_CHECKING:
 
 def add_service_options(parser: argparse.ArgumentParser) -> None:
     """Add the option that chooses the local service."""
-    parser.add_argument(
-        "--home",
-        type=Path,
-        metavar="DIR",
-        help="folder of the database, raw files and reports (default: $LINNA_HOME)",
-    )
+    option(parser, "--home DIR", Path, "folder of the database, raw files and reports (default: $LINNA_HOME)")
 
 
 def add_operator_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose the local service or a server."""
     add_service_options(parser)
-    parser.add_argument(
-        "--server", metavar="URL", help="work on this server (default: $LINNA_SERVER, otherwise this machine)"
+    option(
+        parser, "--server URL", str, "work on this server (default: $LINNA_SERVER, otherwise this machine)"
     )
-    parser.add_argument("--token", metavar="T", help="token for the server (default: $LINNA_TOKEN)")
-    parser.add_argument(
-        "--as",
+    option(parser, "--token T", str, "token for the server (default: $LINNA_TOKEN)")
+    option(
+        parser,
+        "--as NAME",
+        str,
+        "actor in the audit log, without a server (default: the login name)",
         dest="actor",
-        metavar="NAME",
-        help="actor in the audit log, without a server (default: the login name)",
     )
 
 

@@ -90,8 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         f"the {len(board)} craters of the map; {figures['median_cpu_s']:.2f} s "
         f"(largest {figures['largest_cpu_s']:.2f}) a search"
     )
-    emit(arguments, figures, text="\n".join([*table, last, level]))
-    return 0
+    return emit(arguments, figures, text="\n".join([*table, last, level]))
 
 
 def _seen(arguments: argparse.Namespace, world: World, numbers: IntArray) -> tuple[OnnxDetector, SeenFrames]:

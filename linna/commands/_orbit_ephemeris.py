@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 if TYPE_CHECKING:
     from lunar.ephemeris import Ephemeris
@@ -17,63 +18,45 @@ if TYPE_CHECKING:
 def configure_compare(commands: Any) -> None:
     """Add `compare` to the subparsers of `linna orbit`."""
     compare = commands.add_parser("compare", help="difference of two ephemerides on common epochs")
-    compare.add_argument("a", type=Path, metavar="A", help="ephemeris file; its orbit gives the axes")
-    compare.add_argument("b", type=Path, metavar="B", help="ephemeris file (OEM, STK .e, Horizons CSV)")
-    compare.add_argument(
-        "--step", type=float, metavar="S", help="seconds between epochs (default: the states of A)"
-    )
-    compare.add_argument(
-        "--plot", type=Path, metavar="FILE", help="differences as a picture (png, svg or pdf)"
-    )
-    add_json_flag(compare)
-    compare.set_defaults(handler=run_compare)
+    option(compare, "a A", Path, "ephemeris file; its orbit gives the axes")
+    option(compare, "b B", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(compare, "--step S", float, "seconds between epochs (default: the states of A)")
+    option(compare, "--plot FILE", Path, "differences as a picture (png, svg or pdf)")
+    finish(compare, run_compare)
 
 
 def configure_interpolate(commands: Any) -> None:
     """Add `interpolate` to the subparsers of `linna orbit`."""
     interpolate = commands.add_parser("interpolate", help="states of an ephemeris at given UTC epochs")
-    interpolate.add_argument(
-        "ephemeris", type=Path, metavar="F", help="ephemeris file (OEM, STK .e, Horizons CSV)"
+    option(interpolate, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(
+        interpolate, "--epochs FILE", str, "UTC epochs, one a line (- reads standard input)", required=True
     )
-    interpolate.add_argument(
-        "--epochs", required=True, metavar="FILE", help="UTC epochs, one a line (- reads standard input)"
-    )
-    add_json_flag(interpolate)
-    interpolate.set_defaults(handler=run_interpolate)
+    finish(interpolate, run_interpolate)
 
 
 def configure_stats(commands: Any) -> None:
     """Add `stats` to the subparsers of `linna orbit`."""
     stats = commands.add_parser("stats", help="altitudes, passes and period of an ephemeris")
-    stats.add_argument("ephemeris", type=Path, metavar="F", help="ephemeris file (OEM, STK .e, Horizons CSV)")
-    stats.add_argument(
-        "--step", type=float, metavar="S", help="seconds between epochs (default: the states of the file)"
-    )
-    stats.add_argument("--plot", type=Path, metavar="FILE", help="altitudes as a picture (png, svg or pdf)")
-    add_json_flag(stats)
-    stats.set_defaults(handler=run_stats)
+    option(stats, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(stats, "--step S", float, "seconds between epochs (default: the states of the file)")
+    option(stats, "--plot FILE", Path, "altitudes as a picture (png, svg or pdf)")
+    finish(stats, run_stats)
 
 
 def configure_convert(commands: Any) -> None:
     """Add `convert` to the subparsers of `linna orbit`."""
     convert = commands.add_parser("convert", help="an ephemeris as OEM, SPK, STK .e, CSV or TUM")
-    convert.add_argument(
-        "ephemeris",
-        type=Path,
-        metavar="F",
-        help="OEM (text or XML), STK .e, Horizons CSV (all also as .gz or .zip), or SPK",
+    option(
+        convert,
+        "ephemeris F",
+        Path,
+        "OEM (text or XML), STK .e, Horizons CSV (all also as .gz or .zip), or SPK",
     )
-    convert.add_argument(
-        "--out", required=True, type=Path, metavar="FILE", help="ending in .oem, .xml, .bsp, .e, .csv or .tum"
-    )
-    convert.add_argument(
-        "--spice-id", type=int, metavar="N", help="SPICE number of the spacecraft in an SPK, such as -85"
-    )
-    convert.add_argument(
-        "--step", type=float, metavar="S", help="seconds between states (default: the states of the file)"
-    )
-    add_json_flag(convert)
-    convert.set_defaults(handler=run_convert)
+    option(convert, "--out FILE", Path, "ending in .oem, .xml, .bsp, .e, .csv or .tum", required=True)
+    option(convert, "--spice-id N", int, "SPICE number of the spacecraft in an SPK, such as -85")
+    option(convert, "--step S", float, "seconds between states (default: the states of the file)")
+    finish(convert, run_convert)
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
@@ -107,8 +90,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
         f"distance: max {difference.max_m:.6g} m, rms {difference.rms_m:.6g} m\n"
         f"rms radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
     )
-    emit(arguments, figures, text=text)
-    return 0
+    return emit(arguments, figures, text=text)
 
 
 def run_interpolate(arguments: argparse.Namespace) -> int:
@@ -148,7 +130,7 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
         )
         for state in states
     ]
-    emit(
+    return emit(
         arguments,
         {
             "states": states,
@@ -158,7 +140,6 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
         },
         text="\n".join(lines),
     )
-    return 0
 
 
 def run_stats(arguments: argparse.Namespace) -> int:
@@ -212,8 +193,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
         f"period {figures['period_min']:.2f} min\n"
         f"within 60 deg of the equator: {numbers.share_inside:.1%} of the time in {numbers.passes} passes"
     )
-    emit(arguments, figures, text=text)
-    return 0
+    return emit(arguments, figures, text=text)
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
@@ -257,8 +237,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     finally:
         part.unlink(missing_ok=True)
     figures = {"out": str(out), "states": len(ephemeris.utc_ns), "segments": len(ephemeris.segments)}
-    emit(arguments, figures, text=f"{figures['states']} states -> {out}")
-    return 0
+    return emit(arguments, figures, text=f"{figures['states']} states -> {out}")
 
 
 def _spice_id(arguments: argparse.Namespace) -> int:

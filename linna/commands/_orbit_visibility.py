@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 
 def configure_visibility(commands: Any) -> None:
@@ -14,21 +15,17 @@ def configure_visibility(commands: Any) -> None:
     visibility = commands.add_parser(
         "visibility", help="eclipses, nights, occultations and station contacts of an ephemeris"
     )
-    visibility.add_argument(
-        "ephemeris", type=Path, metavar="F", help="ephemeris file (OEM, STK .e, Horizons CSV)"
-    )
-    visibility.add_argument(
-        "--station",
+    option(visibility, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(
+        visibility,
+        "--station NAME=LAT,LON[,HEIGHT_M[,MIN_ELEVATION]]",
+        str,
+        "ground station in degrees and metres, WGS 84; may be given several times",
         action="append",
         default=[],
-        metavar="NAME=LAT,LON[,HEIGHT_M[,MIN_ELEVATION]]",
-        help="ground station in degrees and metres, WGS 84; may be given several times",
     )
-    visibility.add_argument(
-        "--step", type=float, default=60.0, metavar="S", help="seconds between looks (default 60)"
-    )
-    add_json_flag(visibility)
-    visibility.set_defaults(handler=run_visibility)
+    option(visibility, "--step S", float, "seconds between looks (default 60)", default=60.0)
+    finish(visibility, run_visibility)
 
 
 def run_visibility(arguments: argparse.Namespace) -> int:
@@ -83,8 +80,7 @@ def run_visibility(arguments: argparse.Namespace) -> int:
         f"range {figures['range_km']['min']:.0f} to {figures['range_km']['max']:.0f} km, "
         f"light time {found.light_time_s[0]:.3f} to {found.light_time_s[1]:.3f} s"
     )
-    emit(arguments, figures, text="\n".join(lines))
-    return 0
+    return emit(arguments, figures, text="\n".join(lines))
 
 
 def _station(text: str) -> Any:

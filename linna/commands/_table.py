@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
 from linna.commands._ground import add_operator_options, ground_client
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
 from linna.parser import LinnaParser
 
 if TYPE_CHECKING:
@@ -114,8 +114,7 @@ class Command:
         if self.limit is not None and signature.return_annotation.startswith("Listing["):
             _add(parser, "limit", int, self.limit, Option(), False)
         add_operator_options(parser)
-        add_json_flag(parser)
-        parser.set_defaults(handler=self.run)
+        finish(parser, self.run)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """Call the operation and print its result."""
@@ -130,13 +129,11 @@ class Command:
             page = found.page(arguments.limit) if hasattr(arguments, "limit") else None
             rows = [] if self.items is None else list(found) if page is None else page.items
         if self.items is None:
-            emit(arguments, self.figures(found), text=self.text(found))
-            return 0
+            return emit(arguments, self.figures(found), text=self.text(found))
         figures: dict[str, Any] = {self.items: [self.figures(one) for one in rows]}
         if page is not None:
             figures["total"] = page.total
-        emit(arguments, figures, text="\n".join(self.text(one) for one in rows) or self.none)
-        return 0
+        return emit(arguments, figures, text="\n".join(self.text(one) for one in rows) or self.none)
 
     def _work(self) -> Callable[..., Any]:
         if not isinstance(self.work, str):

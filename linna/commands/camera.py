@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -14,30 +15,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     study = commands.add_parser(
         "fov-study", help="probability of craters in the footprint over the field of view"
     )
-    study.add_argument(
-        "--ephemeris",
-        required=True,
-        type=Path,
-        metavar="F",
-        help="ephemeris file (OEM, STK .e, Horizons CSV)",
-    )
-    study.add_argument(
-        "--catalogue",
-        metavar="F",
-        help=CATALOGUE_HELP,
-    )
-    study.add_argument("--seed", type=int, default=1, help="seed of a synthetic catalogue (default: 1)")
-    study.add_argument(
-        "--step", type=float, metavar="S", help="seconds between positions (default: every state of the file)"
-    )
-    study.add_argument("--fov-step", type=float, default=10.0, metavar="DEG", help="default: 10 degrees")
-    study.add_argument("--needed", type=int, default=3, metavar="N", help="craters needed (default: 3)")
-    study.add_argument(
-        "--threshold", type=float, default=0.9, metavar="P", help="probability to exceed (default: 0.9)"
-    )
-    study.add_argument("--plot", type=Path, metavar="FILE", help="curves as a picture (png, svg or pdf)")
-    add_json_flag(study)
-    study.set_defaults(handler=run_fov_study)
+    option(study, "--ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)", required=True)
+    option(study, "--catalogue F", str, CATALOGUE_HELP)
+    option(study, "--seed", int, "seed of a synthetic catalogue (default: 1)", default=1)
+    option(study, "--step S", float, "seconds between positions (default: every state of the file)")
+    option(study, "--fov-step DEG", float, "default: 10 degrees", default=10.0)
+    option(study, "--needed N", int, "craters needed (default: 3)", default=3)
+    option(study, "--threshold P", float, "probability to exceed (default: 0.9)", default=0.9)
+    option(study, "--plot FILE", Path, "curves as a picture (png, svg or pdf)")
+    finish(study, run_fov_study)
 
 
 def run_fov_study(arguments: argparse.Namespace) -> int:
@@ -116,5 +102,4 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     lines.append(
         f"smallest with P(>={study.needed}) > {study.threshold:g}: {chosen}; {covered}; {study.source}"
     )
-    emit(arguments, figures, text="\n".join(lines))
-    return 0
+    return emit(arguments, figures, text="\n".join(lines))

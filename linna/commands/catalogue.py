@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
 from linna.commands._ground import add_operator_options, ground_client
 from linna.commands._region import parse_region
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 if TYPE_CHECKING:
     from lunar.arrays import FloatArray
@@ -18,16 +19,10 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     stats = commands.add_parser("stats", help="size classes of a crater catalogue")
-    stats.add_argument(
-        "catalogue",
-        nargs="?",
-        metavar="FILE",
-        help=CATALOGUE_HELP,
-    )
-    stats.add_argument("--seed", type=int, default=1, help="seed of a synthetic catalogue (default: 1)")
-    stats.add_argument("--plot", type=Path, metavar="FILE", help="histogram of diameters (png, svg or pdf)")
-    add_json_flag(stats)
-    stats.set_defaults(handler=run_stats)
+    option(stats, "catalogue FILE", str, CATALOGUE_HELP, nargs="?")
+    option(stats, "--seed", int, "seed of a synthetic catalogue (default: 1)", default=1)
+    option(stats, "--plot FILE", Path, "histogram of diameters (png, svg or pdf)")
+    finish(stats, run_stats)
     _configure_curate(
         commands.add_parser(
             "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
@@ -41,10 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     adding = commands.add_parser(
         "add", help="have the ground service hold a catalogue, which a mission description names by its hash"
     )
-    adding.add_argument("file", type=Path, metavar="FILE", help="CSV, plain or gzip")
+    option(adding, "file FILE", Path, "CSV, plain or gzip")
     add_operator_options(adding)
-    add_json_flag(adding)
-    adding.set_defaults(handler=run_add)
+    finish(adding, run_add)
     from linna.commands._catalogue_landmarks import configure as configure_landmarks
 
     configure_landmarks(
@@ -55,43 +49,36 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_add(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         held = service.add_catalogue(arguments.file)
-    emit(arguments, held.model_dump(mode="json"), text=f"{held.name}: {held.sha256}")
-    return 0
+    return emit(arguments, held.model_dump(mode="json"), text=f"{held.name}: {held.sha256}")
 
 
 def _configure_curate(curate: argparse.ArgumentParser) -> None:
-    curate.add_argument("catalogue", metavar="CATALOGUE", help="crater list (CSV, plain or gzip)")
-    curate.add_argument(
-        "--terrain",
+    option(curate, "catalogue CATALOGUE", str, "crater list (CSV, plain or gzip)")
+    option(
+        curate,
+        "--terrain F",
+        Path,
+        "height rasters in longitude and latitude (default: the 128 px/deg tiles of the available data)",
         nargs="+",
-        type=Path,
-        metavar="F",
-        help="height rasters in longitude and latitude (default: the 128 px/deg tiles of the available data)",
     )
-    curate.add_argument(
-        "--out",
-        type=Path,
+    option(
+        curate,
+        "--out F",
+        Path,
+        "table to write: *.csv as text, without uncertainties; any other name as the table that is uploaded",
         required=True,
-        metavar="F",
-        help="table to write: *.csv as text, without uncertainties; any other name as the table that is uploaded",
     )
-    curate.add_argument(
-        "--region",
+    option(
+        curate,
+        "--region W,E,S,N",
+        str,
+        "degrees, longitude east (default: 0,360,-80,80)",
         default="0,360,-80,80",
-        metavar="W,E,S,N",
-        help="degrees, longitude east (default: 0,360,-80,80)",
     )
-    curate.add_argument("--min-diameter", type=float, default=3.0, metavar="KM", help="default: 3 km")
-    curate.add_argument("--max-diameter", type=float, default=30.0, metavar="KM", help="default: 30 km")
-    curate.add_argument(
-        "--depth-ratio",
-        type=float,
-        default=0.03,
-        metavar="R",
-        help="least depth over diameter (default: 0.03)",
-    )
-    add_json_flag(curate)
-    curate.set_defaults(handler=run_curate)
+    option(curate, "--min-diameter KM", float, "default: 3 km", default=3.0)
+    option(curate, "--max-diameter KM", float, "default: 30 km", default=30.0)
+    option(curate, "--depth-ratio R", float, "least depth over diameter (default: 0.03)", default=0.03)
+    finish(curate, run_curate)
 
 
 def run_stats(arguments: argparse.Namespace) -> int:
@@ -121,8 +108,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
         f"class {k} ({name}): {count} (paper {paper})"
         for k, (name, count, paper) in enumerate(zip(names, counts, PAPER_CLASS_COUNTS, strict=True))
     ]
-    emit(arguments, figures, text="\n".join(lines))
-    return 0
+    return emit(arguments, figures, text="\n".join(lines))
 
 
 def run_curate(arguments: argparse.Namespace) -> int:
@@ -186,8 +172,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
         f"{heights.pixels_per_degree:g} px/deg, rim heights raised by {curation.height_correction_m:.0f} m",
         f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
     ]
-    emit(arguments, figures, text="\n".join(lines))
-    return 0
+    return emit(arguments, figures, text="\n".join(lines))
 
 
 def _range(values: FloatArray) -> dict[str, float]:

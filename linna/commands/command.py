@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from linna.commands._ground import add_operator_options, ground_client
 from linna.commands._table import Command, Commands, Hand, Option, add_commands
 from linna.errors import UsageError
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.client import Client
@@ -48,14 +49,13 @@ def _argument(text: str) -> tuple[str, object]:
 
 
 def _configure_uplink(parser: LinnaParser) -> None:
-    parser.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
-    parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
-    parser.add_argument("--format", choices=("cltu", "packets"), default="cltu")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file for the octets")
-    parser.add_argument("--tcp", metavar="HOST:PORT", help="TCP address to send the octets to")
+    option(parser, "--spacecraft-id N", int, required=True)
+    option(parser, "--instance", str, "instance of the spacecraft (default: flight)", default="flight")
+    option(parser, "--format", ("cltu", "packets"), default="cltu")
+    option(parser, "--out FILE", Path, "file for the octets")
+    option(parser, "--tcp HOST:PORT", str, "TCP address to send the octets to")
     add_operator_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=_uplink)
+    finish(parser, _uplink)
 
 
 def _uplink(arguments: argparse.Namespace) -> int:
@@ -78,12 +78,11 @@ def _uplink(arguments: argparse.Namespace) -> int:
             link.sendall(taken.octets)
     where = str(arguments.out or arguments.tcp)
     figures = {"file": where, "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
-    emit(
+    return emit(
         arguments,
         figures,
         text=f"{where}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets",
     )
-    return 0
 
 
 def _connection(address: str) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linna.completion import SHELLS, script
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -12,7 +13,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Print the text that makes a shell complete linna commands, options and names of shipped scenarios. "
         'bash: eval "$(linna completion bash)"; fish: linna completion fish | source'
     )
-    parser.add_argument("shell", choices=SHELLS, help="shell that reads the text")
+    option(parser, "shell", SHELLS, "shell that reads the text")
     parser.set_defaults(handler=run)
 
 

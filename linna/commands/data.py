@@ -6,31 +6,22 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from linna.output import finish
+from linna.parser import option
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from linna.output import add_json_flag
 
     verbs = parser.add_subparsers(title="verbs", required=True)
     listing = verbs.add_parser("list", help="list the products: available files, size, licence, address")
     fetch = verbs.add_parser("fetch", help="download products into the data folder; resumes what broke off")
-    fetch.add_argument("names", nargs="*", metavar="PRODUCT", help="default: the small ones all need")
-    fetch.add_argument(
-        "--only", default="", metavar="TEXT", help="only files with this in their name (tiles)"
-    )
-    fetch.add_argument(
-        "--mirror", default="", metavar="URL", help="take files from URL/<path in the data folder> instead"
-    )
+    option(fetch, "names PRODUCT", str, "default: the small ones all need", nargs="*")
+    option(fetch, "--only TEXT", str, "only files with this in their name (tiles)", default="")
+    option(fetch, "--mirror URL", str, "take files from URL/<path in the data folder> instead", default="")
     verify = verbs.add_parser("verify", help="read every file again and compare checksums")
     for verb, handler in ((listing, _list), (fetch, _fetch), (verify, _verify)):
-        verb.add_argument(
-            "--to",
-            type=Path,
-            default=None,
-            metavar="DIR",
-            help="data folder; default $LINNA_DATA or the user's",
-        )
-        add_json_flag(verb)
-        verb.set_defaults(handler=handler)
+        option(verb, "--to DIR", Path, "data folder; default $LINNA_DATA or the user's", default=None)
+        finish(verb, handler)
 
 
 def _list(arguments: argparse.Namespace) -> int:
@@ -54,8 +45,7 @@ def _list(arguments: argparse.Namespace) -> int:
         ]
         if row["note"]:
             lines.append(f"  {row['note']}")
-    emit(arguments, {"root": str(root), "products": rows}, "\n".join(lines))
-    return 0
+    return emit(arguments, {"root": str(root), "products": rows}, "\n".join(lines))
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
@@ -85,8 +75,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
         found = fetch(chosen, root, report=report)
         log(f"{file.path}: {found.status}, {_size(found.octets)}")
         done.append({"path": found.path, "status": found.status, "octets": found.octets})
-    emit(arguments, {"root": str(root), "files": done}, f"{len(done)} files in {root}")
-    return 0
+    return emit(arguments, {"root": str(root), "files": done}, f"{len(done)} files in {root}")
 
 
 def _verify(arguments: argparse.Namespace) -> int:

@@ -6,46 +6,38 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from linna.output import finish
+from linna.parser import option
+
 _CLASSES = ("5-10 km", "10-15 km", "15-30 km")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from linna.output import add_json_flag
 
     verbs = parser.add_subparsers(title="verbs", required=True)
     build = verbs.add_parser("build", help="render frames with labels; resumes an unfinished data set")
-    build.add_argument(
-        "recipe",
-        type=Path,
-        metavar="SCENARIO",
-        help="TOML with a [dataset] table, or the name of a shipped scenario",
-    )
-    build.add_argument("--out", type=Path, required=True, metavar="DIR")
-    build.add_argument("--frames", type=int, required=True, metavar="N")
-    build.add_argument(
-        "--workers", type=int, default=1, metavar="W", help="processes; the frames do not depend on it"
-    )
-    build.add_argument("--seed", type=int, default=None, help="instead of the recipe's")
-    build.add_argument("--bits", type=int, choices=(8, 16), default=None, help="of the PNG files")
-    build.add_argument("--renderer", default=None, metavar="NAME", help="fast (default), raymarch or cycles")
-    add_json_flag(build)
-    build.set_defaults(handler=_build)
+    option(build, "recipe SCENARIO", Path, "TOML with a [dataset] table, or the name of a shipped scenario")
+    option(build, "--out DIR", Path, required=True)
+    option(build, "--frames N", int, required=True)
+    option(build, "--workers W", int, "processes; the frames do not depend on it", default=1)
+    option(build, "--seed", int, "instead of the recipe's", default=None)
+    option(build, "--bits", int, "of the PNG files", choices=(8, 16), default=None)
+    option(build, "--renderer NAME", str, "fast (default), raymarch or cycles", default=None)
+    finish(build, _build)
     for name, handler, text in (
         ("check", _check, "find missing and damaged files"),
         ("stats", _stats, "frames by split, crater instances by class, compared with the paper"),
     ):
         verb = verbs.add_parser(name, help=text)
-        verb.add_argument("folder", type=Path, metavar="DIR")
-        add_json_flag(verb)
-        verb.set_defaults(handler=handler)
+        option(verb, "folder DIR", Path)
+        finish(verb, handler)
     sheet = verbs.add_parser("sheet", help="a picture of frames with their labels, as the paper's Fig. 5")
-    sheet.add_argument("folder", type=Path, metavar="DIR")
-    sheet.add_argument("--out", type=Path, required=True, metavar="F.png")
-    sheet.add_argument("--split", choices=("train", "val", "test"), default="", help="default: all")
-    sheet.add_argument("--columns", type=int, default=4)
-    sheet.add_argument("--rows", type=int, default=2)
-    add_json_flag(sheet)
-    sheet.set_defaults(handler=_sheet)
+    option(sheet, "folder DIR", Path)
+    option(sheet, "--out F.png", Path, required=True)
+    option(sheet, "--split", ("train", "val", "test"), "default: all", default="")
+    option(sheet, "--columns", int, default=4)
+    option(sheet, "--rows", int, default=2)
+    finish(sheet, _sheet)
 
 
 def _build(arguments: argparse.Namespace) -> int:
@@ -84,8 +76,7 @@ def _build(arguments: argparse.Namespace) -> int:
         "peak_rss_mb": max(used.ru_maxrss for used in usage) / 1024.0,
         "workers": max(1, arguments.workers),
     }
-    emit(arguments, figures, _text(figures))
-    return 0
+    return emit(arguments, figures, _text(figures))
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -100,8 +91,7 @@ def _check(arguments: argparse.Namespace) -> int:
         emit(arguments, {"whole": False, "problems": problems}, f"{len(problems)} problems")
         return 1
     figures = summarise(arguments.folder)
-    emit(arguments, figures | {"whole": True, "problems": []}, f"{_text(figures)}\nwhole")
-    return 0
+    return emit(arguments, figures | {"whole": True, "problems": []}, f"{_text(figures)}\nwhole")
 
 
 def _stats(arguments: argparse.Namespace) -> int:
@@ -109,8 +99,7 @@ def _stats(arguments: argparse.Namespace) -> int:
     from payload_emulator.training.data.summary import summarise
 
     figures = summarise(arguments.folder)
-    emit(arguments, figures, _text(figures))
-    return 0
+    return emit(arguments, figures, _text(figures))
 
 
 def _sheet(arguments: argparse.Namespace) -> int:
@@ -125,8 +114,7 @@ def _sheet(arguments: argparse.Namespace) -> int:
         raise UsageError("--columns, --rows: expected 1 or more each")
     picture = draw_sheet(Dataset(arguments.folder), arguments.split, arguments.columns, arguments.rows)
     write_picture(arguments.out, picture[..., ::-1])
-    emit(arguments, {"sheet": str(arguments.out)}, str(arguments.out))
-    return 0
+    return emit(arguments, {"sheet": str(arguments.out)}, str(arguments.out))
 
 
 def _text(figures: dict[str, Any]) -> str:

@@ -97,15 +97,15 @@ def run_grant(arguments: argparse.Namespace) -> int:
     grant = roles.grant_backup if arguments.backup else roles.grant_service
     if arguments.print:
         statements = list(statements_of(role, [*METADATA.tables, *roles.READ_ONLY]))
-        emit(arguments, {"role": role, "statements": statements}, text=";\n".join(statements) + ";")
-        return 0
+        return emit(arguments, {"role": role, "statements": statements}, text=";\n".join(statements) + ";")
     database = prepare_database(settings.resolved_migration_url())
     try:
         grant(database, role)
     finally:
         database.engine.dispose()
-    emit(arguments, {"role": role, "database": database.label}, text=f"{database.label}: granted to {role}")
-    return 0
+    return emit(
+        arguments, {"role": role, "database": database.label}, text=f"{database.label}: granted to {role}"
+    )
 
 
 def _service_role(settings: Settings) -> str | None:
@@ -160,8 +160,7 @@ def run_backup(arguments: argparse.Namespace) -> int:
         f"{arguments.out}: {sum(manifest['rows'].values())} rows, {manifest['files']} files, "
         f"audit head {head['number']}:{head['sha256']}"
     )
-    emit(arguments, {"folder": str(arguments.out), **manifest}, text=text)
-    return 0
+    return emit(arguments, {"folder": str(arguments.out), **manifest}, text=text)
 
 
 def run_restore(arguments: argparse.Namespace) -> int:
@@ -171,8 +170,7 @@ def run_restore(arguments: argparse.Namespace) -> int:
         manifest = restore(arguments.folder, ground)
         label = ground.database.label
     text = f"{label}: {sum(manifest['rows'].values())} rows, {manifest['files']} files"
-    emit(arguments, {"database": label, **manifest}, text=text)
-    return 0
+    return emit(arguments, {"database": label, **manifest}, text=text)
 
 
 def run_tidy(arguments: argparse.Namespace) -> int:
@@ -181,10 +179,9 @@ def run_tidy(arguments: argparse.Namespace) -> int:
     days = arguments.days if arguments.days is not None else settings_of(arguments).retention_days
     with open_service(arguments) as ground:
         removed = tidy(ground, max(days, 0))
-    emit(
+    return emit(
         arguments, {"removed": removed}, text=", ".join(f"{count} {name}" for name, count in removed.items())
     )
-    return 0
 
 
 def run_redecode(arguments: argparse.Namespace) -> int:
@@ -192,15 +189,13 @@ def run_redecode(arguments: argparse.Namespace) -> int:
 
     with open_service(arguments) as ground:
         rows = decode_all_again(ground)
-    emit(arguments, {"rows": rows}, text=f"{rows} rows")
-    return 0
+    return emit(arguments, {"rows": rows}, text=f"{rows} rows")
 
 
 def _show(arguments: argparse.Namespace, found: str | None, head: str, label: str) -> int:
     current = found or "none"
-    emit(
+    return emit(
         arguments,
         {"database": label, "revision": found, "head": head, "current": found == head},
         text=f"{label}: revision {current}, newest {head}",
     )
-    return 0

@@ -9,21 +9,21 @@ from typing import Any
 
 from linna.commands._ground import local_actor
 from linna.commands.pass_ import requirement_lines
-from linna.output import add_json_flag, emit, log, progress
+from linna.output import emit, finish, log, progress
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out",
-        type=Path,
+    option(
+        parser,
+        "--out DIR",
+        Path,
+        "folder for the pass archive, the ground database and the report (default: linna-demo)",
         default=Path("linna-demo"),
-        metavar="DIR",
-        help="folder for the pass archive, the ground database and the report (default: linna-demo)",
     )
-    parser.add_argument("--scenario", default="selenita", help="scenario file or name (default: selenita)")
-    parser.add_argument("--seed", type=int, help="another seed than the scenario's")
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    option(parser, "--scenario", str, "scenario file or name (default: selenita)", default="selenita")
+    option(parser, "--seed", int, "another seed than the scenario's")
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -62,12 +62,11 @@ def run(arguments: argparse.Namespace) -> int:
         "wall_s": round(time.monotonic() - started, 2),
         "data": emulated["data"],
     }
-    emit(
+    return emit(
         arguments,
         figures,
         text=describe(figures) + "\n\nnext steps:\n" + "\n".join(next_steps(arguments, figures)),
     )
-    return 0
 
 
 def next_steps(arguments: argparse.Namespace, figures: dict[str, Any]) -> list[str]:

@@ -51,7 +51,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="what the images of --images are (default: not stated)",
     )
     _add_live(parser)
-    _add_continuous(parser)
     parser.add_argument(
         "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
     )
@@ -60,88 +59,66 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_live(parser: argparse.ArgumentParser) -> None:
-    live = parser.add_argument_group("live", "the payload as a process to watch and to command over TCP")
-    live.add_argument("--live", action="store_true", help="fly live instead of writing an archive")
-    live.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
-    live.add_argument("--port", type=int, default=10015, help="telemetry, CADUs (default: %(default)s)")
-    live.add_argument(
-        "--tc-port", type=int, default=10025, help="telecommands, CLTUs or packets (default: %(default)s)"
-    )
-    live.add_argument(
-        "--console-port",
-        type=int,
-        default=10035,
-        help="snapshots as JSON lines out, pause|run|step|rate X|quit in (default: %(default)s)",
-    )
-    live.add_argument(
-        "--mission-port",
-        type=int,
-        default=10045,
-        help="mission description, sent to each client (default: %(default)s)",
-    )
-    live.add_argument(
+    live = parser.add_argument_group("live", "the spacecraft as a process to watch and to command over TCP")
+    add = live.add_argument
+    add("--live", action="store_true", help="fly live instead of writing an archive")
+    add("--no-operator", action="store_true", help="the ground commands, from the epoch of the scenario on")
+    add(
         "--rate",
         type=float,
         default=1.0,
-        help="simulated seconds a second, 0: as quick as it goes (default: 1)",
+        help="simulated seconds a second, 0: as fast as possible (default: 1)",
     )
-    live.add_argument("--paused", action="store_true", help="wait for run or step on the console")
-    live.add_argument(
-        "--no-operator",
-        action="store_true",
-        help="the ground commands: the scenario's own operator is silent",
+    add("--paused", action="store_true", help="wait for run or step on the console")
+    add("--stop-at-end", action="store_true", help="end with the windows of the scenario")
+    add("--days", type=float, metavar="D", help="end after so many days (default: never)")
+    add("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+    add("--port", type=int, default=10015, help="telemetry of the first station (default: %(default)s)")
+    add(
+        "--tc-port", type=int, default=10025, help="its telecommands, CLTUs or packets (default: %(default)s)"
     )
-    live.add_argument("--stop-at-end", action="store_true", help="end with the scenario")
-
-
-def _add_continuous(parser: argparse.ArgumentParser) -> None:
-    endless = parser.add_argument_group(
-        "continuous",
-        "the spacecraft in operation: images in commanded windows alone, contacts of the stations",
-    )
-    endless.add_argument(
-        "--continuous", action="store_true", help="fly from the scenario's epoch on, whatever its windows"
-    )
-    endless.add_argument("--days", type=float, metavar="D", help="end after so many days (default: never)")
-    endless.add_argument(
+    add(
         "--station-port",
         action="append",
         default=[],
         metavar="NAME:TM:TC",
-        help="telemetry and telecommand port of a station (default: any free ports)",
+        help="ports of a station (default: those after the ports of the station before)",
     )
-    endless.add_argument(
+    words = "run|pause|step|state|watch|save|until UTC|rate X|quit"
+    add(
+        "--console-port",
+        type=int,
+        default=10035,
+        help=f"JSON lines out, {words} in (default: %(default)s)",
+    )
+    add("--mission-port", type=int, default=10045, help="mission description (default: %(default)s)")
+    add("--craters", type=Path, metavar="FILE", help="craters on board from launch; made if there is no file")
+    add(
+        "--operations",
+        type=Path,
+        metavar="FILE",
+        help="TOML in place of the automation and approval of the mission",
+    )
+    add(
         "--hold-contacts",
         action="store_true",
-        help="stop time at the beginning and the end of each contact until run on the console",
+        help="stop time at the start and the end of contacts until run",
     )
-    endless.add_argument(
-        "--keep-unacknowledged",
-        action="store_true",
-        help="stations keep telemetry until the client acknowledges it",
-    )
-    endless.add_argument(
-        "--end-with-console", action="store_true", help="end when the last connection of the console ends"
-    )
-    endless.add_argument(
+    add("--keep-unacknowledged", action="store_true", help="stations keep telemetry until it is acknowledged")
+    add("--end-with-console", action="store_true", help="end when the last connection of the console ends")
+    add(
         "--state",
         type=Path,
         metavar="FILE",
         help="exact state, written after contacts, on save on the console and at the end; a start goes on from it",
     )
-    endless.add_argument(
+    add(
         "--journal",
         type=Path,
         metavar="FILE",
         help="transmissions that stations have confirmed; a start from --state repeats those after it",
     )
-    endless.add_argument("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
-    endless.add_argument(
-        "--craters", type=Path, metavar="FILE", help="crater catalogue with rim heights, on board from launch"
-    )
-    endless.add_argument(
-        "--operations", type=Path, metavar="FILE", help="TOML appended to the mission description"
-    )
+    add("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -155,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("emulate: expected a scenario or --images DIR, found none")
     if arguments.evidence and arguments.images is None:
         raise UsageError("--evidence: expected together with --images DIR, found alone")
-    if arguments.images is not None and (arguments.live or arguments.continuous or arguments.campaign):
+    if arguments.images is not None and (arguments.live or arguments.campaign):
         raise UsageError("--images: expected together with --out DIR alone")
     chosen = arguments.images / SCENARIO if arguments.scenario is None else arguments.scenario
     scenario = load_scenario(chosen).with_choices(
@@ -163,12 +140,10 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.campaign:
         return _campaign(arguments, scenario)
-    if arguments.continuous:
-        return _continuous(arguments, scenario)
     if arguments.live:
         return _live(arguments, scenario)
     if arguments.out is None:
-        raise UsageError("emulate: expected --out DIR, --live, --continuous or --campaign FILE, found none")
+        raise UsageError("emulate: expected --out DIR, --live or --campaign FILE, found none")
     kept = {"none": 0, "some": 8, "all": None}[arguments.frames]
     external = (
         None if arguments.images is None else load_external(arguments.images, scenario, arguments.evidence)
@@ -225,84 +200,51 @@ def _campaign(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
 def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     import signal
-
-    from linna.data import data_folder
-    from linna.errors import UsageError
-    from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
-    from payload_emulator.session.live import LivePayload
-    from payload_emulator.session.mission import mission_text
-    from payload_emulator.session.world import build_world
-
-    if not arguments.rate >= 0.0:
-        raise UsageError(f"--rate: expected a number from 0, found {arguments.rate}")
-    data = data_folder()
-    world = build_world(scenario, data)
-    loaded, _, _ = load_scenario_payload(world, data)
-    live = LivePayload(
-        world,
-        new_spacecraft(world, loaded),
-        arguments.port,
-        arguments.tc_port,
-        arguments.console_port,
-        arguments.host,
-        arguments.rate,
-        arguments.paused,
-        arguments.stop_at_end,
-        not arguments.no_operator,
-        mission_text(world, data),
-        arguments.mission_port,
-    )
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: live.stopping.set())
-    log(", ".join(f"{name} on {arguments.host}:{port}" for name, port in live.ports.items()))
-    live.run()
-    figures = {"ports": live.ports, "sent": live.sent, **live.spacecraft.payload.summary()}
-    emit(
-        arguments,
-        figures,
-        text=f"stopped; {live.sent} transmissions, mode {live.spacecraft.payload.mode.name}",
-    )
-    return 0
-
-
-def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
-    import signal
     from dataclasses import asdict
 
     from linna.data import data_folder
     from linna.errors import UsageError
-    from lunar.catalogue import load_catalogue
-    from payload_emulator.session.continuous import ContinuousSession
-    from payload_emulator.session.mission import operations_mission_text
+    from payload_emulator.session.live import LiveSession, station_names
+    from payload_emulator.session.mission import OPERATIONS, live_mission_text
+    from payload_emulator.session.starting import launch, load_scenario_payload
+    from payload_emulator.session.world import build_world
 
-    if not scenario.link.stations:
-        raise UsageError(f"--continuous: expected link.stations in scenario {scenario.name}, found none")
     if not arguments.rate >= 0.0 or (arguments.days is not None and not arguments.days > 0.0):
         raise UsageError(
             f"--rate, --days: expected numbers above 0, found {arguments.rate}, {arguments.days}"
         )
-    data = data_folder()
-    further = arguments.operations.read_text(encoding="utf-8") if arguments.operations else ""
+    data, operated = data_folder(), not arguments.no_operator
+    if operated:
+        world = build_world(scenario, data)
+        loaded, _, _ = load_scenario_payload(world, data)
+    else:
+        world, loaded = launch(scenario, data, arguments.craters)
+    names = station_names(scenario, operated)
+    ports = {name: (arguments.port + k, arguments.tc_port + k) for k, name in enumerate(names)}
+    operations = None if operated else OPERATIONS
+    if arguments.operations is not None:
+        operations = arguments.operations.read_text(encoding="utf-8")
     days = arguments.days
-    session = ContinuousSession(
-        scenario,
-        data,
+    session = LiveSession(
+        world,
+        loaded,
+        has_operator=operated,
         rate=arguments.rate,
         holds=arguments.hold_contacts,
         stop_utc_ns=None if days is None else scenario.epoch_utc_ns + round(days * 86_400e9),
+        ends_with_scenario=arguments.stop_at_end,
         paused=arguments.paused,
         host=arguments.host,
         console_port=arguments.console_port,
         mission_port=arguments.mission_port,
-        station_ports=_station_ports(arguments.station_port, scenario.link.stations),
+        station_ports=ports | _station_ports(arguments.station_port, names),
         state_file=arguments.state,
         journal_file=arguments.journal,
         clock_file=arguments.clock_file,
         keeps=arguments.keep_unacknowledged,
         ends_with_console=arguments.end_with_console,
-        catalogue=load_catalogue(arguments.craters) if arguments.craters else None,
-        mission=lambda world, ports: operations_mission_text(
-            world, data, arguments.host, ports, further, arguments.keep_unacknowledged
+        mission=lambda world, used: live_mission_text(
+            world, data, arguments.host, used, operations, arguments.keep_unacknowledged, arguments.craters
         ),
     )
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -8,8 +8,8 @@ import zipfile
 from pathlib import Path
 
 from linna.commands._ground import add_operator_options, ground_client
-from linna.output import add_json_flag, emit, log
-from linna.parser import RawFormatter
+from linna.output import emit, finish, log
+from linna.parser import RawFormatter, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -17,26 +17,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     parser.formatter_class = RawFormatter
     parser.epilog = "formats:\n" + "\n".join(f"  {one.name:<8} {one.description}" for one in FORMATS.values())
-    parser.add_argument("pass_id", type=int, metavar="PASS", help="number of the pass (see linna pass list)")
-    parser.add_argument(
-        "--format", required=True, choices=FORMATS, metavar="FORMAT", help="one of the list below"
-    )
-    parser.add_argument(
-        "--out",
+    option(parser, "pass_id PASS", int, "number of the pass (see linna pass list)")
+    option(parser, "--format FORMAT", FORMATS, "one of the list below", required=True)
+    option(
+        parser,
+        "--out F",
+        Path,
+        "file to write; for formats of several files a folder, or a name ending in .zip",
         required=True,
-        type=Path,
-        metavar="F",
-        help="file to write; for formats of several files a folder, or a name ending in .zip",
     )
-    parser.add_argument(
-        "--states",
+    option(
+        parser,
+        "--states NAME",
+        str,
+        f"states of orbits and maps: {REFERENCE} (default), or the name of an estimator",
         default=REFERENCE,
-        metavar="NAME",
-        help=f"states of orbits and maps: {REFERENCE} (default), or the name of an estimator",
     )
     add_operator_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -59,8 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         "files": [str(file) for file in files],
         "octets": sum(file.stat().st_size for file in files),
     }
-    emit(arguments, figures, text="\n".join(figures["files"]))
-    return 0
+    return emit(arguments, figures, text="\n".join(figures["files"]))
 
 
 def _unpack(archive: Path, folder: Path) -> list[Path]:

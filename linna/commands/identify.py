@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.output import add_json_flag, emit, log
+from linna.parser import option
 
 if TYPE_CHECKING:
     from payload_emulator.sim.detector import SimulatedDetector
@@ -25,42 +26,42 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "tracking", help="identification around a prediction: wrong pairs, wrong fixes"
     )
     for command, frames in ((lost, 300), (tracking, 10_000)):
-        command.add_argument(
-            "catalogue",
+        option(
+            command,
+            "catalogue FILE",
+            str,
+            "anchoring table of `linna catalogue curate`, or a catalogue (default: the available one)",
             nargs="?",
-            metavar="FILE",
-            help="anchoring table of `linna catalogue curate`, or a catalogue (default: the available one)",
         )
-        command.add_argument("--frames", type=int, default=frames, help=f"default: {frames}")
-        command.add_argument("--seed", type=int, default=1, help="default: 1")
-        command.add_argument("--recall", type=float, default=0.5, help="default: 0.5")
-        command.add_argument("--precision", type=float, default=0.8, help="default: 0.8")
-        command.add_argument("--sigma-px", type=float, default=1.4, help="per axis (default: 1.4)")
-        command.add_argument("--log-diameter-sigma", type=float, default=0.05, help="default: 0.05")
+        option(command, "--frames", int, f"default: {frames}", default=frames)
+        option(command, "--seed", int, "default: 1", default=1)
+        option(command, "--recall", float, "default: 0.5", default=0.5)
+        option(command, "--precision", float, "default: 0.8", default=0.8)
+        option(command, "--sigma-px", float, "per axis (default: 1.4)", default=1.4)
+        option(command, "--log-diameter-sigma", float, "default: 0.05", default=0.05)
         add_json_flag(command)
-    lost.add_argument(
+    option(
+        lost,
         "--attitude-deg",
-        type=float,
+        float,
+        "error of nadir and heading, 1 sigma per axis (default: 0.5)",
         default=0.5,
-        help="error of nadir and heading, 1 sigma per axis (default: 0.5)",
     )
-    lost.add_argument("--sets", type=int, help="sets of four frames (default: a third of the frames)")
+    option(lost, "--sets", int, "sets of four frames (default: a third of the frames)")
     rendered = lost.add_argument_group("rendered", "frames along a scenario and the detector that flies")
-    rendered.add_argument(
-        "--scenario",
-        metavar="FILE",
-        help="render frames of a scenario in sets of four; its terrain's craters are the map, FILE is not used",
+    option(
+        rendered,
+        "--scenario FILE",
+        str,
+        "render frames of a scenario in sets of four; its terrain's craters are the map, FILE is not used",
     )
-    rendered.add_argument(
-        "--min-diameter-km", type=float, default=3.0, help="smallest craters of the map (default: 3)"
-    )
-    rendered.add_argument(
-        "--detections", type=Path, metavar="F.npz", help="keep the detections here, or take those kept here"
-    )
-    rendered.add_argument(
+    option(rendered, "--min-diameter-km", float, "smallest craters of the map (default: 3)", default=3.0)
+    option(rendered, "--detections F.npz", Path, "keep the detections here, or take those kept here")
+    option(
+        rendered,
         "--hostile",
-        action="store_true",
-        help="search each frame also with its detections mirrored, turned and scattered: each fix is wrong",
+        bool,
+        "search each frame also with its detections mirrored, turned and scattered: each fix is wrong",
     )
     lost.set_defaults(handler=run_lost)
     tracking.set_defaults(handler=run_tracking)
@@ -116,8 +117,9 @@ def run_lost(arguments: argparse.Namespace) -> int:
             f"{score.kind:<12}{score.frames:>9}{score.correct:>9}{score.wrong:>7}{none:>8}"
             f"{score.median_error_m:>9.0f}{score.p95_error_m:>7.0f}{score.median_cpu_s:>7.2f}"
         )
-    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"]))
-    return 0
+    return emit(
+        arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"])
+    )
 
 
 def run_tracking(arguments: argparse.Namespace) -> int:
@@ -155,8 +157,9 @@ def run_tracking(arguments: argparse.Namespace) -> int:
         f"wrong associations {100 * figures['wrong_association_share']:.2f} %; "
         f"{100 * figures['fixed_of_four_or_more']:.1f} % of frames with four findable craters fixed"
     )
-    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"]))
-    return 0
+    return emit(
+        arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"])
+    )
 
 
 def _provenance(arguments: argparse.Namespace, name: str, model: SimulatedDetector) -> dict[str, object]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from linna.commands._ground import add_operator_options, ground_client, settings_of
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -63,8 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "checksum=true (default: mission description, last good settings, or the evidence of the file)",
     )
     add_operator_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:

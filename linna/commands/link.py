@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_service_options, open_ground_only, settings_of
 from linna.commands._table import Command, Commands, Hand, Option, add_commands
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log
+from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.links.model import Contacts, LinkStatus
@@ -35,12 +36,9 @@ def _configure_check(parser: LinnaParser) -> None:
         "Propose the link settings of a recording from the whole file. Exit status 0: one candidate; "
         "1: it contradicts the mission description; 3: none, or several with equal support."
     )
-    parser.add_argument("file", type=Path, metavar="FILE")
-    parser.add_argument(
-        "--mission", type=Path, metavar="M", help="mission description to compare the settings with"
-    )
-    add_json_flag(parser)
-    parser.set_defaults(handler=check)
+    option(parser, "file FILE", Path)
+    option(parser, "--mission M", Path, "mission description to compare the settings with")
+    finish(parser, check)
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -133,7 +131,7 @@ def _share(value: float | None) -> str:
 
 def _configure_run(parser: LinnaParser) -> None:
     parser.description = "Operate links until stopped, in place of `linna serve` (LINNA_LINKS=false)."
-    parser.add_argument("names", nargs="*", metavar="LINK", help="default: all links")
+    option(parser, "names LINK", str, "default: all links", nargs="*")
     add_service_options(parser)
     parser.set_defaults(handler=operate)
 

@@ -92,8 +92,7 @@ def write(arguments: argparse.Namespace) -> int:
     mission = parse_mission(text, str(arguments.out))
     arguments.out.write_text(text, encoding="utf-8")
     figures = {**_figures(mission), "file": str(arguments.out)}
-    emit(arguments, figures, text=f"{arguments.out}\n{_described(figures)}")
-    return 0
+    return emit(arguments, figures, text=f"{arguments.out}\n{_described(figures)}")
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -105,15 +104,13 @@ def check(arguments: argparse.Namespace) -> int:
         emit(arguments, figures, text="\n".join(faults))
         return 2
     figures = {**_figures(mission), "faults": []}
-    emit(arguments, figures, text=_described(figures))
-    return 0
+    return emit(arguments, figures, text=_described(figures))
 
 
 def add(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         figures = service.add_mission(arguments.file).model_dump(mode="json")
-    emit(arguments, figures, text=_described(figures))
-    return 0
+    return emit(arguments, figures, text=_described(figures))
 
 
 def list_missions(arguments: argparse.Namespace) -> int:
@@ -124,15 +121,13 @@ def list_missions(arguments: argparse.Namespace) -> int:
         for one in page.items
     ]
     figures = {"missions": [one.model_dump(mode="json") for one in page.items], "total": page.total}
-    emit(arguments, figures, text="\n".join(lines) or "no mission descriptions")
-    return 0
+    return emit(arguments, figures, text="\n".join(lines) or "no mission descriptions")
 
 
 def show(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         figures = service.get_mission(arguments.revision).model_dump(mode="json")
-    emit(arguments, figures, text=f"{_described(figures)}\n\n{figures['text'].rstrip()}")
-    return 0
+    return emit(arguments, figures, text=f"{_described(figures)}\n\n{figures['text'].rstrip()}")
 
 
 def _figures(mission: Any) -> dict[str, Any]:

@@ -6,33 +6,32 @@ import argparse
 from dataclasses import asdict
 from typing import Any
 
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--runs", type=int, default=50, metavar="N", help="runs (default: 50)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the first run (default: 1)")
-    parser.add_argument("--hours", type=float, default=3.0, metavar="H", help="length of a run (default: 3)")
-    parser.add_argument(
+    option(parser, "--runs N", int, "runs (default: 50)", default=50)
+    option(parser, "--seed", int, "seed of the first run (default: 1)", default=1)
+    option(parser, "--hours H", float, "length of a run (default: 3)", default=3.0)
+    option(
+        parser,
         "--track",
-        choices=("test", "tuning", "inclined", "limb"),
-        default="test",
-        help="orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits "
+        ("test", "tuning", "inclined", "limb"),
+        "orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits "
         "(default: test)",
+        default="test",
     )
-    parser.add_argument(
-        "--noise-factor", type=float, default=1.0, metavar="F", help="factor on the filter's process noise"
+    option(parser, "--noise-factor F", float, "factor on the filter's process noise", default=1.0)
+    option(
+        parser,
+        "--attitude-noise-deg A",
+        float,
+        "true noise of the attitude per axis in each frame (default: as declared on board)",
     )
-    parser.add_argument(
-        "--attitude-noise-deg",
-        type=float,
-        metavar="A",
-        help="true noise of the attitude per axis in each frame (default: as declared on board)",
-    )
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
-    parser.add_argument("--gate", action="store_true", help="exit 1 where errors and claims do not agree")
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    option(parser, "--workers N", int, "processes (default: one per core)")
+    option(parser, "--gate", bool, "exit 1 where errors and claims do not agree")
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:

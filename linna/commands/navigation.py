@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from linna.commands._region import parse_region
-from linna.output import add_json_flag, emit, log, progress
+from linna.output import emit, finish, log, progress
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -17,22 +18,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
         description="Fly observation windows over a region of the terrain in the data folder, with rendered images, "
         "and judge them by the truth. With --out, an interrupted survey resumes with the next seed.",
     )
-    survey.add_argument("--region", required=True, metavar="W,E,S,N", help="degrees, such as 285,300,-60,60")
-    survey.add_argument("--seeds", type=int, default=3, metavar="N", help="sessions (default: 3)")
-    survey.add_argument("--seed", type=int, metavar="S", help="first seed (default: the scenario's)")
-    survey.add_argument(
-        "--windows", type=int, default=6, metavar="N", help="windows of a session (default: 6)"
-    )
-    survey.add_argument("--direction", choices=("ascending", "descending", "any"), default="ascending")
-    survey.add_argument(
-        "--scenario",
+    option(survey, "--region W,E,S,N", str, "degrees, such as 285,300,-60,60", required=True)
+    option(survey, "--seeds N", int, "sessions (default: 3)", default=3)
+    option(survey, "--seed S", int, "first seed (default: the scenario's)")
+    option(survey, "--windows N", int, "windows of a session (default: 6)", default=6)
+    option(survey, "--direction", ("ascending", "descending", "any"), default="ascending")
+    option(
+        survey,
+        "--scenario FILE",
+        str,
+        "errors, attitude, camera and network (default: the shipped unseen-strip)",
         default="unseen-strip",
-        metavar="FILE",
-        help="errors, attitude, camera and network (default: the shipped unseen-strip)",
     )
-    survey.add_argument("--out", type=Path, metavar="DIR", help="folder that keeps the session of each seed")
-    add_json_flag(survey)
-    survey.set_defaults(handler=run_survey)
+    option(survey, "--out DIR", Path, "folder that keeps the session of each seed")
+    finish(survey, run_survey)
 
 
 def run_survey(arguments: argparse.Namespace) -> int:
@@ -61,5 +60,6 @@ def run_survey(arguments: argparse.Namespace) -> int:
             )
         )
     figures = summary(sessions)
-    emit(arguments, {"seeds": list(range(first, first + arguments.seeds)), **figures}, format_survey(figures))
-    return 0
+    return emit(
+        arguments, {"seeds": list(range(first, first + arguments.seeds)), **figures}, format_survey(figures)
+    )

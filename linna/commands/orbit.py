@@ -16,41 +16,31 @@ from linna.commands._orbit_ephemeris import (
     configure_stats,
 )
 from linna.commands._orbit_visibility import configure_visibility
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
-    propagate.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    propagate.add_argument(
-        "--days", type=_positive, default=30.0, metavar="D", help="span in days (default 30)"
-    )
-    propagate.add_argument(
-        "--step", type=_positive, default=30.0, metavar="S", help="seconds between states (default 30)"
-    )
-    propagate.add_argument("--out", type=Path, required=True, metavar="F.oem", help="ephemeris to write")
-    propagate.add_argument("--gravity", metavar="FILE", help="coefficient file, or 'builtin'")
-    propagate.add_argument("--degree", type=int, metavar="N", help="degree of the gravity field")
-    propagate.add_argument(
-        "--integrator", choices=("rkn86", "dop853"), help="another one than the scenario's"
-    )
-    propagate.add_argument("--no-maneuvers", action="store_true", help="let the orbit drift freely")
-    propagate.add_argument(
-        "--free-drift",
-        action="store_true",
-        help="report also when the orbit would hit the ground without burns",
-    )
-    propagate.add_argument(
-        "--count-within-deg",
-        type=_positive,
+    option(propagate, "scenario", str, "scenario file, or the name of a shipped one")
+    option(propagate, "--days D", _positive, "span in days (default 30)", default=30.0)
+    option(propagate, "--step S", _positive, "seconds between states (default 30)", default=30.0)
+    option(propagate, "--out F.oem", Path, "ephemeris to write", required=True)
+    option(propagate, "--gravity FILE", str, "coefficient file, or 'builtin'")
+    option(propagate, "--degree N", int, "degree of the gravity field")
+    option(propagate, "--integrator", ("rkn86", "dop853"), "another one than the scenario's")
+    option(propagate, "--no-maneuvers", bool, "let the orbit drift freely")
+    option(propagate, "--free-drift", bool, "report also when the orbit would hit the ground without burns")
+    option(
+        propagate,
+        "--count-within-deg LAT",
+        _positive,
+        "count the states whose sub-satellite latitude is within this of the equator; may be repeated",
         action="append",
         default=[],
-        metavar="LAT",
-        help="count the states whose sub-satellite latitude is within this of the equator; may be repeated",
     )
-    add_json_flag(propagate)
-    propagate.set_defaults(handler=run_propagate)
+    finish(propagate, run_propagate)
     configure_compare(commands)
     configure_interpolate(commands)
     configure_stats(commands)
@@ -92,8 +82,7 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     if arguments.free_drift:
         figures["free_drift"] = _impact_figures(free_impact(scenario, model, duration_s))
     figures["out"] = str(out)
-    emit(arguments, figures, _text(figures))
-    return 0
+    return emit(arguments, figures, _text(figures))
 
 
 def _positive(text: str) -> float:

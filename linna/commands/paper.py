@@ -7,7 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from linna.output import add_json_flag, emit, log, progress
+from linna.output import emit, finish, log, progress
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -16,21 +17,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "and the same with the estimators of this system: DIR/paper.html, paper.pdf and paper.json. Finished steps are "
         "kept in DIR; the same command continues an interrupted run."
     )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the document and its steps"
+    option(parser, "--out DIR", Path, "folder of the document and its steps", required=True)
+    option(parser, "--quick", bool, "3 hours and few images instead of 24 hours")
+    option(parser, "--hours H", float, "length of the session (default: 24; quick: 3)")
+    option(
+        parser,
+        "--model M.onnx",
+        Path,
+        "class-only network made elsewhere (linna detector export --classes-only) instead of training one",
     )
-    parser.add_argument("--quick", action="store_true", help="3 hours and few images instead of 24 hours")
-    parser.add_argument(
-        "--hours", type=float, metavar="H", help="length of the session (default: 24; quick: 3)"
-    )
-    parser.add_argument(
-        "--model",
-        type=Path,
-        metavar="M.onnx",
-        help="class-only network made elsewhere (linna detector export --classes-only) instead of training one",
-    )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     (out / "paper.json").write_text(as_json(figures) + "\n", encoding="utf-8")
     figures["wall_s"] = round(time.monotonic() - started, 1)
-    emit(arguments, figures, text=_text(figures))
-    return 0
+    return emit(arguments, figures, text=_text(figures))
 
 
 def _workshop(arguments: argparse.Namespace, data: Any) -> Any:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_operator_options, ground_client, server_of
-from linna.output import add_json_flag, emit, log, progress
+from linna.output import emit, finish, log, progress
+from linna.parser import option
 
 PROGRESS_STEP = 0.05
 
@@ -30,83 +31,75 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "3 inconclusive (too few frames, or a value is unknown), 2 bad usage or input.",
     )
     _archives(run)
-    run.add_argument(
-        "--build", required=True, metavar="BUILD", help="candidate: build file, 'current' or identity"
-    )
-    run.add_argument("--baseline", default="current", metavar="BUILD", help="baseline (default: current)")
-    run.add_argument(
-        "--policy", type=Path, metavar="FILE", help="policy of the gates (default: the shipped one)"
-    )
-    run.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit XML")
-    run.add_argument("--report", type=Path, metavar="FILE", help="write the report as HTML")
+    option(run, "--build BUILD", str, "candidate: build file, 'current' or identity", required=True)
+    option(run, "--baseline BUILD", str, "baseline (default: current)", default="current")
+    option(run, "--policy FILE", Path, "policy of the gates (default: the shipped one)")
+    option(run, "--junit FILE", Path, "write JUnit XML")
+    option(run, "--report FILE", Path, "write the report as HTML")
     _finish(run, _run)
     baseline = commands.add_parser(
         "baseline", help="replay archives with one build and show its metrics with confidence intervals"
     )
     _archives(baseline)
-    baseline.add_argument("--build", default="current", metavar="BUILD", help="build (default: current)")
+    option(baseline, "--build BUILD", str, "build (default: current)", default="current")
     _finish(baseline, _baseline)
     suite = commands.add_parser("suite", help="write the pass archives of the regression suite")
-    suite.add_argument("scenario", nargs="*", help="scenario files (default: the shipped suite)")
-    suite.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the archives")
-    suite.add_argument(
-        "--frames", type=int, metavar="N", help="frames of each pass (default: the scenario's)"
-    )
-    suite.add_argument(
-        "--seeds", type=int, default=1, metavar="K", help="passes of each scenario (default: 1)"
-    )
-    add_json_flag(suite)
-    suite.set_defaults(handler=_suite)
+    option(suite, "scenario", str, "scenario files (default: the shipped suite)", nargs="*")
+    option(suite, "--out DIR", Path, "folder for the archives", required=True)
+    option(suite, "--frames N", int, "frames of each pass (default: the scenario's)")
+    option(suite, "--seeds K", int, "passes of each scenario (default: 1)", default=1)
+    finish(suite, _suite)
     archive = commands.add_parser(
         "archive", help="list, add, render, pin, pack or remove the archives kept for replays"
     )
-    archive.add_argument("action", choices=("list", "add", "render", "pin", "unpin", "pack", "prune"))
-    archive.add_argument(
+    option(archive, "action", ("list", "add", "render", "pin", "unpin", "pack", "prune"))
+    option(
+        archive,
         "target",
+        str,
+        "archive to add or pack; pass to add or render; identity to render, pin or unpin",
         nargs="?",
-        help="archive to add or pack; pass to add or render; identity to render, pin or unpin",
     )
-    archive.add_argument("--out", type=Path, metavar="FILE", help="zip to write (pack)")
-    archive.add_argument(
+    option(archive, "--out FILE", Path, "zip to write (pack)")
+    option(
+        archive,
         "--unused-days",
-        type=float,
+        float,
+        "prune: remove archives that were not used for this time (default: 90)",
         default=90.0,
-        help="prune: remove archives that were not used for this time (default: 90)",
     )
     _finish(archive, _archive)
     build = commands.add_parser("build", help="register a build, or list those registered")
-    build.add_argument("action", choices=("register", "list"))
-    build.add_argument("file", nargs="?", help="build file")
+    option(build, "action", ("register", "list"))
+    option(build, "file", str, "build file", nargs="?")
     _finish(build, _build)
     sandbox = commands.add_parser(
         "sandbox", help="show which sandbox isolates builds here, or why builds are refused"
     )
-    add_json_flag(sandbox)
-    sandbox.set_defaults(handler=_sandbox)
+    finish(sandbox, _sandbox)
 
 
 def _archives(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--archive",
+    option(
+        parser,
+        "--archive ARCHIVE",
+        str,
+        "pass archives: folders, zips, folders of archives, or identities of kept archives",
         default=[],
         nargs="+",
         action="extend",
-        metavar="ARCHIVE",
-        help="pass archives: folders, zips, folders of archives, or identities of kept archives",
     )
-    parser.add_argument(
-        "--pass",
+    option(
+        parser,
+        "--pass ID",
+        int,
+        "passes whose archives are replayed",
         dest="passes",
-        type=int,
         default=[],
         nargs="+",
         action="extend",
-        metavar="ID",
-        help="passes whose archives are replayed",
     )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="simultaneous replays (default: one for each core)"
-    )
+    option(parser, "--workers N", int, "simultaneous replays (default: one for each core)")
 
 
 def _finish(
@@ -114,8 +107,7 @@ def _finish(
     handler: Callable[[argparse.Namespace], int],
 ) -> None:
     add_operator_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=handler)
+    finish(parser, handler)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -203,8 +195,7 @@ def _suite(arguments: argparse.Namespace) -> int:
         f"{row['archive']}: {row['frames']} frames, {one.altitude_km[0]:.0f} to {one.altitude_km[1]:.0f} km"
         for row, one in zip(rows, written, strict=True)
     ]
-    emit(arguments, {"passes": rows}, text="\n".join(lines))
-    return 0
+    return emit(arguments, {"passes": rows}, text="\n".join(lines))
 
 
 def _comparison(
@@ -302,8 +293,7 @@ def _archive(arguments: argparse.Namespace) -> int:
         if arguments.out is None:
             raise UsageError("regress archive pack: expected --out FILE, found none")
         archives.pack_archive(Path(arguments.target), arguments.out)
-        emit(arguments, {"archive": str(arguments.out)}, text=f"archive: {arguments.out}")
-        return 0
+        return emit(arguments, {"archive": str(arguments.out)}, text=f"archive: {arguments.out}")
     removed: list[str] = []
     with ground_client(arguments) as service:
         if arguments.action == "add" and _is_pass(arguments.target):
@@ -330,8 +320,9 @@ def _archive(arguments: argparse.Namespace) -> int:
         for one in kept
     ]
     rows = [one.model_dump(mode="json", include=shown) for one in kept]
-    emit(arguments, {"archives": rows, "removed": removed}, text="\n".join(lines) or "no archive is kept")
-    return 0
+    return emit(
+        arguments, {"archives": rows, "removed": removed}, text="\n".join(lines) or "no archive is kept"
+    )
 
 
 def _is_pass(target: str) -> bool:
@@ -348,15 +339,13 @@ def _build(arguments: argparse.Namespace) -> int:
         with ground_client(arguments) as service:
             build = _registered(service, arguments.file)
         figures = build.model_dump(mode="json", include={"digest", "name", "version"})
-        emit(arguments, figures, text=_title(build))
-        return 0
+        return emit(arguments, figures, text=_title(build))
     with ground_client(arguments) as service:
         builds = list(service.list_builds())
     shown = {"digest", "name", "version", "kind", "provenance"}
     lines = [f"{one.digest[:16]}  {one.kind:<8} {one.name} {one.version}".rstrip() for one in builds]
     rows = [one.model_dump(mode="json", include=shown) for one in builds]
-    emit(arguments, {"builds": rows}, text="\n".join(lines) or "no build is registered")
-    return 0
+    return emit(arguments, {"builds": rows}, text="\n".join(lines) or "no build is registered")
 
 
 def _title(build: Build) -> str:

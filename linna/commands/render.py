@@ -7,7 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from linna.output import add_json_flag, emit, log, progress
+from linna.output import emit, finish, log, progress
+from linna.parser import option
 
 RENDERERS = ("fast", "raymarch", "cycles")
 LAWS = ("lunar-lambert", "lambert", "hapke", "matt")
@@ -21,52 +22,33 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Render one frame; with --sheet several frames on one picture. Sheets take the epochs named, or --views "
         "frames spread over the scenario's observation windows."
     )
-    parser.add_argument(
-        "scenario", type=Path, metavar="SCENARIO", help="scenario file, or the name of a shipped one"
-    )
-    parser.add_argument(
-        "--epoch",
+    option(parser, "scenario SCENARIO", Path, "scenario file, or the name of a shipped one")
+    option(
+        parser,
+        "--epoch UTC",
+        str,
+        "when, as 2029-08-07T12:00:00Z; may be repeated",
         action="append",
         default=[],
-        metavar="UTC",
-        help="when, as 2029-08-07T12:00:00Z; may be repeated",
     )
-    parser.add_argument("--out", required=True, type=Path, metavar="F.png", help="RGB picture to write")
-    parser.add_argument("--renderer", choices=RENDERERS, default="fast", help="default: fast")
-    parser.add_argument("--sheet", action="store_true", help="a contact sheet of several frames")
-    parser.add_argument(
-        "--views",
-        type=int,
-        default=SHEET_VIEWS,
-        metavar="N",
-        help=f"frames of a sheet (default: {SHEET_VIEWS})",
-    )
-    parser.add_argument(
-        "--draw-labels",
-        action="store_true",
-        help="draw the labels: cyan, lime, yellow by class (paper, Fig. 5)",
-    )
-    parser.add_argument(
+    option(parser, "--out F.png", Path, "RGB picture to write", required=True)
+    option(parser, "--renderer", RENDERERS, "default: fast", default="fast")
+    option(parser, "--sheet", bool, "a contact sheet of several frames")
+    option(parser, "--views N", int, f"frames of a sheet (default: {SHEET_VIEWS})", default=SHEET_VIEWS)
+    option(parser, "--draw-labels", bool, "draw the labels: cyan, lime, yellow by class (paper, Fig. 5)")
+    option(
+        parser,
         "--label-rule",
-        choices=("exact", "paper"),
+        ("exact", "paper"),
+        "exact rims, or the paper's local equirectangular map (default: exact)",
         default="exact",
-        help="exact rims, or the paper's local equirectangular map (default: exact)",
     )
-    parser.add_argument("--terrain", choices=TERRAINS, help="instead of the scenario's")
-    parser.add_argument(
-        "--photometry", choices=LAWS, help="instead of the scenario's; matt is the paper's Principled BSDF"
-    )
-    parser.add_argument(
-        "--tilt", type=float, metavar="DEG", help="from nadir toward image up, instead of the scenario's"
-    )
-    parser.add_argument(
-        "--yaw", type=float, metavar="DEG", help="azimuth of image up, instead of the scenario's"
-    )
-    parser.add_argument(
-        "--bits", type=int, choices=(8, 12, 16), help="of the sensor, instead of the scenario's"
-    )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run_render)
+    option(parser, "--terrain", TERRAINS, "instead of the scenario's")
+    option(parser, "--photometry", LAWS, "instead of the scenario's; matt is the paper's Principled BSDF")
+    option(parser, "--tilt DEG", float, "from nadir toward image up, instead of the scenario's")
+    option(parser, "--yaw DEG", float, "azimuth of image up, instead of the scenario's")
+    option(parser, "--bits", int, "of the sensor, instead of the scenario's", choices=(8, 12, 16))
+    finish(parser, run_render)
 
 
 def run_render(arguments: argparse.Namespace) -> int:
@@ -120,8 +102,7 @@ def _run_frame(arguments: argparse.Namespace) -> int:
         f"{metadata['sun_elevation_deg']:.1f} deg up, azimuth {metadata['sun_azimuth_deg']:.1f} deg; "
         f"{len(frame.labels)} craters labelled"
     )
-    emit(arguments, figures, text)
-    return 0
+    return emit(arguments, figures, text)
 
 
 def _run_sheet(arguments: argparse.Namespace) -> int:
@@ -150,8 +131,7 @@ def _run_sheet(arguments: argparse.Namespace) -> int:
         "data": list(world.data_names),
     }
     text = f"{arguments.out}: {len(frames)} frames; craters of classes 0, 1, 2: {', '.join(map(str, counts))}"
-    emit(arguments, figures, text)
-    return 0
+    return emit(arguments, figures, text)
 
 
 def _scenario(arguments: argparse.Namespace) -> Any:

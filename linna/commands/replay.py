@@ -7,33 +7,39 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from linna.output import add_json_flag, emit, progress
+from linna.output import emit, finish, progress
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, nargs="?", help="pass archive: a folder or a zip file")
-    parser.add_argument(
-        "--build", default="current", help="build file (TOML), or 'current': this flight code and its network"
+    option(parser, "archive", Path, "pass archive: a folder or a zip file", nargs="?")
+    option(
+        parser,
+        "--build",
+        str,
+        "build file (TOML), or 'current': this flight code and its network",
+        default="current",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="output folder for downlink and summary")
-    parser.add_argument(
-        "--check-build",
-        type=Path,
-        metavar="BUILD",
-        help="only check the parameters of a build file against this flight code",
+    option(parser, "--out DIR", Path, "output folder for downlink and summary")
+    option(
+        parser,
+        "--check-build BUILD",
+        Path,
+        "only check the parameters of a build file against this flight code",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--complete",
-        action="store_true",
-        help="fly nothing; write to --out a copy of the archive with all its frames, rendered from its scenario",
+        bool,
+        "fly nothing; write to --out a copy of the archive with all its frames, rendered from its scenario",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--recorded-only",
-        action="store_true",
-        help="refuse an archive that lacks frames instead of rendering them from its scenario",
+        bool,
+        "refuse an archive that lacks frames instead of rendering them from its scenario",
     )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -67,8 +73,7 @@ def _fly(arguments: argparse.Namespace, archive: Path) -> int:
 
         data = data_folder()
     summary = replay_archive(archive, flight, arguments.out, data=data, progress=_bar)
-    emit(arguments, summary, text=_describe(summary, arguments.out))
-    return 0
+    return emit(arguments, summary, text=_describe(summary, arguments.out))
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -81,8 +86,7 @@ def _check(arguments: argparse.Namespace) -> int:
         fault = {name: getattr(error, name) for name in ("file", "key", "expected", "found")}
         emit(arguments, {"fault": fault}, text=str(error))
         return 2
-    emit(arguments, {"fault": None}, text=f"{arguments.check_build}: parameters are valid")
-    return 0
+    return emit(arguments, {"fault": None}, text=f"{arguments.check_build}: parameters are valid")
 
 
 def _complete(arguments: argparse.Namespace, archive: Path) -> int:
@@ -91,12 +95,11 @@ def _complete(arguments: argparse.Namespace, archive: Path) -> int:
 
     manifest = complete_archive(archive, arguments.out, data_folder(), progress=_bar)
     frames = sum(name.startswith("frames/") for name in manifest["files"])
-    emit(
+    return emit(
         arguments,
         {"archive": str(arguments.out), "frames": frames},
         text=f"{frames} frames, archive: {arguments.out}",
     )
-    return 0
 
 
 def _run_command(arguments: argparse.Namespace, archive: Path) -> int:

@@ -8,20 +8,20 @@ from typing import Any
 
 from linna.commands._ground import add_operator_options, ground_client, server_of, settings_of
 from linna.commands.pass_ import requirement_lines
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("pass_id", type=int, metavar="PASS", help="number of the pass (see linna pass list)")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="folder for the documents (default: reports/pass-N in the home folder; with a server: pass-N)",
+    option(parser, "pass_id PASS", int, "number of the pass (see linna pass list)")
+    option(
+        parser,
+        "--out DIR",
+        Path,
+        "folder for the documents (default: reports/pass-N in the home folder; with a server: pass-N)",
     )
     add_operator_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -40,8 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         **summary,
     }
     lines = [figures["report"], figures["verdict"], *requirement_lines(figures.get("requirements") or [])]
-    emit(arguments, figures, text="\n".join(lines))
-    return 0
+    return emit(arguments, figures, text="\n".join(lines))
 
 
 def _default_folder(arguments: argparse.Namespace) -> Path:

@@ -6,19 +6,13 @@ import argparse
 from pathlib import Path
 
 from linna.output import checked
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--exchange",
-        type=Path,
-        metavar="DIR",
-        help="folder shared with the service (default: $LINNA_RUNNER_EXCHANGE)",
-    )
-    parser.add_argument("--jobs", type=int, metavar="N", help="exit after N builds (default: never)")
-    parser.add_argument(
-        "--check", action="store_true", help="only check whether a runner serves the exchange folder"
-    )
+    option(parser, "--exchange DIR", Path, "folder shared with the service (default: $LINNA_RUNNER_EXCHANGE)")
+    option(parser, "--jobs N", int, "exit after N builds (default: never)")
+    option(parser, "--check", bool, "only check whether a runner serves the exchange folder")
     parser.set_defaults(handler=run)
 
 

@@ -6,6 +6,7 @@ import argparse
 
 from linna.commands._ground import add_service_options, settings_of
 from linna.output import checked
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -13,11 +14,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Enter the nightly job and the jobs of the plan, send lost jobs again, and note overdue telecommands. "
         "One process of a deployment does this, by a lease in the database; each API process takes part as well."
     )
-    parser.add_argument(
-        "--check",
-        action="store_true",
-        help="exit 0 if a process of the deployment has the lease, otherwise 1",
-    )
+    option(parser, "--check", bool, "exit 0 if a process of the deployment has the lease, otherwise 1")
     add_service_options(parser)
     parser.set_defaults(handler=run)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--host", help="address to bind to (default: 127.0.0.1)")
-    parser.add_argument("--port", type=int, help="port (default: 8042)")
+    option(parser, "--host", str, "address to bind to (default: 127.0.0.1)")
+    option(parser, "--port", int, "port (default: 8042)")
     add_service_options(parser)
     parser.set_defaults(handler=run)
 

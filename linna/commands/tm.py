@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 if TYPE_CHECKING:
     from tmtc.downlink import DownlinkDecode
@@ -22,42 +23,30 @@ def configure(parser: argparse.ArgumentParser) -> None:
     decode = commands.add_parser(
         "decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet"
     )
-    decode.add_argument("file", type=Path, metavar="FILE")
-    decode.add_argument("--format", choices=("json", "csv", "parquet"), default="json")
-    decode.add_argument("--out", type=Path, metavar="F", help="write there (default: standard output)")
+    option(decode, "file FILE", Path)
+    option(decode, "--format", ("json", "csv", "parquet"), default="json")
+    option(decode, "--out F", Path, "write there (default: standard output)")
     _add_definition_options(decode)
-    decode.add_argument(
-        "--raw", action="store_true", help="values as transmitted, neither calibrated nor named (with --xtce)"
-    )
-    decode.add_argument(
-        "--packet", metavar="NAME", action="append", help="only packets of this name (repeatable)"
-    )
+    option(decode, "--raw", bool, "values as transmitted, neither calibrated nor named (with --xtce)")
+    option(decode, "--packet NAME", str, "only packets of this name (repeatable)", action="append")
     _add_link_options(decode)
-    add_json_flag(decode)
-    decode.set_defaults(handler=run_decode)
+    finish(decode, run_decode)
 
     check = commands.add_parser("check", help="account for every octet of a downlink")
-    check.add_argument("file", type=Path, metavar="FILE")
-    check.add_argument(
-        "--strict", action="store_true", help="exit 1 when anything is damaged, missing or skipped"
-    )
+    option(check, "file FILE", Path)
+    option(check, "--strict", bool, "exit 1 when anything is damaged, missing or skipped")
     _add_definition_options(check)
     _add_link_options(check)
-    add_json_flag(check)
-    check.set_defaults(handler=run_check)
+    finish(check, run_check)
 
     icd = commands.add_parser("icd", help="the interface control document, in Markdown")
-    icd.add_argument("--out", type=Path, metavar="F", help="write there (default: standard output)")
-    add_json_flag(icd)
-    icd.set_defaults(handler=run_icd)
+    option(icd, "--out F", Path, "write there (default: standard output)")
+    finish(icd, run_icd)
 
     xtce = commands.add_parser("xtce", help="the dictionary as XTCE 1.2")
-    xtce.add_argument("--out", type=Path, metavar="F", help="write there (default: standard output)")
-    xtce.add_argument(
-        "--unrolled", action="store_true", help="without arrays, for decoders that do not support them"
-    )
-    add_json_flag(xtce)
-    xtce.set_defaults(handler=run_xtce)
+    option(xtce, "--out F", Path, "write there (default: standard output)")
+    option(xtce, "--unrolled", bool, "without arrays, for decoders that do not support them")
+    finish(xtce, run_xtce)
 
 
 def run_decode(arguments: argparse.Namespace) -> int:
@@ -75,8 +64,7 @@ def run_decode(arguments: argparse.Namespace) -> int:
         tables = {name: table for name, table in tables.items() if name in arguments.packet}
     records = packet_records(tables)
     if arguments.json and arguments.out is None:
-        emit(arguments, {**decoded.accounting(), "telemetry": records})
-        return 0
+        return emit(arguments, {**decoded.accounting(), "telemetry": records})
     octets = format_records(records, arguments.format)
     return _write(arguments, octets, len(records), decoded.accounting(), _describe(decoded))
 
@@ -96,8 +84,7 @@ def _decode_foreign(arguments: argparse.Namespace) -> int:
     records = xtce_records(found, raw=arguments.raw)
     figures = {**decoded.accounting(), "verdicts": found.counts()}
     if arguments.json and arguments.out is None:
-        emit(arguments, {**figures, "telemetry": records})
-        return 0
+        return emit(arguments, {**figures, "telemetry": records})
     octets = format_xtce_records(records, arguments.format)
     text = f"{_describe(decoded)}\n{_describe_verdicts(found)}"
     return _write(arguments, octets, len(records), figures, text)
@@ -111,8 +98,7 @@ def _write(
         return 0
     _save(arguments.out, octets)
     figures = {**figures, "written": count, "out": str(arguments.out)}
-    emit(arguments, figures, text=f"{count} packets written to {arguments.out}\n{text}")
-    return 0
+    return emit(arguments, figures, text=f"{count} packets written to {arguments.out}\n{text}")
 
 
 def run_check(arguments: argparse.Namespace) -> int:
@@ -167,38 +153,32 @@ def _document(arguments: argparse.Namespace, text: str) -> int:
 
     figures = {"dictionary_version": DICTIONARY.version, "dictionary_hash": DICTIONARY.hash}
     if arguments.out is None:
-        emit(arguments, {**figures, "text": text}, text=text.rstrip("\n"))
-        return 0
+        return emit(arguments, {**figures, "text": text}, text=text.rstrip("\n"))
     _save(arguments.out, text.encode())
-    emit(arguments, {**figures, "out": str(arguments.out)}, text=f"written to {arguments.out}")
-    return 0
+    return emit(arguments, {**figures, "out": str(arguments.out)}, text=f"written to {arguments.out}")
 
 
 def _add_definition_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("packets of other missions")
-    group.add_argument(
-        "--xtce",
-        type=Path,
-        metavar="DEFINITION",
+    option(
+        group,
+        "--xtce DEFINITION",
+        Path,
+        "decode through this XTCE file in place of the payload's dictionary (repeatable)",
         action="append",
-        help="decode through this XTCE file in place of the payload's dictionary (repeatable)",
     )
-    group.add_argument(
-        "--container", metavar="NAME", help="container that packets begin with, where there are several"
-    )
-    group.add_argument(
-        "--no-error-control", action="store_true", help="packets do not end with a checksum (CRC-16)"
-    )
+    option(group, "--container NAME", str, "container that packets begin with, where there are several")
+    option(group, "--no-error-control", bool, "packets do not end with a checksum (CRC-16)")
 
 
 def _add_link_options(parser: argparse.ArgumentParser) -> None:
     link = parser.add_argument_group("link", "settings of the link; found out from the file where not given")
-    link.add_argument("--frame-length", type=int, metavar="N", help="octets of a transfer frame")
-    link.add_argument("--coding", choices=("rs", "none"))
-    link.add_argument("--randomiser", choices=("none", "legacy", "long"))
-    link.add_argument("--interleave", type=int, metavar="I")
-    link.add_argument("--no-frame-checksum", action="store_true", help="frames carry no frame error control")
-    link.add_argument("--spacecraft-id", type=lambda text: int(text, 0), metavar="ID")
+    option(link, "--frame-length N", int, "octets of a transfer frame")
+    option(link, "--coding", ("rs", "none"))
+    option(link, "--randomiser", ("none", "legacy", "long"))
+    option(link, "--interleave I", int)
+    option(link, "--no-frame-checksum", bool, "frames carry no frame error control")
+    option(link, "--spacecraft-id ID", lambda text: int(text, 0))
 
 
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:

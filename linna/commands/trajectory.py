@@ -9,19 +9,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "report", type=Path, metavar="REPORT.json", help="report of a pass, as linna report wrote it"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the TUM files")
-    parser.add_argument(
-        "--frames", type=int, default=4, metavar="N", help="frames that a relative error spans (default: 4)"
-    )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    option(parser, "report REPORT.json", Path, "report of a pass, as linna report wrote it")
+    option(parser, "--out DIR", Path, "folder for the TUM files", required=True)
+    option(parser, "--frames N", int, "frames that a relative error spans (default: 4)", default=4)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -59,12 +55,11 @@ def run(arguments: argparse.Namespace) -> int:
             "ate": asdict(absolute_error(position, truth)),
             "rpe": asdict(relative_error(position, truth, arguments.frames)),
         }
-    emit(
+    return emit(
         arguments,
         {"frames": arguments.frames, "series": figures, "out": str(arguments.out)},
         describe(figures),
     )
-    return 0
 
 
 def describe(figures: dict[str, Any]) -> str:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._ground import add_service_options, local_actor, open_service
 from linna.commands._table import Command, Commands, Hand, Option, add_commands
-from linna.output import add_json_flag, emit
+from linna.output import emit, finish
+from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.access.model import Token, User
@@ -36,14 +37,11 @@ def _revoke(service: Client, token_id: int) -> Token:
 
 
 def _configure_ensure(parser: LinnaParser) -> None:
-    parser.add_argument("name")
-    parser.add_argument("--role", choices=("viewer", "operator", "admin"), required=True)
-    parser.add_argument(
-        "--token-variable", default="LINNA_ADMIN_TOKEN", metavar="NAME", help="default: LINNA_ADMIN_TOKEN"
-    )
+    option(parser, "name", str)
+    option(parser, "--role", ("viewer", "operator", "admin"), required=True)
+    option(parser, "--token-variable NAME", str, "default: LINNA_ADMIN_TOKEN", default="LINNA_ADMIN_TOKEN")
     add_service_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=_ensure)
+    finish(parser, _ensure)
 
 
 def _ensure(arguments: argparse.Namespace) -> int:
@@ -58,8 +56,7 @@ def _ensure(arguments: argparse.Namespace) -> int:
     with open_service(arguments) as ground:
         changed = ensure_user(ground, arguments.name, arguments.role, token, actor=local_actor())
     state = "set" if changed else "unchanged"
-    emit(arguments, {"name": arguments.name, "changed": changed}, text=f"{arguments.name}: {state}")
-    return 0
+    return emit(arguments, {"name": arguments.name, "changed": changed}, text=f"{arguments.name}: {state}")
 
 
 def _changed(user: User) -> str:

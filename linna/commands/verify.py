@@ -6,25 +6,27 @@ import argparse
 import time
 
 from linna.commands._ground import add_service_options, open_service
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log
+from linna.parser import option
 
 LINES = 50
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    option(
+        parser,
         "--rebuild",
-        action="store_true",
-        help="also derive packets, values, roll-ups and time correlations again from the raw files and compare",
+        bool,
+        "also derive packets, values, roll-ups and time correlations again from the raw files and compare",
     )
-    parser.add_argument(
-        "--head",
-        metavar="NUMBER:SHA256",
-        help="head of the audit chain that was stored elsewhere ('linna audit head')",
+    option(
+        parser,
+        "--head NUMBER:SHA256",
+        str,
+        "head of the audit chain that was stored elsewhere ('linna audit head')",
     )
     add_service_options(parser)
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:

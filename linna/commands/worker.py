@@ -6,15 +6,12 @@ import argparse
 
 from linna.commands._ground import add_service_options, settings_of
 from linna.output import checked
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--concurrency", type=int, default=1, metavar="N", help="simultaneous jobs (default: 1)"
-    )
-    parser.add_argument(
-        "--check", action="store_true", help="exit 0 if the worker of this machine responds, otherwise 1"
-    )
+    option(parser, "--concurrency N", int, "simultaneous jobs (default: 1)", default=1)
+    option(parser, "--check", bool, "exit 0 if the worker of this machine responds, otherwise 1")
     add_service_options(parser)
     parser.set_defaults(handler=run)
 

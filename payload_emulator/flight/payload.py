@@ -42,6 +42,7 @@ __all__ = ["FlightParameters", "FlightTables", "Payload", "PayloadMode"]
 _PARAMETERS, _NO_TABLES = FlightParameters(), FlightTables()
 # Octets of packets in a transfer frame, for time reports.
 _FRAME_OCTETS = 1_107
+_TIME_EXPONENT = 4
 _HOUR_TICKS = 3_600 * TICKS_PER_SECOND
 _SCRUBBED_RECORDS = 256
 # What is sent in modes without a science downlink.
@@ -99,6 +100,7 @@ class Payload:
             defaults={
                 "housekeeping_interval_s": parameters.housekeeping_interval_s,
                 "image_reports": float(parameters.image_reports),
+                "scrub_interval_s": parameters.scrub_interval_s,
             }
         )
         store = PacketStore(board.store)
@@ -120,6 +122,7 @@ class Payload:
             model_hash=model_hash,
             model_octets=0 if isinstance(model_octets, bytes) else model_octets,
             boot_count=boot_count,
+            time_exponent=_TIME_EXPONENT if parameters.time_reports else -1,
         )
         self._last_ticks: int | None = None
         self._last_uptime = -1
@@ -129,7 +132,7 @@ class Payload:
 
     def step(
         self,
-        image: NDArray[Any],
+        image: NDArray[Any] | None,
         attitude: FloatArray,
         clock_ticks: int,
         telecommand_octets: bytes,
@@ -140,7 +143,7 @@ class Payload:
         Parameters
         ----------
         image
-            (H, W) or (H, W, 3); an image without pixels stands for a camera that gave none.
+            (H, W) or (H, W, 3); without pixels for a camera that gave none; None in a turn in which none was taken.
         attitude
             Message of the ADCS, shape (7,): q_wxyz of camera_from_icrf, then the unit Sun vector in the
             camera frame; NaN where absent.
@@ -203,6 +206,11 @@ class Payload:
             due += [ticks for ticks in (window.next_ticks, window.stop_ticks) if ticks]
         return min(due, default=None)
 
+    @property
+    def has_cadence(self) -> bool:
+        """Whether the observation was commanded with an interval of frames; else every image is looked at."""
+        return self._machine.observation.cadence_ticks > 0
+
     def will_look(self, ticks: int, telecommand_octets: bytes) -> bool:
         """Return whether a step at an on-board time with these telecommands may look at its image.
 
@@ -210,7 +218,7 @@ class Payload:
         """
         machine, window = self._machine, self._machine.observation
         if machine.mode is PayloadMode.observing and not 0 < window.stop_ticks <= ticks:
-            return not window.cadence_ticks or ticks >= window.next_ticks - window.cadence_ticks // 2
+            return ticks >= window.next_ticks
         schedule = machine.schedule
         due = [one.packet for one in schedule.activities if schedule.enabled and one.release_ticks <= ticks]
         orders = [*parse_commands(telecommand_octets), *parse_commands(b"".join(due))]
@@ -386,12 +394,14 @@ class Payload:
 
     # Frames
 
-    def _look(self, image: NDArray[Any], attitude: FloatArray, instruments: Samples) -> None:
+    def _look(self, image: NDArray[Any] | None, attitude: FloatArray, instruments: Samples) -> None:
         """Work on a frame, if it is time for one; end the observation when its time is over."""
         machine = self._machine
         ticks, window = machine.telemetry.ticks, machine.observation
         if machine.mode is PayloadMode.observing and window.stop_ticks and ticks >= window.stop_ticks:
             machine.enter(PayloadMode.standby)
+        if image is None:
+            return
         if machine.mode is not PayloadMode.observing:
             if image.size:
                 machine.telemetry.event("info", "frame_skipped", float(machine.mode))

@@ -16,10 +16,11 @@ from typing import Any
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.onboard.modes import PayloadMode
-from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
-from payload_emulator.session.flying import fly
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.scenario import SHIPPED, FaultsSection, Scenario
+from payload_emulator.session.schedule import fly_scenario
+from payload_emulator.session.spacecraft import new_spacecraft
+from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import World, build_world, clock_ticks
 from payload_emulator.sim.board.faults import Fault, parse_fault
 from tmtc.cuc import TICKS_PER_SECOND
@@ -140,9 +141,9 @@ def fly_case(world: World, loaded: LoadedPayload, case: Case, seed: int) -> Resu
     first_ticks = clock_ticks(world, int(world.frame_utc_ns[0]))
     events: list[tuple[float, str]] = []
     processed: list[float] = []
-    for flown in fly(world, spacecraft):
-        second = (flown.moment.utc_ns - int(world.frame_utc_ns[0])) / 1e9
-        for packet in flown.packets:
+    for turn in fly_scenario(world, spacecraft):
+        second = (turn.moment.utc_ns - int(world.frame_utc_ns[0])) / 1e9
+        for packet in turn.packets:
             name, values = DICTIONARY.unpack(packet)
             if name.startswith("event_"):
                 made_s = (int.from_bytes(packet[14:20], "big") - first_ticks) / TICKS_PER_SECOND

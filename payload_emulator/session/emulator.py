@@ -12,23 +12,22 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lunar.catalogue import CraterCatalogue, save_catalogue
+from lunar.catalogue import save_catalogue
 from lunar.datafolder import DataFolder
-from lunar.ephemeris import Ephemeris
 from lunar.frames import spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
-from payload_emulator.errors import ScenarioError
+from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.session.external import ExternalFrames
-from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
 from payload_emulator.session.instruments import onboard_attitudes
-from payload_emulator.session.loading import LoadedPayload, load_payload
+from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.mission import save_attitudes, save_mission
 from payload_emulator.session.recording import (
     StepInput,
@@ -38,19 +37,36 @@ from payload_emulator.session.recording import (
     step_input,
 )
 from payload_emulator.session.scenario import Scenario, format_scenario
+from payload_emulator.session.schedule import fly_scenario, timeline
 from payload_emulator.session.scoring import judge_session, score_navigation
-from payload_emulator.session.spacecraft import Spacecraft, new_board
+from payload_emulator.session.spacecraft import (
+    PLAYBACK_CHANNEL,
+    SPACECRAFT_ID,
+    Spacecraft,
+    Turn,
+    new_spacecraft,
+)
+from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import (
     World,
     build_world,
-    catalogue_near_track,
+    clock_ticks,
     sample_truth,
-    with_reference_error,
 )
-from payload_emulator.sim.board.faults import parse_fault
-from payload_emulator.sim.board.link import Reception, save_receptions, save_time_receptions, transmit
-from tmtc.dictionary import DICTIONARY
+from payload_emulator.sim.board.link import (
+    LIGHT_S,
+    Reception,
+    Transmitter,
+    save_receptions,
+    save_time_receptions,
+    transmit,
+)
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.dictionary import APID_TIME_REPORT, DICTIONARY
 from tmtc.link import LinkSettings
+
+_LATE_TICKS = 120 * TICKS_PER_SECOND
+_DUMP_OCTETS = 64_000
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
@@ -97,35 +113,45 @@ def emulate(
     return summary
 
 
-def new_spacecraft(world: World, loaded: LoadedPayload) -> Spacecraft:
-    """The payload of a scenario on a new board, with the faults of the scenario ahead of it."""
-    scenario = world.scenario
-    return Spacecraft(
-        loaded,
-        new_board(scenario.seed),
-        int(world.frame_utc_ns[0]),
-        tuple(parse_fault(text) for text in scenario.faults.events),
-        CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
-    )
+@dataclass(slots=True, eq=False)
+class Sender:
+    """Puts what the payload hands over into dumps: one for all without stations, else several a contact.
 
+    Packets older than `_LATE_TICKS` travel on the channel for playback. `time_reports` keeps when each was emitted
+    (UTC), whenever their dump goes out: they tell the clock at that instant.
+    """
 
-def load_scenario_payload(world: World, data: DataFolder) -> tuple[LoadedPayload, Ephemeris, CraterCatalogue]:
-    """The payload loaded for a world, with the reference and the catalogue that the ground made its tables of."""
-    scenario = world.scenario
-    truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns)
-    reference = with_reference_error(truth_ephemeris, scenario.reference, scenario.seed)
-    catalogue = catalogue_near_track(world)
-    loaded = load_payload(
-        scenario,
-        world.camera,
-        reference,
-        catalogue,
-        world.truth.orientation,
-        data,
-        int(world.frame_utc_ns[0]),
-        world.burns,
-    )
-    return loaded, reference, catalogue
+    world: World
+    settings: LinkSettings
+    transmitter: Transmitter = field(init=False)
+    time_reports: list[tuple[bytes, int]] = field(default_factory=list)
+    _waiting: dict[int, list[tuple[bytes, bytes]]] = field(default_factory=dict)
+    _utc_ns: int = 0
+    _light_s: float = LIGHT_S
+
+    def __post_init__(self) -> None:
+        self.transmitter = Transmitter(SPACECRAFT_ID, self.settings)
+
+    def take(self, turn: Turn) -> None:
+        """Take the packets of a turn, and send what is complete."""
+        self._utc_ns, self._light_s = turn.moment.utc_ns, turn.moment.light_s
+        stations = bool(self.world.scenario.link.stations)
+        now = clock_ticks(self.world, turn.moment.utc_ns)
+        for packet in turn.packets:
+            late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
+            self._waiting.setdefault(PLAYBACK_CHANNEL if late else 0, []).append((packet, turn.clcw))
+            if not late and int.from_bytes(packet[:2], "big") & 0x7FF == APID_TIME_REPORT:
+                self.time_reports.append((packet, turn.moment.utc_ns))
+        waiting = sum(len(packet) for packets in self._waiting.values() for packet, _ in packets)
+        if stations and (not turn.moment.heard or waiting > _DUMP_OCTETS):
+            self.flush()
+
+    def flush(self) -> None:
+        """Send everything."""
+        for channel, waiting in sorted(self._waiting.items()):
+            packets, clcws = [packet for packet, _ in waiting], [clcw for _, clcw in waiting]
+            self.transmitter.send(packets, self._utc_ns, channel, self._light_s, clcws)
+        self._waiting = {}
 
 
 def _emulate_into(
@@ -148,12 +174,14 @@ def _emulate_into(
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
     inputs: list[StepInput] = []
     attitudes = np.full((total, 3, 3), np.nan)
-    flown = fly(world, spacecraft)
-    for moment in progress(flown, len(timeline(world))) if progress else flown:
-        sender.take(moment)
-        given, number = spacecraft.given, moment.moment.frame
-        if moment.exposure is not None:
-            attitudes[number] = moment.exposure.camera_from_mcmf
+    flown = fly_scenario(world, spacecraft)
+    for turn in progress(flown, len(timeline(world))) if progress else flown:
+        sender.take(turn)
+        given, number = spacecraft.given, turn.moment.frame
+        if turn.exposure is not None:
+            if turn.exposure.fault:
+                raise TerrainError(turn.exposure.fault)
+            attitudes[number] = turn.exposure.camera_from_mcmf
         if given is None:
             continue
         inputs.append(step_input(number, given))

@@ -19,8 +19,9 @@ from lunar.lens import BrownCamera
 from lunar.messages.oem import load_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
+from payload_emulator.session.camera import true_sun_direction
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.world import World, build_world, true_sun_direction
+from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.orbit.truth import require_above_ground
 from payload_emulator.sim.render import raymarch, renderer
 from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_scene

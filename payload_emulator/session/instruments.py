@@ -60,6 +60,15 @@ class InstrumentBench:
     _sampled_utc_ns: dict[str, int] = field(default_factory=dict)
     _frame: tuple[int, FloatArray] | None = None
 
+    @property
+    def state(self) -> tuple[dict[str, Any], dict[str, int], tuple[int, FloatArray] | None]:
+        """What the samples to come depend on."""
+        return self._states, self._sampled_utc_ns, self._frame
+
+    @state.setter
+    def state(self, value: tuple[dict[str, Any], dict[str, int], tuple[int, FloatArray] | None]) -> None:
+        self._states, self._sampled_utc_ns, self._frame = value
+
     def sample(self, utc_ns: int, camera_from_mcmf: FloatArray) -> Samples:
         """Return the samples before a frame, the on-board time first; `camera_from_mcmf` is its true attitude."""
         scenario = self.world.scenario

@@ -52,6 +52,8 @@ from tmtc.tables import (
     unpack_catalogue_table,
 )
 
+# Memory of a launched spacecraft is checked at this interval, which a mission of months can afford.
+_SCRUB_S = 600.0
 _ANCHOR_STEP_NS = 15_000_000_000
 _ORIENTATION_STEP_NS = 3_600_000_000_000
 _ORIENTATION_MARGIN_NS = 4 * _ORIENTATION_STEP_NS
@@ -157,14 +159,15 @@ def launch_payload(
 ) -> LoadedPayload:
     """Flight software as launched: model, parameters, gravity field and catalogue; other tables are uploaded in flight.
 
-    It reports the checksums of each image, so that the ground can check images that it renders again.
+    It reports its time and the checksums of each image, so that the ground can correlate its clock and check images
+    that it renders again.
 
     Raises
     ------
     ModelError
         The detector model is missing or no network of this project.
     """
-    build = _build(scenario, camera, data, image_reports=True)
+    build = _build(scenario, camera, data, is_launched=True)
     craters = b"" if catalogue is None else _catalogue_octets(scenario, catalogue)
     tables = FlightTables(gravity=_gravity_octets(build.field), catalogue=craters)
     return _loaded(build, tables, {}, IauOrientation())
@@ -180,9 +183,7 @@ class _Build:
     field: GravityField
 
 
-def _build(
-    scenario: Scenario, camera: PinholeCamera, data: DataFolder, image_reports: bool = False
-) -> _Build:
+def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder, is_launched: bool = False) -> _Build:
     model_octets = network_octets(scenario.detector.network)
     navigation = scenario.navigation
     field = filter_field(navigation.filter_gravity, navigation.filter_degree, data)
@@ -193,7 +194,9 @@ def _build(
             modes=tuple(Mode[name] for name in navigation.estimators),
             odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
             anchored=AnchoredParameters(gravity_degree=field.degree, errors=_attitude_errors(scenario)),
-            image_reports=image_reports,
+            image_reports=is_launched,
+            time_reports=is_launched,
+            scrub_interval_s=_SCRUB_S if is_launched else FlightParameters().scrub_interval_s,
             instruments=flight_parameters(scenario),
         ),
     )

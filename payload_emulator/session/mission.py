@@ -7,6 +7,7 @@ TOML, read by the ground service.
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
@@ -22,15 +23,15 @@ from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.session.flying import PLAYBACK_CHANNEL, SPACECRAFT_ID
 from payload_emulator.session.loading import detector_parameters, filter_field, network_octets
 from payload_emulator.session.recipe import Box, Source, load_recipe
 from payload_emulator.session.recording import StepInput
 from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario, format_scenario
+from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL, SPACECRAFT_ID
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.board.contact_plan import parse_outage
-from payload_emulator.sim.board.link import STATIONS
+from payload_emulator.sim.board.link import STATIONS, LinkSection
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.link import LinkSettings
@@ -48,6 +49,20 @@ SEEN_SPLITS = ("train", "val")
 
 SILENCE_S = 1_800.0
 """Mission time without telemetry after which a contact has ended: at maximum speed minutes pass between two reads."""
+
+OPERATIONS = """
+[automation]
+evaluate = true
+
+[approval]
+windows = "automatic"
+one_person_for = [
+  "enable_schedule", "set_parameter", "set_time_report_rate",
+  "uplink_first", "uplink_middle", "uplink_last", "perform_function/set_mode",
+  "perform_function/start_observation", "perform_function/stop_observation",
+]
+"""
+"""Automation and approval of a simulated spacecraft: windows that the ground plans are flown without a person."""
 
 _TRACK_STEP_S = 60.0
 
@@ -147,63 +162,54 @@ def _registration(world: World) -> dict[str, float | int]:
     }
 
 
-def operations_mission_text(
+def live_mission_text(
     world: World,
     data: DataFolder,
     host: str,
     ports: Mapping[str, tuple[int, int]],
-    further: str = "",
+    operations: str | None = None,
     acknowledge: bool = False,
+    catalogue: Path | None = None,
 ) -> str:
-    """Return the mission description of a spacecraft in continuous operation.
+    """Return the mission description of a spacecraft that is flown live.
 
     Parameters
     ----------
     ports
         Telemetry and telecommand port of each station on `host`.
-    further
-        TOML appended to the text: automation, approval and resources.
+    operations
+        TOML of automation and approval, and further sections where the ground commands; None: the operator of the
+        scenario commands its windows.
     acknowledge
         Whether the stations keep telemetry until the ground acknowledges it, and confirm telecommands.
+    catalogue
+        Craters that were on board at launch.
     """
     scenario, link = world.scenario, world.scenario.link
-    step_ns = round(_TRACK_STEP_S * NS)
-    times = np.arange(world.truth.start_utc_ns, world.truth.stop_utc_ns, step_ns, dtype=np.int64)
-    latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
-    low_deg, high_deg = scenario.window.latitude_band_deg
-    band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
-    lines = [mission_text(replace(world, frame_utc_ns=band), data).rstrip()]
-    lines += [
-        "",
-        "[uploads]",
-        f"tables = {_toml(_uploaded_tables(scenario))}",
-        f"sigma_position_m = {max(scenario.navigation.initial_position_error_m, 1.0)!r}",
-        f"sigma_velocity_m_s = {max(scenario.navigation.initial_velocity_error_m_s, 1e-3)!r}",
-    ]
-    if scenario.camera.images != "reduced":
-        lines += ["", "[world]", f"scenario = {_toml(format_scenario(scenario))}"]
-    for name in link.stations:
-        latitude_deg, longitude_deg, height_m = STATIONS[name]
-        own = [one for one in map(parse_outage, link.outages) if one.station == name]
-        values: dict[str, Value] = {
-            "latitude_deg": latitude_deg,
-            "longitude_deg": longitude_deg,
-            "height_m": height_m,
-            "minimum_elevation_deg": link.minimum_elevation_deg,
-            "downlink_bps": link.rate_bps,
-            "uplink_bps": link.uplink_bps,
-            "outages": [f"{format_utc(one.start_utc_ns)}/{format_utc(one.stop_utc_ns)}" for one in own],
-            "header_octets": RECORD_HEADER.size,
-            "time_code": "unix_ns",
-            "time_offset": 0,
-        }
+    if operations is None:
+        lines = [mission_text(world, data).rstrip()]
+    else:
+        step_ns = round(_TRACK_STEP_S * NS)
+        times = np.arange(world.truth.start_utc_ns, world.truth.stop_utc_ns, step_ns, dtype=np.int64)
+        latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
+        low_deg, high_deg = scenario.window.latitude_band_deg
+        band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
+        lines = [mission_text(replace(world, frame_utc_ns=band), data).rstrip()]
         lines += [
             "",
-            f"[link.stations.{name}]",
-            *(f"{key} = {_toml(value)}" for key, value in values.items()),
+            "[uploads]",
+            f"tables = {_toml(_uploaded_tables(scenario))}",
+            f"sigma_position_m = {max(scenario.navigation.initial_position_error_m, 1.0)!r}",
+            f"sigma_velocity_m_s = {max(scenario.navigation.initial_velocity_error_m_s, 1e-3)!r}",
         ]
+        if scenario.camera.images != "reduced":
+            lines += ["", "[world]", f"scenario = {_toml(format_scenario(scenario))}"]
+    if catalogue is not None:
+        digest = hashlib.sha256(catalogue.read_bytes()).hexdigest()
+        lines[0] = lines[0].replace("[catalogue]\n", f'[catalogue]\nsha256 = "{digest}"\n')
     for name, (telemetry, telecommand) in ports.items():
-        values = {
+        lines += ["", *_section(f"[link.stations.{name}]", _station(name, link))]
+        connection: dict[str, Value] = {
             "name": name,
             "kind": "tcp",
             "station": name,
@@ -215,8 +221,35 @@ def operations_mission_text(
             "confirm": acknowledge,
             "silence_s": SILENCE_S,
         }
-        lines += ["", "[[links]]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
-    return "\n".join(lines) + "\n" + further
+        lines += ["", *_section("[[links]]", connection)]
+    return "\n".join(lines) + "\n" + (operations or "")
+
+
+def _section(title: str, values: Mapping[str, Value]) -> list[str]:
+    return [title, *(f"{key} = {_toml(value)}" for key, value in values.items())]
+
+
+def _station(name: str, link: LinkSection) -> dict[str, Value]:
+    """Place, rates and outages of a station of the scenario, and its records."""
+    records: dict[str, Value] = {
+        "header_octets": RECORD_HEADER.size,
+        "time_code": "unix_ns",
+        "time_offset": 0,
+    }
+    if name not in link.stations:
+        return records
+    latitude_deg, longitude_deg, height_m = STATIONS[name]
+    own = [one for one in map(parse_outage, link.outages) if one.station == name]
+    return {
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "height_m": height_m,
+        "minimum_elevation_deg": link.minimum_elevation_deg,
+        "downlink_bps": link.rate_bps,
+        "uplink_bps": link.uplink_bps,
+        "outages": [f"{format_utc(one.start_utc_ns)}/{format_utc(one.stop_utc_ns)}" for one in own],
+        **records,
+    }
 
 
 def _uploaded_tables(scenario: Scenario) -> list[str]:

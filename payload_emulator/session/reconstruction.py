@@ -26,6 +26,7 @@ from payload_emulator.flight.onboard.commanding import Refusal, parse_commands
 from payload_emulator.flight.onboard.parameters import find_parameter
 from payload_emulator.flight.ports import UNLIMITED, ResetCause
 from payload_emulator.flight.telemetry.products import image_report
+from payload_emulator.session.camera import Exposure, expose
 from payload_emulator.session.emulator import file_entries
 from payload_emulator.session.instruments import InstrumentBench, onboard_attitudes
 from payload_emulator.session.loading import LoadedPayload, launch_payload
@@ -39,11 +40,11 @@ from payload_emulator.session.recording import (
 )
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.world import (
-    Exposure,
+    CHUNK_S,
     World,
-    expose_at,
     extended_flight,
     first_utc_ns,
+    frame_utc_ns,
     open_world,
 )
 from tmtc.cuc import TICKS_PER_SECOND
@@ -61,9 +62,6 @@ TELECOMMANDS = "telecommands.packets"
 
 CATALOGUE = "onboard-catalogue.csv"
 """Crater catalogue of the ground, of which the table on board was made."""
-
-CHUNK_S = 86_400.0
-"""Time that the orbit is propagated at once, as in flight: another division gives other last digits."""
 
 _BOOT_TICKS = 60 * TICKS_PER_SECOND
 _MARGIN_NS = 600_000_000_000
@@ -102,7 +100,7 @@ def reconstruct(
     telecommands = _octets(archive, TELECOMMANDS, "telecommands that were sent for the pass")
     _octets(archive, CATALOGUE, "the crater catalogue that was on board at launch")
     catalogue = load_catalogue(archive / CATALOGUE)
-    world = open_world(scenario, data, CHUNK_S)
+    world = open_world(scenario, data, is_declared=True)
     loaded = launch_payload(scenario, world.camera, data, catalogue)
     _check_loads(archive, telemetry.get("housekeeping"), loaded, telecommands)
     world = flown_until(world, first_utc_ns(world, reports[-1].ticks))
@@ -164,7 +162,9 @@ def with_telecommands(steps: Mapping[int, StepInput], telecommands: bytes) -> li
 def _exposures(world: World, reports: Sequence[ImageReport]) -> Iterator[tuple[ImageReport, Exposure]]:
     bench = InstrumentBench(world)
     for report in reports:
-        yield report, expose_at(world, first_utc_ns(world, report.ticks), bench.sample)
+        exposure = expose(world, frame_utc_ns(world, report.ticks))
+        samples = bench.sample(exposure.utc_ns, exposure.camera_from_mcmf)
+        yield report, replace(exposure, instruments=samples)
 
 
 def _step(ticks: int) -> StepInput:

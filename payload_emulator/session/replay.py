@@ -250,7 +250,8 @@ def replay(
         detector.reset()
         detector.image_ticks = item.clock_ticks
         began = cpu_clock()
-        packets += payload.step(image, item.attitude, item.clock_ticks, item.telecommands, item.instruments)
+        taken = None if item.number < 0 else image
+        packets += payload.step(taken, item.attitude, item.clock_ticks, item.telecommands, item.instruments)
         step_s = cpu_clock() - began
         if item.number < 0:
             continue
@@ -289,8 +290,9 @@ def stored_images(archive: Path, record: PassRecord) -> Iterator[Image]:
 
 def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iterator[Image]:
     """The images of a pass, those that its archive lacks rendered from scenario and seed and found to be the same."""
+    from payload_emulator.session.camera import expose
     from payload_emulator.session.scenario import parse_scenario
-    from payload_emulator.session.world import build_world, expose_frame
+    from payload_emulator.session.world import build_world
 
     text = _manifest(archive).get("scenario_toml")
     if not text:
@@ -306,7 +308,7 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
             raise RecordError(
                 f"{archive}: expected a scenario with frame {item.number}, found {world.frame_utc_ns.size} frames"
             )
-        image = expose_frame(world, item.number).image
+        image = expose(world, int(world.frame_utc_ns[item.number])).image
         check_image(item, image, f"frame {item.number} rendered from the scenario of {archive}")
         return image
 

@@ -236,10 +236,11 @@ class DisturbancesSection:
 
 @dataclass(frozen=True, slots=True)
 class ClockSection:
-    """The on-board clock: reading minus ideal = offset + drift x elapsed."""
+    """The on-board clock: reading minus ideal = offset + drift x elapsed since `reference`, UTC; empty: first frame."""
 
     offset_s: float = 0.0
     drift_ppm: float = 0.0
+    reference: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -522,7 +523,12 @@ def _check(scenario: Scenario, source: str) -> None:
 
 def _check_orbit(scenario: Scenario, require: Require) -> None:
     orbit, window = scenario.orbit, scenario.window
-    for key, text in (("orbit.epoch", orbit.epoch), ("window.start", window.start)):
+    texts = {
+        "orbit.epoch": orbit.epoch,
+        "window.start": window.start,
+        "clock.reference": scenario.clock.reference,
+    }
+    for key, text in texts.items():
         try:
             if text or key == "orbit.epoch":
                 parse_utc(text)

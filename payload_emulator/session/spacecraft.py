@@ -1,8 +1,12 @@
-"""The payload on its simulated board: time, power, faults and resets around `Payload.step`."""
+"""The spacecraft: the payload on its simulated board, its camera and receiver, and the loop that flies it.
+
+Every way to fly is `fly` over a schedule of moments: a scenario with its operator, a process commanded by the ground.
+Time, power, faults and resets are around `Payload.step`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,14 +20,23 @@ from payload_emulator.flight.payload import Payload
 from payload_emulator.flight.ports import SETTINGS_OCTETS, STORE_OCTETS, UNLIMITED, ResetCause
 from payload_emulator.flight.vision.detections import Detections, Detector
 from payload_emulator.flight.vision.preprocess import ImageQuality
+from payload_emulator.session.camera import Camera, Exposure
+from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.loading import LoadedPayload
-from payload_emulator.session.world import NO_SAMPLES, Samples
-from payload_emulator.sim.board.faults import Fault
+from payload_emulator.session.reduced import CatalogueDetector
+from payload_emulator.session.world import NO_SAMPLES, Samples, World, clock_ticks
+from payload_emulator.sim.board.faults import Fault, parse_fault
+from payload_emulator.sim.board.link import LIGHT_S, Receiver
 from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
 from payload_emulator.sim.orbit.truth import ReadCount, counted_reads
 from tmtc.cuc import TICKS_PER_SECOND
 
+SPACECRAFT_ID = 0x4C
+PLAYBACK_CHANNEL = 1
+"""Virtual channel of packets that are sent long after they were made."""
+
 _NS = 1_000_000_000
+_NO_ATTITUDE = np.full(7, np.nan)
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 _PLATFORM = PlatformModel()
 _REGIONS = {
@@ -32,6 +45,45 @@ _REGIONS = {
     "table_flip": TABLE_NUMBERS["catalogue"],
     "parameters_flip": PARAMETERS_NUMBER,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One step of the spacecraft.
+
+    Attributes
+    ----------
+    frame
+        Number of the frame of the scenario; -1 where it has none.
+    heard
+        Whether a station listens.
+    light_s
+        Light time to there.
+    image_utc_ns, next_image_utc_ns
+        Time of the image that the camera takes in this step, None without one, and of the one that probably follows.
+    orders
+        Telecommand packets that reach the payload.
+    """
+
+    utc_ns: int
+    frame: int
+    sunlit: float
+    heard: bool
+    downlink_octets: int
+    light_s: float = LIGHT_S
+    image_utc_ns: int | None = None
+    next_image_utc_ns: int | None = None
+    orders: bytes = b""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """Outcome of one step; `clcw` is the state of the telecommand receiver after it, as frames carry it."""
+
+    moment: Moment
+    exposure: Exposure | None
+    packets: list[bytes]
+    clcw: bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,8 +145,14 @@ class Spacecraft:
 
     Attributes
     ----------
+    camera
+        Takes the images, and holds the world.
     faults
         Faults; seconds count from `first_utc_ns`.
+    detector
+        In place of the network; None uses the network.
+    receiver
+        Belongs to the platform: a restart of the payload leaves it as it is.
     resets
         Starts of the processor after the first, by cause.
     given
@@ -105,9 +163,11 @@ class Spacecraft:
 
     loaded: LoadedPayload
     board: SimulatedBoard
+    camera: Camera
     first_utc_ns: int
     faults: Sequence[Fault] = ()
     detector: Detector | None = None
+    receiver: Receiver = field(default_factory=lambda: Receiver(SPACECRAFT_ID))
     resets: list[int] = field(default_factory=list)
     payload: Payload = field(init=False)
     given: Given | None = None
@@ -119,12 +179,41 @@ class Spacecraft:
     _clock_error_ticks: int = 0
     _last_utc_ns: int | None = None
     _down_until_ns: int | None = None
+    _frames_before: int = 0
     _camera_dead: bool = False
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng((self.board.seed, 2**41))
         self._breakable = BreakableDetector(self.detector or self.loaded.detector)
         self.payload = self._boot()
+
+    @property
+    def world(self) -> World:
+        """The world as far as it is flown."""
+        return self.camera.bench.world
+
+    @world.setter
+    def world(self, world: World) -> None:
+        self.camera.bench.world = world
+
+    def turn(self, moment: Moment) -> Turn:
+        """Let the spacecraft do what is due at a moment."""
+        exposure = None
+        if moment.image_utc_ns is not None:
+            exposure = self.camera.take(moment.image_utc_ns, moment.next_image_utc_ns)
+            if isinstance(self.detector, CatalogueDetector):
+                self.detector.show(self.world, exposure)
+        packets = self.step(
+            moment.utc_ns,
+            None if exposure is None else exposure.image,
+            _NO_ATTITUDE if exposure is None else exposure.attitude,
+            clock_ticks(self.world, moment.utc_ns),
+            moment.orders,
+            sunlit=moment.sunlit,
+            downlink_octets=moment.downlink_octets,
+            instruments=NO_SAMPLES if exposure is None else exposure.instruments,
+        )
+        return Turn(moment, exposure, packets, self.receiver.clcw)
 
     def step(
         self,
@@ -153,17 +242,17 @@ class Spacecraft:
             self._reset(ResetCause.watchdog)
         if self._camera_dead and not board.camera_on:
             self._camera_dead = False
-        shown, ticks = _NO_IMAGE if picture is None else picture, clock_ticks + self._clock_error_ticks
+        ticks = clock_ticks + self._clock_error_ticks
         samples = _with_clock_error(instruments, self._clock_error_ticks)
         cause, self._booted = self._booted, None
         try:
             with counted_reads(self.truth_reads):
-                packets = self.payload.step(shown, message, ticks, telecommands, samples)
+                packets = self.payload.step(picture, message, ticks, telecommands, samples)
         except ProcessorHang:
             self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
             packets = []
         self.given = Given(
-            shown,
+            _NO_IMAGE if picture is None else picture,
             message,
             ticks,
             telecommands,
@@ -182,6 +271,11 @@ class Spacecraft:
         return packets
 
     @property
+    def frames(self) -> int:
+        """Frames that the payload has looked at: one made for a command that it refused is none."""
+        return self._frames_before + self.payload.frames
+
+    @property
     def clock_error_ticks(self) -> int:
         """How far clock jumps have set the on-board clock ahead of the clock of the scenario."""
         return self._clock_error_ticks
@@ -192,6 +286,7 @@ class Spacecraft:
 
     def _reset(self, cause: int) -> None:
         self.resets.append(int(cause))
+        self._frames_before += self.payload.frames
         self.board.reset(cause)
         self.payload = self._boot()
 
@@ -254,6 +349,31 @@ class Spacecraft:
         used = np.flatnonzero(memory)
         for at in self._rng.choice(used, min(bits, used.size), replace=False).tolist() if used.size else ():
             memory[at] ^= 1 << int(self._rng.integers(0, 8))
+
+
+def fly(spacecraft: Spacecraft, schedule: Iterable[Moment]) -> Iterator[Turn]:
+    """Fly the moments of a schedule, which may look at the spacecraft before each."""
+    for moment in schedule:
+        yield spacecraft.turn(moment)
+
+
+def new_spacecraft(world: World, loaded: LoadedPayload, first_utc_ns: int | None = None) -> Spacecraft:
+    """Return the payload of a scenario on a new board, with the faults of the scenario ahead of it.
+
+    Parameters
+    ----------
+    first_utc_ns
+        Time from which the seconds of faults count; None: the first frame.
+    """
+    scenario = world.scenario
+    return Spacecraft(
+        loaded,
+        new_board(scenario.seed),
+        Camera(InstrumentBench(world)),
+        int(world.frame_utc_ns[0]) if first_utc_ns is None else first_utc_ns,
+        tuple(parse_fault(text) for text in scenario.faults.events),
+        CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
+    )
 
 
 def _with_clock_error(samples: Samples, error_ticks: int) -> Samples:

@@ -207,8 +207,9 @@ class _Reader:
             if kind == "list":
                 made.extend(map(self.value, rest))
             else:
-                for key, one in rest:
-                    made[self.value(key)] = self.value(one)
+                for key_node, value_node in rest:
+                    key = self.value(key_node)  # before the value: references are numbered in this order
+                    made[key] = self.value(value_node)
             return made
         self._made[at] = self._whole(kind, *rest)
         return self._made[at]

@@ -16,13 +16,18 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from payload_emulator.errors import LinkError
 from payload_emulator.session.live_ports import Client, Server
+from payload_emulator.sim.board.link import Receiver
+from tmtc.uplink import CLTU_START, CLTU_TAIL
 
 RECORD_HEADER = struct.Struct(">Q")
 _COUNT = struct.Struct(">Q")
 _TRANSMISSION = struct.Struct(">QI")
 _TRANSMISSION_LIMIT_OCTETS = 16 << 20
 _REFUSED = 0
+_BUFFER_LIMIT = 1 << 20
+_TELECOMMAND_START = 0b00011  # version 000, type 1, secondary header flag 1
 
 KEPT_LIMIT_OCTETS = 64 << 20
 """Largest number of octets that a station keeps for a client that is not there; the simulation waits beyond half."""
@@ -71,13 +76,17 @@ class StationPorts:
             self._ended,
             greeting=self._greet,
         )
-        self.telecommand = Server(
-            f"telecommand of {self.name}",
-            self.telecommand_port,
-            self.host,
-            self._take if self.keeps else self.receive,
-            self._end_uplink,
-        )
+        try:
+            self.telecommand = Server(
+                f"telecommand of {self.name}",
+                self.telecommand_port,
+                self.host,
+                self._take if self.keeps else self.receive,
+                self._end_uplink,
+            )
+        except LinkError:
+            self.telemetry.close()
+            raise
 
     @property
     def waiting(self) -> int:
@@ -156,3 +165,53 @@ class StationPorts:
         count -= count % self._record_octets
         del self._kept[:count]
         self._begin += count
+
+
+@dataclass(slots=True)
+class TelecommandBuffer:
+    """Telecommand packets out of octets as they come, CLTUs or bare packets; nothing on the wire stops it.
+
+    Attributes
+    ----------
+    receiver
+        What CLTUs are received with.
+    dropped
+        Octets that were neither.
+    """
+
+    receiver: Receiver
+    dropped: int = 0
+    _octets: bytes = b""
+
+    def take(self, octets: bytes) -> list[bytes]:
+        """The packets that these octets complete."""
+        self._octets += octets
+        packets: list[bytes] = []
+        while self._octets:
+            if self._octets[:1] == CLTU_START[:1]:
+                if len(self._octets) > 1 and self._octets[:2] != CLTU_START:
+                    self._drop(1)
+                    continue
+                end = self._octets.find(CLTU_TAIL)
+                if end < 0:
+                    break
+                stop = end + len(CLTU_TAIL)
+                decoded = self.receiver.decoder.decode(self._octets[:stop])
+                self.dropped += decoded.octets_skipped
+                packets += decoded.packets
+                self._octets = self._octets[stop:]
+            elif self._octets[0] >> 3 == _TELECOMMAND_START:
+                length = 7 + int.from_bytes(self._octets[4:6], "big") if len(self._octets) >= 6 else 1 << 17
+                if length > len(self._octets):
+                    break
+                packets.append(self._octets[:length])
+                self._octets = self._octets[length:]
+            else:
+                self._drop(1)
+        if len(self._octets) > _BUFFER_LIMIT:
+            self._drop(len(self._octets))
+        return packets
+
+    def _drop(self, count: int) -> None:
+        self.dropped += count
+        self._octets = self._octets[count:]

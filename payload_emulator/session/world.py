@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
@@ -25,7 +24,6 @@ from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
 from lunar.messages.oem import load_oem
 from lunar.propagation import ForceModel
-from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import (
     format_utc,
     parse_utc,
@@ -41,30 +39,25 @@ from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed,
 from payload_emulator.sim.orbit.truth import (
     Crossing,
     Truth,
-    attitude_message,
     find_crossings,
     frame_times,
-    perturbed,
     require_above_ground,
     spliced,
 )
-from payload_emulator.sim.render.light import sun_direction_mcmf
-from payload_emulator.sim.render.photometry import Photometry
-from payload_emulator.sim.render.renderer import render
-from payload_emulator.sim.render.sensor import Picture, take_picture
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 from tmtc.cuc import TICKS_PER_SECOND
-from tmtc.dictionary import DICTIONARY
+
+CHUNK_S = 86_400.0
+"""Time that the orbit is propagated at once; another division gives other last digits."""
 
 Samples = Mapping[str, FloatArray]
 """Samples of each instrument by its name: rows, the on-board time first."""
 
 NO_SAMPLES: Samples = MappingProxyType({})
 _NS = 1_000_000_000
-_MS = 1_000_000
 _TICKS_NS = 200_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
@@ -74,12 +67,8 @@ _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
 # Rims within this of the frames tell the registration where no product does: a 15 degree tile.
 _REGISTERED_DEG = 7.5
-# What stands for an image where none is rendered.
-_REDUCED_PX = 8
 # No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
 _HIGHEST_GROUND_M = 12_000.0
-# With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
-_NIGHT_RAD = np.radians(12.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +86,12 @@ class World:
     frame_utc_ns: IntArray
     data_names: tuple[str, ...]
     external: ExternalFrames | None = None
+
+    @property
+    def clock_utc_ns(self) -> int:
+        """Time at which the error of the clock is its offset: as the scenario states it, else the first frame."""
+        stated = self.scenario.clock.reference
+        return _parsed_utc(stated) if stated else int(self.frame_utc_ns[0])
 
     @property
     def gravity(self) -> GravityField:
@@ -126,24 +121,9 @@ class World:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Exposure:
-    """One frame as the payload receives it, and the truth it was taken from (which stays here).
-
-    Attributes
-    ----------
-    camera_from_mcmf
-        True attitude, shape (3, 3).
-    instruments
-        Samples since the frame before.
-    """
-
-    utc_ns: int
-    image: Picture
-    attitude: FloatArray
-    clock_ticks: int
-    camera_from_mcmf: FloatArray
-    instruments: Samples = field(default_factory=dict)
+@functools.lru_cache(maxsize=16)
+def _parsed_utc(text: str) -> int:
+    return parse_utc(text)
 
 
 def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:
@@ -194,13 +174,18 @@ def _external_world(
     return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
 
 
-def open_world(scenario: Scenario, data: DataFolder, duration_s: float) -> World:
-    """Return the world of a scenario from its epoch on, whatever its windows: no frames but the clock's first instant.
+def open_world(scenario: Scenario, data: DataFolder, *, is_declared: bool = False) -> World:
+    """Return the world of a scenario from its epoch on, flown a day at a time, whatever its windows.
+
+    Parameters
+    ----------
+    is_declared
+        Whether the scenario comes from a mission description, whose clock without a reference counts from the epoch.
 
     Raises
     ------
     ScenarioError
-        The scenario flies an ephemeris file or has disturbances that belong to one arc.
+        The scenario flies an ephemeris file or has disturbances that belong to one arc, or has no window.
     """
     section = scenario.disturbances
     if scenario.orbit.oem or section.kidnap_distance_km > 0.0 or section.burn_delta_v_m_s != 0.0:
@@ -208,11 +193,12 @@ def open_world(scenario: Scenario, data: DataFolder, duration_s: float) -> World
         raise ScenarioError(
             f"scenario {scenario.name}: expected an orbit to propagate without end, found {found}"
         )
-    terrain = scenario_terrain(scenario, data)
-    model = force_model(scenario, data)
-    truth, burns = _propagate(scenario, model, duration_s / 86_400.0)
-    first = np.array([scenario.epoch_utc_ns], dtype=np.int64)
-    return World(scenario, truth, terrain, model, burns, first, _names(terrain, model))
+    world = build_world(scenario, data)
+    truth, burns = _propagate(scenario, world.model, CHUNK_S / 86_400.0)
+    reference = scenario.epoch_utc_ns if is_declared else world.clock_utc_ns
+    if not scenario.clock.reference:
+        scenario = replace(scenario, clock=replace(scenario.clock, reference=format_utc(reference, 9)))
+    return replace(world, scenario=scenario, truth=truth, burns=burns)
 
 
 def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
@@ -251,41 +237,6 @@ def _names(terrain: TiledTerrain, model: ForceModel) -> tuple[str, ...]:
         f"gravity {model.gravity.name} to degree {model.degree}",
         f"orientation {model.orientation.name}",
     )
-
-
-def continued(world: World, duration_s: float) -> World | None:
-    """Return the world flown on beyond its trajectory, with the frames of the added time; None for an OEM file.
-
-    The window's band of latitudes and its search still decide where frames are taken; its number of passes and its
-    duration do not. Frames begin two intervals after the last, so that they form a separate arc.
-
-    Raises
-    ------
-    ImpactError
-        The orbit hits the Moon.
-    ScenarioError
-        The trajectory dips below the ground at a new frame.
-    """
-    scenario = world.scenario
-    if scenario.orbit.oem:
-        return None
-    longer, burns = extended_flight(world, duration_s)
-    stop_utc_ns = longer.stop_utc_ns
-    interval_ns = round(scenario.camera.frame_interval_s * _NS)
-    begin_utc_ns = int(world.frame_utc_ns[-1]) + 2 * interval_ns
-    windows = [(begin_utc_ns, stop_utc_ns)]
-    if scenario.window.search == "terrain":
-        crossings = _crossings(scenario, longer, world.terrain, begin_utc_ns)
-        windows = [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable]
-    added = [
-        frame_times(longer, max(first, begin_utc_ns), last, interval_ns, _band_rad(scenario))
-        for first, last in windows
-    ]
-    frames = np.concatenate([world.frame_utc_ns, *added])
-    require_above_ground(
-        longer, frames[world.frame_utc_ns.size - 1 :], world.terrain.height_m, _HIGHEST_GROUND_M
-    )
-    return replace(world, truth=longer, burns=(*world.burns, *burns), frame_utc_ns=frames)
 
 
 def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
@@ -339,183 +290,17 @@ def _disturbed(
     return truth, burns
 
 
-def no_instruments(utc_ns: int, camera_from_mcmf: FloatArray) -> Samples:
-    """Return no samples."""
-    return NO_SAMPLES
-
-
-def exposures(
-    world: World, sample: Callable[[int, FloatArray], Samples] = no_instruments, first: int = 0
-) -> Generator[Exposure]:
-    """Yield the frames of a world from the `first` on in time order, rendered ahead while the payload works.
-
-    One thread renders and samples the instruments, because a terrain serves one thread; a second lets the sensor take
-    the picture of what the first has rendered.
-
-    Parameters
-    ----------
-    sample
-        From time and true attitude of a frame to the samples before it; called in order of time.
-    """
-    world.terrain.release_thread()
-    try:
-        with ThreadPoolExecutor(max_workers=1) as renderer, ThreadPoolExecutor(max_workers=1) as sensor:
-
-            def begin(number: int) -> Future[Exposure]:
-                def prepared() -> tuple[_Scene, Samples]:
-                    scene = _scene(world, int(world.frame_utc_ns[number]), number)
-                    return scene, sample(scene.utc_ns, scene.camera_from_mcmf)
-
-                scene = renderer.submit(prepared)
-                return sensor.submit(lambda: _exposed(world, *scene.result()))
-
-            pending = [begin(first)]
-            for number in range(first, world.frame_utc_ns.size):
-                if number + 1 < world.frame_utc_ns.size:
-                    pending.append(begin(number + 1))
-                yield pending.pop(0).result()
-    finally:
-        world.terrain.release_thread()
-
-
-def orders_before(world: World, number: int) -> bytes:
-    """Telecommands that reach the payload with a frame: after a told kidnap, to trust its estimate less."""
-    section = world.scenario.disturbances
-    if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
-        return b""
-    moved_utc_ns = int(world.frame_utc_ns[0]) + round(section.kidnap_at_s * _NS)
-    if int(world.frame_utc_ns[number]) < moved_utc_ns or (
-        number and int(world.frame_utc_ns[number - 1]) >= moved_utc_ns
-    ):
-        return b""
-    distance_m = 1e3 * section.kidnap_distance_km
-    return DICTIONARY.pack_command(
-        "perform_function",
-        # A jump of place on an orbit comes with one of velocity: 1e-3 rad/s times the distance.
-        {"function_id": "widen_estimate", "argument_1": distance_m, "argument_2": 1e-3 * distance_m},
-        sequence_count=0,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """What lies before the camera at one frame, and the draws that are still to come.
-
-    Attributes
-    ----------
-    radiance
-        None where the camera gives no picture of the ground; `picture` is what it gives instead.
-    """
-
-    utc_ns: int
-    camera_from_mcmf: FloatArray
-    camera_from_icrf: FloatArray
-    sun_mcmf: FloatArray
-    radiance: NDArray[np.float32] | None
-    picture: Picture | None
-    rng: np.random.Generator
-
-
-def expose_frame(world: World, number: int) -> Exposure:
-    """What the camera, the ADCS and the clock deliver for one frame. Every draw depends on (seed, frame) alone."""
-    return _exposed(world, _scene(world, int(world.frame_utc_ns[number]), number))
-
-
-def expose_at(
-    world: World, utc_ns: int, sample: Callable[[int, FloatArray], Samples] = no_instruments
-) -> Exposure:
-    """Return what the camera, the ADCS and the clock deliver at any time; every draw depends on (seed, time) alone."""
-    scene = _scene(world, utc_ns, utc_ns // _MS)
-    return _exposed(world, scene, sample(utc_ns, scene.camera_from_mcmf))
-
-
-def _scene(world: World, utc_ns: int, number: int) -> _Scene:
-    scenario = world.scenario
-    rng = np.random.default_rng((scenario.seed, number))
-    position = world.truth.positions_mcmf(utc_ns)[0]
-    tdb_s = float(tdb_s_from_utc_ns(utc_ns))
-    sun = true_sun_direction(world, position, utc_ns, rng)
-    pointing = np.radians(scenario.attitude.pointing_error_deg) * rng.standard_normal(3)
-    camera_from_mcmf = perturbed(world.camera_from_mcmf(position), pointing)
-    mcmf_from_icrf = world.truth.orientation.mcmf_from_icrf(tdb_s)
-    camera_from_icrf = camera_from_mcmf @ mcmf_from_icrf
-    measured = None if world.external is None else world.external.camera_from_icrf(utc_ns)
-    if measured is not None:
-        camera_from_icrf, camera_from_mcmf = measured, measured @ mcmf_from_icrf.T
-    radiance, picture = _seen(world, utc_ns, position, camera_from_mcmf, sun)
-    return _Scene(utc_ns, camera_from_mcmf, camera_from_icrf, sun, radiance, picture, rng)
-
-
-def _exposed(world: World, scene: _Scene, instruments: Samples = NO_SAMPLES) -> Exposure:
-    scenario, rng = world.scenario, scene.rng
-    image = scene.picture
-    if scene.radiance is not None:
-        image = take_picture(scene.radiance, scenario.sensor, rng)
-    assert image is not None
-    attitude = scenario.attitude
-    bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng(
-        (scenario.seed, 2**32)
-    ).standard_normal(3)
-    noise = np.radians(attitude.knowledge_noise_deg) * rng.standard_normal(3)
-    known = perturbed(scene.camera_from_icrf, bias + noise)
-    sun_in_camera = known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf
-    message = attitude_message(known, sun_in_camera)
-    if scenario.instruments_give_attitude:
-        message[:4] = np.nan
-    return Exposure(
-        scene.utc_ns,
-        image,
-        message,
-        clock_ticks(world, scene.utc_ns),
-        scene.camera_from_mcmf,
-        instruments,
-    )
-
-
-def _seen(
-    world: World, utc_ns: int, position_mcmf_m: FloatArray, camera_from_mcmf: FloatArray, sun_mcmf: FloatArray
-) -> tuple[NDArray[np.float32] | None, Picture | None]:
-    """The light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
-    section, camera = world.scenario.disturbances, world.true_camera
-    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
-    if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
-        return None, np.empty((0, 0, 3), dtype=np.uint8)
-    if world.external is not None:
-        return None, world.external.image(utc_ns)
-    if world.scenario.camera.images == "reduced":
-        return None, np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
-    if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
-        return np.zeros((camera.height_px, camera.width_px), dtype=np.float32), None
-    law = Photometry(world.scenario.light.photometry)
-    return render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance, None
-
-
-def true_sun_direction(
-    world: World, position_mcmf_m: FloatArray, utc_ns: int, rng: np.random.Generator
-) -> FloatArray:
-    """Direction to the Sun in MCMF, unit (3,): drawn near the spacecraft as in the paper, or from the ephemeris."""
-    light = world.scenario.light
-    if light.mode == "paper":
-        elevation = np.radians(rng.uniform(light.elevation_min_deg, light.elevation_max_deg))
-        azimuth = np.radians(rng.uniform(light.azimuth_min_deg, light.azimuth_max_deg))
-        latitude, longitude, _ = spherical_from_mcmf(position_mcmf_m)
-        return sun_direction_mcmf(elevation, azimuth, float(latitude), float(longitude))
-    tdb_s = float(tdb_s_from_utc_ns(utc_ns))
-    from_moon = sun_position_icrf_m(tdb_s) - world.truth.states(utc_ns)[0][0]
-    return np.asarray(world.truth.orientation.mcmf_from_icrf(tdb_s) @ (from_moon / np.linalg.norm(from_moon)))
-
-
 def clock_ticks(world: World, utc_ns: int) -> int:
-    """The on-board clock's reading: ideal ticks, an offset, and a drift since the first frame."""
+    """The on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
     clock = world.scenario.clock
-    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
+    elapsed_s = (utc_ns - world.clock_utc_ns) / _NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
     return int(ticks_from_utc_ns(utc_ns)) + round(error_s * TICKS_PER_SECOND)
 
 
 def first_utc_ns(world: World, ticks: int) -> int:
     """Return the first time at which the clock of a scenario reads `ticks`."""
-    utc_ns = int(world.frame_utc_ns[0])
+    utc_ns = world.clock_utc_ns
     for _ in range(4):
         utc_ns += round((ticks - clock_ticks(world, utc_ns)) * _NS / TICKS_PER_SECOND)
     # The reading rises by one tick in 15 us; from a time within some ticks of it, the first is found by bisection.
@@ -524,6 +309,15 @@ def first_utc_ns(world: World, ticks: int) -> int:
         middle = (low + high) // 2
         low, high = (low, middle) if clock_ticks(world, middle) >= ticks else (middle, high)
     return high
+
+
+def frame_utc_ns(world: World, ticks: int) -> int:
+    """Return the time of an image whose on-board time is `ticks`: a frame of the scenario, else the first instant."""
+    first = first_utc_ns(world, ticks)
+    number = int(np.searchsorted(world.frame_utc_ns, first))
+    if number < world.frame_utc_ns.size and clock_ticks(world, int(world.frame_utc_ns[number])) == ticks:
+        return int(world.frame_utc_ns[number])
+    return first
 
 
 def _fly_to_windows(

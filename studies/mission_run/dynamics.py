@@ -14,25 +14,23 @@ from lunar.catalogue import save_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
-from payload_emulator.session.continuous import CHUNK_S, pruned
+from payload_emulator.session.live import pruned
+from payload_emulator.session.regions import Box, observed_boxes, observed_craters
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world import (
+    CHUNK_S,
     World,
     extended_flight,
     open_world,
     sample_truth,
     with_reference_error,
 )
-from studies.mission_run.regions import Box, in_boxes, observed_boxes
 
 DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
 AHEAD_NS = 54 * 3600 * NS
 ARCS_KEPT = 4
 """Days of the flight that are kept: more than an orbit determination spans."""
-
-CATALOGUE_MARGIN_DEG = 5.0
-"""Half the field of view of the camera at 60 km altitude, beyond the latitudes of the windows."""
 
 
 @dataclass(slots=True)
@@ -44,7 +42,7 @@ class FlightDynamics:
     @classmethod
     def of(cls, scenario: Scenario, data: DataFolder) -> FlightDynamics:
         """Return the flight dynamics of a scenario from its epoch on."""
-        return cls(open_world(scenario, data, CHUNK_S))
+        return cls(open_world(scenario, data))
 
     def save_reference(self, now_utc_ns: int, path: Path) -> Path:
         """Write the orbit determination of a day: from some hours ago to two days ahead."""
@@ -66,19 +64,6 @@ class FlightDynamics:
 
     def save_craters(self, latitude_limit_deg: float, path: Path) -> int:
         """Write the craters around the places of the windows with their rim heights; their number."""
-        world, navigation = self.world, self.world.scenario.navigation
-        listed = world.terrain.catalogue
-        near = [one.widened(CATALOGUE_MARGIN_DEG) for one in self.boxes(latitude_limit_deg)]
-        chosen = np.flatnonzero(
-            in_boxes(np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad), near)
-            & (listed.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km)
-            & (listed.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km)
-        )
-        if world.scenario.camera.images == "reduced" and "anchored" not in navigation.estimators:
-            # Nobody asks for the heights of rims: measuring them means making the ground.
-            catalogue = listed.select(chosen)
-        else:
-            catalogue = world.terrain.measured(chosen)
-            world.terrain.release_ground()
+        catalogue = observed_craters(self.world, latitude_limit_deg)
         save_catalogue(catalogue, path)
         return len(catalogue)

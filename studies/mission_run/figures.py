@@ -12,7 +12,7 @@ from ground_service.evaluation.model import PassFigures
 from ground_service.planning.model import Window
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.timescales import parse_utc
-from payload_emulator.session.flying import SPACECRAFT_ID
+from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.ground import MissionGround
 from studies.mission_run.incidents import find_incidents
 from studies.mission_run.processes import judged_memory

@@ -1,7 +1,7 @@
 """The ground service of a mission run, and its embedded form: in this process on SQLite.
 
-A user posts the mission description, an ephemeris, two telecommands of commissioning and a standing request; after that
-the run only reads. Flight dynamics delivers an orbit determination a day, as a system of its own.
+A user posts the crater catalogue, the mission description, an ephemeris and a standing request; after that the run only
+reads. Flight dynamics delivers an orbit determination a day, as a system of its own.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from ground_service.worker.actions import has_repetitions, repeat_due
 from ground_service.worker.follow_up import CONSUMER, KINDS
 from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
-from studies.mission_run.regions import Box
+from payload_emulator.session.regions import Box
 
 USER = "mission-run"
 FLIGHT_DYNAMICS = "flight-dynamics"

@@ -16,9 +16,9 @@ from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.session.flying import SPACECRAFT_ID
 from payload_emulator.session.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
+from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.distributed import DistributedGround, Servers
 from studies.mission_run.dynamics import DAY_NS, FlightDynamics
@@ -50,23 +50,6 @@ COUNTED = (
 
 ORBIT_S = 6_672.0
 """Orbital period of the scenarios of this project, for the latitudes of windows of a given length."""
-
-TIME_RATE_EXPONENT = 4
-SCRUB_PARAMETER = 15
-SCRUB_INTERVAL_S = 600.0
-
-OPERATIONS = """
-[automation]
-evaluate = true
-
-[approval]
-windows = "automatic"
-one_person_for = [
-  "enable_schedule", "set_parameter", "set_time_report_rate",
-  "uplink_first", "uplink_middle", "uplink_last", "perform_function/set_mode",
-  "perform_function/start_observation", "perform_function/stop_observation",
-]
-"""
 
 Say = Callable[[str], None]
 OWN_SERVERS = Servers()
@@ -180,7 +163,6 @@ class MissionRun:
             folder / "scenario.toml",
             folder / "clock",
             folder / "craters.csv",
-            folder / "operations.toml",
             folder / "spacecraft.log",
             folder / "spacecraft.state",
             folder / "spacecraft.journal",
@@ -204,7 +186,6 @@ class MissionRun:
         if not self._files.craters.exists():
             count = dynamics.save_craters(self._terms.latitude_limit_deg, self._files.craters)
             self._say(f"catalogue: {count} craters with rim heights")
-        self._files.operations.write_text(OPERATIONS)
         self._progress.starts += 1
         spacecraft = SpacecraftProcess(
             self._files, self._scenario.link.stations, self._terms.days, self._terms.rate
@@ -353,19 +334,17 @@ class MissionRun:
         )  # fmt: skip
 
     def _post(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
-        """Post what a user posts: catalogue, mission description, ephemeris, commissioning, standing request.
+        """Post what a user posts: catalogue, mission description, ephemeris, standing request.
 
         A later start posts the mission description only, which names the ports of the spacecraft.
         """
         before = ground.audit_head()
-        held = ground.client.add_catalogue(self._files.craters)
-        text = spacecraft.mission_text().decode()
-        ground.add_mission(text.replace("[catalogue]\n", f'[catalogue]\nsha256 = "{held.sha256}"\n').encode())
+        ground.client.add_catalogue(self._files.craters)
+        ground.add_mission(spacecraft.mission_text())
         if self._progress.request_id is None:
             path = dynamics.save_reference(self._scenario.epoch_utc_ns, self._folder / "reference.oem")
             ground.client.add_ephemeris(path, name="orbit determination of day 0", precedence=0)
             self._progress.reference_day = 0
-            self._commission(ground)
             terms = PlanTerms(
                 self._terms.windows_per_day,
                 tuple(dynamics.boxes(self._terms.latitude_limit_deg)),
@@ -376,15 +355,6 @@ class MissionRun:
             )
             self._progress.request_id = ground.client.add_request(terms.request(SPACECRAFT_ID)).id
         self._progress.posts.append((before + 1, ground.audit_head()))
-
-    def _commission(self, ground: MissionGround) -> None:
-        """Send what a new spacecraft is told once: reports of time, how often memory is checked."""
-        for name, arguments in (
-            ("set_time_report_rate", {"rate_exponent": TIME_RATE_EXPONENT}),
-            ("set_parameter", {"parameter_id": SCRUB_PARAMETER, "value": SCRUB_INTERVAL_S}),
-        ):
-            command = ground.client.enter_telecommand(name, SPACECRAFT_ID, arguments=arguments)
-            ground.client.release_telecommand(command.id)
 
     def _deliver_reference(self, ground: MissionGround, dynamics: FlightDynamics, now: int) -> None:
         """Give the ground the orbit determination of the day."""

@@ -1,4 +1,4 @@
-"""The spacecraft of a mission run: `linna emulate --continuous` as a process, and its console."""
+"""The spacecraft of a mission run: `linna emulate --live --no-operator` as a process, and its console."""
 
 from __future__ import annotations
 
@@ -36,7 +36,6 @@ class SpacecraftFiles:
     scenario: Path
     clock: Path
     craters: Path
-    operations: Path
     log: Path
     state: Path
     journal: Path
@@ -77,10 +76,19 @@ class SpacecraftProcess:
         files, station_ports = self._files, self._station_ports
         console, mission = free_port(), free_port()
         self.mission_port = mission
-        words = ["emulate", files.scenario, "--continuous", "--days", self._days, "--rate", self._rate]
+        words = [
+            "emulate",
+            files.scenario,
+            "--live",
+            "--no-operator",
+            "--days",
+            self._days,
+            "--rate",
+            self._rate,
+        ]
         words += ["--hold-contacts", "--journal", files.journal]
         words += ["--console-port", console, "--mission-port", mission, "--state", files.state]
-        words += ["--clock-file", files.clock, "--operations", files.operations, "--craters", files.craters]
+        words += ["--clock-file", files.clock, "--craters", files.craters]
         words += ["--keep-unacknowledged", "--paused", "--end-with-console"]
         words += ["--json"]
         for k, name in enumerate(self._stations):

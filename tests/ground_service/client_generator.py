@@ -162,6 +162,9 @@ def method_of(route: APIRoute, spelling: Spelling) -> str:
         else:
             arguments.append(Argument(body.name, "Document"))
             request += f', body="{body.name}"'
+    work = getattr(route.endpoint, "__wrapped__", None)
+    if work is not None:
+        request += f', reads="{work.__module__.removeprefix("ground_service.")}.{work.__name__}"'
     for one in fields_of(query, spelling):
         named_after_file = is_upload and one.name == "name"
         further.append(Argument("name", "str | None", None) if named_after_file else one)

@@ -1,4 +1,4 @@
-"""The spacecraft in continuous operation: commanded windows, contacts, storage, clock, state."""
+"""The spacecraft commanded by the ground: windows, contacts, storage, clock, state."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from linna import cli
 from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc, tai_ns_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.continuous import ContinuousSession
-from payload_emulator.session.mission import operations_mission_text
+from payload_emulator.session.live import LiveSession
+from payload_emulator.session.mission import OPERATIONS, live_mission_text
 from payload_emulator.session.scenario import Scenario, parse_scenario
+from payload_emulator.session.starting import launch
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import open_world
 from tmtc.dictionary import DICTIONARY
@@ -76,7 +77,7 @@ def scenario(further: str = "") -> Scenario:
 class Ground:
     """Station client and operator of a session in the test's process."""
 
-    def __init__(self, session: ContinuousSession, act: Act = lambda ground, contact: None) -> None:
+    def __init__(self, session: LiveSession, act: Act = lambda ground, contact: None) -> None:
         self.session, self.act = session, act
         self.contacts: list[dict[str, Any]] = []
         self.records = b""
@@ -137,12 +138,17 @@ class Ground:
             connection.close()
 
 
+def opened(scenario: Scenario, craters: Path | None = None, **options: Any) -> LiveSession:
+    """Return a session of a launched spacecraft."""
+    return LiveSession(*launch(scenario, DataFolder(None), craters), **options)
+
+
 def flown(
     scenario: Scenario, hours: float, act: Act = lambda ground, contact: None, **options: Any
-) -> tuple[ContinuousSession, Ground]:
+) -> tuple[LiveSession, Ground]:
     """Fly a session for some hours from its epoch, with a client."""
     stop = EPOCH + round(hours * HOUR_NS)
-    session = ContinuousSession(scenario, DataFolder(None), holds=True, stop_utc_ns=stop, **options)
+    session = opened(scenario, holds=True, stop_utc_ns=stop, **options)
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
     try:
@@ -172,10 +178,10 @@ def packets_of(records: bytes) -> list[tuple[int, str, dict[str, Any]]]:
     return found
 
 
-WINDOW = EPOCH + 30 * HOUR_NS
-"""Start of the window; the scenario itself observes for one minute after its epoch."""
+WINDOW = EPOCH + 30 * HOUR_NS + 37 * NS
+"""Start of the window, whose frames lie between whole minutes; the scenario itself observes after its epoch."""
 
-Flight = tuple[ContinuousSession, Ground, list[tuple[int, str, dict[str, Any]]]]
+Flight = tuple[LiveSession, Ground, list[tuple[int, str, dict[str, Any]]]]
 
 
 @pytest.fixture(scope="module")
@@ -186,6 +192,7 @@ def flight() -> Flight:
         if contact["state"] == "started" and ground.count == 0:
             ground.send(
                 ground.command("set_time_report_rate", rate_exponent=0),
+                ground.at(WINDOW + 100 * NS, ground.command("test_connection")),
                 ground.at(WINDOW, ground.function("start_observation", 600.0, 15.0)),
                 ground.at(WINDOW + 605 * NS, ground.function("set_mode", 3.0)),
             )
@@ -197,7 +204,7 @@ def flight() -> Flight:
 def test_a_commanded_window_long_after_the_arc_of_the_scenario_gives_its_frames(flight: Flight) -> None:
     session, ground, packets = flight
     names = Counter(name for _, name, _ in packets)
-    assert session.account.telecommands == 3 and session.account.telecommand_octets_lost == 0
+    assert session.account.telecommands == 4 and session.account.telecommand_octets_lost == 0
     assert session.account.frames == 40  # 600 s / 15 s
     assert names["detections"] == 40
     ticks = [values["image_ticks"] for _, name, values in packets if name == "detections"]
@@ -327,7 +334,7 @@ def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path:
 
 
 def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
-    session = ContinuousSession(scenario(), DataFolder(None), paused=True, ends_with_console=True)
+    session = opened(scenario(), paused=True, ends_with_console=True)
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
     try:
@@ -345,7 +352,7 @@ def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> 
     """A session that is resumed after its end has passed waits for `run`, and tells every client of its end."""
     state = tmp_path / "session.state"
     flown(scenario(), 1.0, state_file=state)
-    session = ContinuousSession(scenario(), DataFolder(None), holds=True, stop_utc_ns=EPOCH, state_file=state)
+    session = opened(scenario(), holds=True, stop_utc_ns=EPOCH, state_file=state)
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
     try:
@@ -377,7 +384,7 @@ def test_images_that_the_payload_refuses_to_look_at_are_no_frames() -> None:
 
 
 def test_records_that_are_not_acknowledged_come_again_on_the_next_connection() -> None:
-    session = ContinuousSession(scenario(), DataFolder(None), keeps=True)
+    session = opened(scenario(), keeps=True)
     station = session.stations["madrid"]
     station.send(5, bytes(CADU), CADU)
     station.send(6, bytes(2 * CADU), CADU)
@@ -408,8 +415,8 @@ def test_records_that_are_not_acknowledged_come_again_on_the_next_connection() -
 
 
 def test_the_mission_description_names_stations_and_links() -> None:
-    world = open_world(scenario(SHORT), DataFolder(None), 7_200.0)
-    text = operations_mission_text(world, DataFolder(None), "127.0.0.1", {"madrid": (1, 2)})
+    world = open_world(scenario(SHORT), DataFolder(None))
+    text = live_mission_text(world, DataFolder(None), "127.0.0.1", {"madrid": (1, 2)}, OPERATIONS)
     mission = parse_mission(text)
     assert mission.link.stations is not None
     assert mission.link.stations["madrid"].latitude_deg == 40.43
@@ -420,8 +427,8 @@ def test_the_mission_description_names_stations_and_links() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--continuous"], "expected link.stations in scenario"),
-        (["--continuous", "--days", "-1"], "expected"),
+        (["--live", "--rate", "-1"], "expected numbers above 0"),
+        (["--live", "--days", "-1"], "expected numbers above 0"),
     ],
 )
 def test_impossible_options_are_refused_in_one_line(
@@ -434,4 +441,4 @@ def test_impossible_options_are_refused_in_one_line(
 def test_a_scenario_with_an_ephemeris_or_a_kidnap_is_refused() -> None:
     moved = "[disturbances]\nkidnap_distance_km = 10.0\n[maneuvers]\nenabled = false\n"
     with pytest.raises(ScenarioError, match="expected an orbit to propagate without end, found a kidnap"):
-        ContinuousSession(scenario(moved), DataFolder(None))
+        opened(scenario(moved))

@@ -8,7 +8,6 @@ import selectors
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,16 +22,22 @@ from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.camera import Exposure, expose
 from payload_emulator.session.campaign import Case, fly_case, load_campaign, table
-from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
-from payload_emulator.session.flying import Flown, Moment, Operator
-from payload_emulator.session.live import Flight, LivePayload, TelecommandBuffer, snapshot
+from payload_emulator.session.live import LiveSession
 from payload_emulator.session.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import Exposure, World, build_world, expose_frame
+from payload_emulator.session.schedule import Operator
+from payload_emulator.session.spacecraft import Moment, Turn, new_spacecraft
+from payload_emulator.session.starting import load_scenario_payload
+from payload_emulator.session.station_ports import RECORD_HEADER, TelecommandBuffer
+from payload_emulator.session.viewing import turn_message
+from payload_emulator.session.world import World, build_world
+from payload_emulator.sim.board.link import Receiver
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
+from tmtc.link import LinkSettings
 from tmtc.uplink import UplinkEncoder
 
 SCENARIO = """
@@ -69,12 +74,12 @@ def flown() -> tuple[World, LoadedPayload]:
 class Watcher:
     """A client of the live payload."""
 
-    def __init__(self, live: LivePayload) -> None:
-        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry"]), timeout=20.0)
-        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand"]), timeout=20.0)
+    def __init__(self, live: LiveSession) -> None:
+        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=20.0)
+        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=20.0)
         self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=20.0)
         self.lines = self.console.makefile("r")
-        self.octets = b""
+        self.say("watch")
 
     def say(self, word: str) -> None:
         self.console.sendall(word.encode() + b"\n")
@@ -92,7 +97,9 @@ class Watcher:
         octets = b""
         while part := self.telemetry.recv(65_536):
             octets += part
-        return octets
+        length = RECORD_HEADER.size + LinkSettings().cadu_length
+        starts = range(RECORD_HEADER.size, len(octets), length)
+        return b"".join(octets[start : start + LinkSettings().cadu_length] for start in starts)
 
     def close(self) -> None:
         self.lines.close()
@@ -101,9 +108,9 @@ class Watcher:
 
 
 @contextmanager
-def watched(world: World, loaded: LoadedPayload) -> Iterator[tuple[LivePayload, Watcher]]:
+def watched(world: World, loaded: LoadedPayload) -> Iterator[tuple[LiveSession, Watcher]]:
     """Fly a payload live, paused at the start, with a client."""
-    live = LivePayload(world, new_spacecraft(world, loaded), rate=0.0, paused=True)
+    live = LiveSession(world, loaded, has_operator=True, paused=True)
     thread = threading.Thread(target=live.run, daemon=True)
     watcher = Watcher(live)
     thread.start()
@@ -117,7 +124,7 @@ def watched(world: World, loaded: LoadedPayload) -> Iterator[tuple[LivePayload, 
 
 
 @pytest.fixture
-def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, Watcher]]:
+def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LiveSession, Watcher]]:
     with watched(*flown) as both:
         yield both
 
@@ -126,11 +133,11 @@ def ping(count: int) -> bytes:
     return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
 
 
-def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> Flown:
-    """A moment with a nadir image that is not rendered."""
+def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> Turn:
+    """A step with a nadir image that is not rendered."""
     position = world.truth.positions_mcmf(utc_ns)[0]
     exposure = Exposure(utc_ns, np.zeros((0, 0), np.uint8), np.zeros(9), 0, world.camera_from_mcmf(position))
-    return Flown(Moment(utc_ns, 0, 1.0, True, 0), exposure, b"", packets, b"")
+    return Turn(Moment(utc_ns, 0, 1.0, True, 0), exposure, packets, b"")
 
 
 def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None:
@@ -138,7 +145,7 @@ def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None
     with watched(world, load_scenario_payload(world, NO_DATA)[0]) as (_, watcher):
         watcher.say("run")
         rings = watcher.until(lambda message: message["kind"] == "frame")[-1]["catalogue"]
-    exposure = expose_frame(world, 0)
+    exposure = expose(world, int(world.frame_utc_ns[0]))
     row = {int(one): k for k, one in enumerate(world.terrain.catalogue.ids)}
     craters = world.terrain.measured(np.array([row[one["id"]] for one in rings]))
     position = world.truth.positions_mcmf(exposure.utc_ns)[0]
@@ -164,13 +171,13 @@ def test_detections_that_the_payload_identified_have_their_craters(
         DICTIONARY.pack(name, values, ticks=0, sequence_count=0)
         for name, values in (("identifications", pairs), ("detections", detections))
     ]
-    moment = seen_from(world, int(world.frame_utc_ns[0]), packets)
-    message = snapshot(world, new_spacecraft(world, loaded), moment, False, 1.0)
+    turn = seen_from(world, int(world.frame_utc_ns[0]), packets)
+    message = turn_message(new_spacecraft(world, loaded), turn)
     assert [one.get("crater_id") for one in message["detections"]] == [None, 4711, None]
     assert message["terrain"] == {"name": world.terrain.name, "real": False}
 
 
-def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayload, Watcher]) -> None:
+def test_a_session_of_watching_stepping_and_commanding(running: tuple[LiveSession, Watcher]) -> None:
     _, watcher = running
     watcher.say("step")
     watcher.say("step")
@@ -206,11 +213,13 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayloa
     assert uplink.frames == decoded.frame_count and not uplink.no_rf_available and uplink.changes > 0
 
 
-def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LivePayload, Watcher]) -> None:
+def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LiveSession, Watcher]) -> None:
     live, watcher = running
     watcher.say("run")
     messages = watcher.until(
-        lambda message: message["kind"] == "turn" and message["mode"] == "standby" and live.sent > 16
+        lambda message: (
+            message["kind"] == "turn" and message["mode"] == "standby" and live.account.frames == 16
+        )
     )
     frames = [message["frame"] for message in messages if message["kind"] == "frame"]
     assert frames == list(range(16))
@@ -224,52 +233,6 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LivePa
     }
     watcher.say("rate 5")
     watcher.until(lambda message: message.get("rate") == 5.0)
-
-
-def test_signals_arrive_a_light_time_later_in_order_and_none_is_forgotten() -> None:
-    arrived: list[bytes] = []
-    flight = Flight(arrived.append)
-    flight.start(b"at once", 0.0)
-    assert arrived == [b"at once"]
-    begin = time.monotonic()
-    flight.start(b"slow", 1000.0)
-    flight.start(b"quick, behind it", 0.0)
-    flight.land(begin + 999.0)
-    assert arrived == [b"at once"]
-    flight.land(begin + 1001.0)
-    assert arrived == [b"at once", b"slow", b"quick, behind it"]
-    flight.start(b"last", 1000.0)
-    flight.land_all()
-    assert arrived[-1] == b"last"
-
-
-def test_telecommands_and_telemetry_of_the_live_payload_take_the_light_time(
-    flown: tuple[World, LoadedPayload], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world, loaded = flown
-    live = LivePayload(world, new_spacecraft(world, loaded), rate=1.0)
-    sent: list[bytes] = []
-    clock = [1000.0]
-    monkeypatch.setattr("payload_emulator.session.live.time.monotonic", lambda: clock[0])
-    monkeypatch.setattr(Server, "send", lambda server, octets: sent.append(octets) or None)
-    with selectors.DefaultSelector() as selector:
-        live._take_telecommands(UplinkEncoder(0x4C).encode([ping(3)]))
-        live._send_frame(Flown(Moment(EPOCH, -1, 1.0, True, 1 << 20), None, b"", [ping(1)], bytes(4)))
-        live._serve(selector, 0.0)
-        assert not sent and not live._orders
-        clock[0] += 1.27
-        live._serve(selector, 0.0)
-        assert not sent and not live._orders
-        clock[0] += 0.02
-        live._serve(selector, 0.0)
-        assert len(sent) == 1 and list(live._orders) == [ping(3)]
-        # Behind the limb nobody hears.
-        live._heard = False
-        live._take_telecommands(ping(4))
-        clock[0] += 2.0
-        live._serve(selector, 0.0)
-        assert list(live._orders) == [ping(3)]
-    live.close()
 
 
 def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown: tuple[World, LoadedPayload]) -> None:
@@ -289,8 +252,8 @@ def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, Loade
     world, loaded = flown
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(LinkError, match=f"telecommand port {port}: expected a free port"):
-            LivePayload(world, new_spacecraft(world, loaded), telecommand_port=port)
+        with pytest.raises(LinkError, match=f"telecommand of earth port {port}: expected a free port"):
+            LiveSession(world, loaded, has_operator=True, station_ports={"earth": (0, port)})
 
 
 def reset(connection: socket.socket) -> None:
@@ -300,17 +263,17 @@ def reset(connection: socket.socket) -> None:
 
 
 def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_payload(
-    running: tuple[LivePayload, Watcher],
+    running: tuple[LiveSession, Watcher],
 ) -> None:
     live, watcher = running
     held = []
     for k in range(300):
-        for name in ("telemetry", "telecommand", "console"):
+        for name in ("telemetry earth", "telecommand earth", "console"):
             connection = socket.create_connection(("127.0.0.1", live.ports[name]), timeout=20.0)
             if name == "console":
                 # The answer to an unknown word meets a connection that is gone already.
                 connection.sendall(b"unknown\n" * 3 + b"half a wo")
-            elif name == "telecommand":
+            elif name == "telecommand earth":
                 connection.sendall(ping(k)[:7])
             if k % 3 == 0:
                 reset(connection)
@@ -434,7 +397,7 @@ def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
             quiet + (encoder.encode([order]) if (trial >> k) & 1 else order)
             for k, (quiet, order) in enumerate(zip(noise, orders, strict=True))
         ]
-        stream, buffer, found = b"".join(parts), TelecommandBuffer(), []
+        stream, buffer, found = b"".join(parts), TelecommandBuffer(Receiver(0x4C)), []
         while stream:
             cut = int(rng.integers(1, 40))
             found += buffer.take(stream[:cut])
@@ -444,7 +407,7 @@ def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
 
 
 def test_a_flood_of_octets_is_not_kept() -> None:
-    buffer = TelecommandBuffer()
+    buffer = TelecommandBuffer(Receiver(0x4C))
     for _ in range(40):
         assert buffer.take(b"\xeb\x90" + b"\x00" * 65_536) == []
     assert buffer.dropped > 1 << 20

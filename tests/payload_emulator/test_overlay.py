@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import DataFolder
-from payload_emulator.session.flying import craters_in_view
+from payload_emulator.session.camera import Exposure
+from payload_emulator.session.reduced import craters_in_view
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import Exposure, build_world
+from payload_emulator.session.world import build_world
 
 SCENARIO = """
 name = "overlay"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lunar.catalogue import load_catalogue, save_catalogue
+from lunar.catalogue import save_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import PayloadError, RecordError
 from payload_emulator.flight.payload import FlightParameters
@@ -70,13 +70,12 @@ def received(folder: Path, described: Scenario) -> Path:
             )
             ground.send(*sent)
 
-    terrain = open_world(described, DataFolder(None), 3600.0).terrain
+    terrain = open_world(described, DataFolder(None)).terrain
     folder.mkdir()
     listed = terrain.catalogue.diameter_m
     some = np.flatnonzero((listed > 5e3) & (listed < 8e3))[:40]
     save_catalogue(terrain.measured(some), folder / CATALOGUE)
-    catalogue = load_catalogue(folder / CATALOGUE)
-    session, ground = flown(described, 6.5, act, catalogue=catalogue)
+    session, ground = flown(described, 6.5, act, craters=folder / CATALOGUE)
     assert session.account.frames == FRAMES
     (folder / "downlink.packets").write_bytes(packets_of(ground.records))
     (folder / "telecommands.packets").write_bytes(b"".join(sent))
@@ -126,7 +125,7 @@ def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(
 
 
 def test_the_first_time_of_a_tick_is_the_same_from_everywhere() -> None:
-    moon = open_world(world(), DataFolder(None), 3600.0)
+    moon = open_world(world(), DataFolder(None))
     for seconds in (0.0, 1.0, 3333.333, 2_592_000.25):
         ticks = clock_ticks(moon, EPOCH + round(seconds * NS))
         first = first_utc_ns(moon, ticks)
@@ -184,7 +183,7 @@ def test_a_session_without_images_cannot_be_made_again(copy: Path, tmp_path: Pat
 
 def test_only_a_payload_as_launched_reports_images(tmp_path: Path) -> None:
     described = world()
-    opened = open_world(described, DataFolder(None), 3600.0)
+    opened = open_world(described, DataFolder(None))
     launched = launch_payload(described, opened.camera, DataFolder(None)).parameters.flight
     assert launched.image_reports and not replace(launched, image_reports=False).image_reports
     assert launched.hash != replace(launched, image_reports=False).hash

@@ -61,6 +61,12 @@ def test_a_value_may_contain_itself() -> None:
     assert found["list"][0] is found
 
 
+def test_a_key_of_a_mapping_may_occur_again() -> None:
+    key = ("madrid", 1)
+    value = {"by": {key: [key]}, "queue": deque([(key, b"octets")])}
+    assert kept(value) == value
+
+
 def test_random_numbers_go_on() -> None:
     generator = np.random.default_rng((3, 2**41))
     generator.integers(0, 9, 7, dtype=np.uint8)

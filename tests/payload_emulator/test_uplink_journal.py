@@ -9,8 +9,9 @@ import pytest
 
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
-from payload_emulator.session.continuous import ContinuousSession
+from payload_emulator.session.live import LiveSession
 from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.starting import launch
 from payload_emulator.session.station_ports import StationPorts
 from payload_emulator.session.uplink_journal import JournalEntry, add_to_journal, load_journal
 from tests.payload_emulator.test_continuous import SCENARIO
@@ -94,7 +95,9 @@ def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times
     later = JournalEntry(epoch + 10, "madrid", 512, b"later")
     for entry in (later, JournalEntry(epoch, "madrid", 256, b"now")):
         add_to_journal(journal, entry)
-    session = ContinuousSession(parse_scenario(SCENARIO), DataFolder(None), keeps=True, journal_file=journal)
+    session = LiveSession(
+        *launch(parse_scenario(SCENARIO), DataFolder(None)), keeps=True, journal_file=journal
+    )
     try:
         assert session.stations["madrid"].taken == {256, 512}
         session._repeat_journal()
@@ -106,15 +109,13 @@ def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times
         # Without a contact nothing is taken, and nothing is written.
         assert not session._take_telecommands("madrid", 768, b"new") and len(load_journal(journal)) == 2
     finally:
-        for server in session._servers():
-            server.close()
+        session.close()
 
 
 def test_a_clock_file_that_others_have_mapped_is_not_shortened(tmp_path: Path) -> None:
     """A reader of the map would be ended by the kernel (SIGBUS) at that moment."""
     path = tmp_path / "clock"
     path.write_bytes(bytes(8) + b"further")
-    session = ContinuousSession(parse_scenario(SCENARIO), DataFolder(None), clock_file=path)
-    for server in session._servers():
-        server.close()
+    session = LiveSession(*launch(parse_scenario(SCENARIO), DataFolder(None)), clock_file=path)
+    session.close()
     assert path.read_bytes() == struct.pack("<q", session.utc_ns) + b"further"

@@ -53,6 +53,8 @@ function take(message) {
     say("connected");
     return;
   }
+  if (message.kind === "fault") log(`${timeText(message.utc)} ${message.text}`);
+  if (message.kind !== "frame" && message.kind !== "turn") return;
   say(message.paused ? "paused" : "running");
   for (const event of message.events) {
     log(`${timeText(message.utc)} ${event.severity}: ${event.event.replaceAll("_", " ")}${event.text ? `: ${event.text}` : ""}`);

@@ -58,6 +58,10 @@ class FlightParameters:
         Time between housekeeping packets until it is changed by telecommand.
     image_reports
         Whether each image is reported with checksums until it is changed by telecommand.
+    time_reports
+        Whether a time report is sent each 16 frames of telemetry until it is changed by telecommand.
+    scrub_interval_s
+        Time between checks of memory until it is changed by telecommand.
     instruments
         Parameters of each installed instrument by name.
     """
@@ -69,6 +73,8 @@ class FlightParameters:
     housekeeping_interval_s: float = 60.0
     # Without reports and instruments the text, and so the hash in telemetry, is that of builds that knew none.
     image_reports: bool = field(default=False, repr=False)
+    time_reports: bool = field(default=False, repr=False)
+    scrub_interval_s: float = field(default=60.0, repr=False)
     instruments: Mapping[str, Any] = field(default_factory=dict, repr=False, hash=False)
 
     @property

@@ -254,7 +254,7 @@ def save_time_receptions(
     folder: Path, packets: Sequence[bytes], emitted_utc_ns: IntArray, position_icrf_m: FloatArray
 ) -> None:
     """Write when time reports (n,), emitted at positions (n, 3) from the Moon, came to the Earth's centre."""
-    light_s = _light_to_earth_s(position_icrf_m, emitted_utc_ns)
+    light_s = light_to_earth_s(position_icrf_m, emitted_utc_ns)
     received = emitted_utc_ns + np.rint(light_s * 1e9).astype(np.int64)
     rows = [
         f"{int.from_bytes(packet[14:20], 'big')},{int.from_bytes(packet[2:4], 'big') & 0x3FFF},{format_utc(utc)}\n"
@@ -291,7 +291,7 @@ def contacts(ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection) -> tu
     if utc_ns.size == 0:
         return np.ones(0, dtype=np.bool_), np.full(0, LIGHT_S)
     if not section.stations:
-        return np.ones(utc_ns.size, dtype=np.bool_), _light_to_earth_s(ephemeris.at(utc_ns)[0], utc_ns)
+        return np.ones(utc_ns.size, dtype=np.bool_), light_to_earth_s(ephemeris.at(utc_ns)[0], utc_ns)
     grid = np.arange(utc_ns.min(), utc_ns.max() + 1, _CONTACT_STEP_NS, dtype=np.int64)
     heard, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, LIGHT_S)
     for name in section.stations:
@@ -303,7 +303,7 @@ def contacts(ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection) -> tu
     return heard[at], light_s[at]
 
 
-def _light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArray:
+def light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArray:
     """Light time (n,) from positions (n, 3) from the Moon to the Earth's centre, s."""
     earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns)))).reshape(-1, 3)
     return np.asarray(np.linalg.norm(position_icrf_m - earth, axis=1) / SPEED_OF_LIGHT_M_S)

@@ -37,9 +37,9 @@ def test_a_day_is_planned_flown_live_and_reported(tmp_path: Path, monkeypatch: p
         str(tmp_path / "live.toml"), tmp_path, distributed=False, minutes=1.5, echo=False
     )
     assert went_well(figures), str(figures)
-    assert figures["telecommands"] == {"completed": 6}
+    assert figures["telecommands"] == {"completed": 12}
     assert "report.pdf" in figures["report"]
-    assert any(line.startswith("ann $ linna command uplink") for line in lines)
+    assert any(line.startswith("eve $ linna mission add") for line in lines)
     assert any(line.startswith("# audit: bob release telecommand") for line in lines)
 
 

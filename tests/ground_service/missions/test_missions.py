@@ -32,7 +32,7 @@ from ground_service.missions.service import (
 from ground_service.missions.store import (
     approval_in_force,
     find_revision,
-    list_revisions,
+    list_missions,
     newest_of_spacecraft,
 )
 from ground_service.passes.archive_import import import_archive
@@ -147,7 +147,7 @@ def test_entering_the_same_content_again_gives_the_same_revision(ground) -> None
     again = add_mission(ground, (TEXT + "# a remark\n").encode(), actor="bob")
     assert again == first and first.entered_by == "ada" and first.text == TEXT
     other = add_mission(ground, TEXT.replace('"DE421"', '"IAU WGCCRE 2009"').encode())
-    page = ground.read(list_revisions, Paging())
+    page = ground.read(list_missions, Paging())
     listed, total = page.items, page.total
     assert [one.revision for one in listed] == [other.revision, first.revision] and total == 2
     assert ground.read(find_revision, first.revision[:8]) == first
@@ -240,7 +240,7 @@ def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(gr
     _manifest_again(folder)
     with pytest.raises(InvalidInput, match=r"mission\.toml, spacecraft\.id: expected 76 .*, found 5"):
         import_archive(ground, folder)
-    assert ground.read(list_revisions, Paging()).items == []
+    assert ground.read(list_missions, Paging()).items == []
 
 
 @pytest.mark.parametrize(
@@ -408,7 +408,7 @@ def test_several_that_enter_one_description_at_once_get_one_revision(
     with open_ground(tmp_path / "home", database_url=url) as ground, ThreadPoolExecutor(4) as pool:
         entered = list(pool.map(lambda _: add_mission(ground, TEXT.encode()), range(8)))
         assert len({one.id for one in entered}) == 1
-        assert ground.read(list_revisions, Paging()).total == 1
+        assert ground.read(list_missions, Paging()).total == 1
 
 
 def test_a_description_names_a_mission() -> None:

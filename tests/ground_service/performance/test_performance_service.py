@@ -11,7 +11,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from ground_service.automation.model import ActionFilter
-from ground_service.automation.store import list_actions
+from ground_service.automation.store import list_automation_actions
 from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock
 from ground_service.errors import InvalidInput
@@ -351,7 +351,7 @@ def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Grou
         publish(connection, WindowChanged(id=int(window), state="processed"))
     [made] = ground.read(list_monthly_reports, MonthlyReportFilter()).items
     assert (made.month, made.passes, made.spacecraft_id) == ("2029-08", 1, SPACECRAFT)
-    found = {one.action: one for one in ground.read(list_actions, ActionFilter()).items}
+    found = {one.action: one for one in ground.read(list_automation_actions, ActionFilter()).items}
     assert found["monthly_report"].result == {"report": made.id, "month": "2029-08", "passes": 1}
     assert nightly(ground, {})["monthly_reports"] == [
         {"spacecraft_id": SPACECRAFT, "month": "2029-08", "report": made.id}

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from ground_service.client.local import local_client
-from ground_service.clock import set_mission_clock, utc_now_ns
+from ground_service.clock import set_mission_clock
 from ground_service.commanding.model import TelecommandFilter
-from ground_service.commanding.service import get_command
-from ground_service.commanding.store import list_telecommands
+from ground_service.commanding.service import get_command, list_telecommands
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.events import read_events
@@ -140,7 +139,7 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     left = [one.reason for one in plan.candidates if one.outcome == "rejected"]
     assert left and all(left) and "the number of windows of its period is planned" in left
     assert either.read(get_request, key).windows == {"approved": 2}
-    commands = either.read(list_telecommands, TelecommandFilter(state="released"), utc_now_ns()).items
+    commands = either.read(list_telecommands, TelecommandFilter(state="released")).items
     assert len(commands) == 6 and all(
         get_command(either, one.id).record.send_before_utc_ns for one in commands
     )
@@ -181,7 +180,7 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
     assert (failed.state, failed.reason) == ("failed", standing.NO_CONTACT)
     assert {
         get.state
-        for get in either.read(list_telecommands, TelecommandFilter(), utc_now_ns()).items
+        for get in either.read(list_telecommands, TelecommandFilter()).items
         if get.window_id == first.id
     } == {"rejected"}
     assert either.read(get_plan, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]

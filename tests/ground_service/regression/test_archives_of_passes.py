@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from ground_service.automation.model import ActionFilter
-from ground_service.automation.store import list_actions
+from ground_service.automation.store import list_automation_actions
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
@@ -106,7 +106,7 @@ def test_an_imported_pass_is_kept_by_a_default_rule(either: Ground, flown: Flyab
     [kept] = kept_archives(either)
     assert (kept.digest, kept.pass_id, kept.state, kept.reason) == (digest, pass_id, "complete", "")
     assert (kept.frames, kept.frames_stored) == (4, 4)
-    [action] = either.read(list_actions, ActionFilter()).items
+    [action] = either.read(list_automation_actions, ActionFilter()).items
     assert (action.rule, action.action, action.state) == (
         "regression archive of an imported pass",
         "keep_archive",

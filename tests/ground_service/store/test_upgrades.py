@@ -27,7 +27,6 @@ from ground_service.store.database import (
 )
 from ground_service.store.models import METADATA
 from ground_service.store.snapshot import create_schema
-from tests.ground_service.conftest import wait_for
 from tests.ground_service.schema import described_schema
 from tests.ground_service.store.schema_rules import RULE, breaking_changes
 from tests.serving import wait_for

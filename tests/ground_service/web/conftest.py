@@ -102,7 +102,7 @@ class Console:
     def _hear(self, client: socket.socket) -> None:
         with client, suppress(OSError), client.makefile("r") as lines:
             for line in lines:
-                self.heard.append(line.strip())
+                self.heard += [line.strip()] if line.strip() != "watch" else []
         self._clients.remove(client)
 
     def say(self, message: dict[str, object]) -> None:

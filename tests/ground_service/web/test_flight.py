@@ -26,9 +26,9 @@ from lunar.datafolder import find_data
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc
-from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
-from payload_emulator.session.live import LivePayload
+from payload_emulator.session.live import LiveSession
 from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import build_world
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, Pictures, strict_page, wait_until
@@ -68,6 +68,9 @@ height_px = 512
 latitude_deg = 40.43
 longitude_deg = -4.25
 minimum_elevation_deg = 0.0
+header_octets = 8
+time_code = "unix_ns"
+time_offset = 0
 [[links]]
 name = "madrid"
 kind = "tcp"
@@ -121,23 +124,30 @@ def flown(
     folder = tmp_path_factory.mktemp("flight")
     data = find_data(None)
     world = build_world(parse_scenario(SCENARIO), data)
-    spacecraft = new_spacecraft(world, load_scenario_payload(world, data)[0])
-    payload = LivePayload(world, spacecraft, rate=0.0, paused=True, stop_at_end=True)
+    loaded, _, _ = load_scenario_payload(world, data)
+    payload = LiveSession(world, loaded, has_operator=True, paused=True, ends_with_scenario=True)
     thread = threading.Thread(target=payload.run, daemon=True)
-    home = prepared_home(folder, payload.ports["telemetry"])
+    home = prepared_home(folder, payload.ports["telemetry earth"])
     thread.start()
     service = serve(home, home / "serve.log", payload.ports["console"], openmct)
     try:
         with (
             strict_page(browser, service.url) as layout,
             strict_page(browser, service.url) as live,
-            socket.create_connection(("127.0.0.1", payload.ports["telecommand"])) as station,
+            socket.create_connection(("127.0.0.1", payload.ports["telecommand earth"])) as station,
         ):
-            for count, (name, values) in enumerate(ORDERS):
-                packet = DICTIONARY.pack_command(name, values, sequence_count=count, source=SOURCE)
-                station.sendall(packet)
-            wait_until(lambda: len(payload._orders) == len(ORDERS), "no telecommands have arrived")
-            wait_until(lambda: bool(payload._servers["telemetry"].clients), "the link is not connected")
+            sent = [
+                DICTIONARY.pack_command(name, values, sequence_count=count, source=SOURCE)
+                for count, (name, values) in enumerate(ORDERS)
+            ]
+            station.sendall(b"".join(sent))
+            octets = sum(len(one) for one in sent)
+            wait_until(
+                lambda: sum(len(one) for _, one in payload._uplinked) == octets,
+                "no telecommands have arrived",
+            )
+            clients = payload.stations["earth"].telemetry.clients
+            wait_until(lambda: bool(clients), "the link is not connected")
             found = Flown(service.url, layout, live)
             follow(found)
             yield found

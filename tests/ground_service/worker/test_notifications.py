@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from ground_service.automation.model import ActionFilter
-from ground_service.automation.store import list_actions
+from ground_service.automation.store import list_automation_actions
 from ground_service.errors import InvalidInput
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground, open_ground
@@ -320,7 +320,7 @@ smtp = "{mailbox.address}"
     add_mission(local, text.encode())
     with local.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
-    [action] = local.read(list_actions, ActionFilter()).items
+    [action] = local.read(list_automation_actions, ActionFilter()).items
     assert (action.state, action.result) == ("done", {"hook": "delivered", "people": "delivered"})
     [(_, body)] = webhook.received
     document = json.loads(body)
@@ -361,7 +361,7 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
         assert kinds("running") == ["notification"]
         held.set()
         wait_for(lambda: kinds("running") == [], "the end of the notification", 30.0)
-        [action] = local.read(list_actions, ActionFilter()).items
+        [action] = local.read(list_automation_actions, ActionFilter()).items
         assert (action.state, action.result) == ("done", {"hook": "delivered"})
     finally:
         held.set()
@@ -393,6 +393,6 @@ smtp = "{mailbox.address}"
     add_mission(local, text.encode())
     with local.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="pass"))
-    [action] = local.read(list_actions, ActionFilter()).items
+    [action] = local.read(list_automation_actions, ActionFilter()).items
     assert action.state == "failed" and "hook: the webhook refuses the message" in (action.error or "")
     assert len(mailbox.received) == 1

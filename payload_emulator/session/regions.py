@@ -1,4 +1,4 @@
-"""Where a mission run requests its windows: over ground that the crater catalogue and the height rasters describe."""
+"""Ground that is observed: where the crater catalogue and the height rasters describe it, and the craters around it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray
+from lunar.catalogue import CraterCatalogue
+from payload_emulator.session.world import World
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 
 CELL_DEG = 15
@@ -21,6 +23,12 @@ CRATER_DIAMETER_M = 5e3
 """Smallest craters that are scored; a cell of the catalogue without any is not catalogued."""
 
 SAMPLES = 4
+
+CATALOGUE_MARGIN_DEG = 5.0
+"""Half the field of view of the camera at 60 km altitude, beyond the latitudes of the windows."""
+
+WINDOW_LATITUDE_DEG = 20.0
+"""Half the band of latitudes that a pass crosses in 12 minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,3 +143,21 @@ def _covered(terrain: TiledTerrain) -> BoolArray:
     longitude = np.radians(CELL_DEG * np.arange(columns)[:, None] + steps).reshape(-1)
     held = terrain.covers(latitude[:, None], longitude[None, :])
     return np.asarray(held.reshape(rows, SAMPLES, columns, SAMPLES).all(axis=(1, 3)))
+
+
+def observed_craters(world: World, latitude_limit_deg: float = WINDOW_LATITUDE_DEG) -> CraterCatalogue:
+    """Return the craters around the observed boxes, with the heights of their rims where an estimator needs them."""
+    navigation, listed = world.scenario.navigation, world.terrain.catalogue
+    near = [one.widened(CATALOGUE_MARGIN_DEG) for one in observed_boxes(world.terrain, latitude_limit_deg)]
+    chosen = np.flatnonzero(
+        in_boxes(np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad), near)
+        & (listed.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km)
+        & (listed.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km)
+    )
+    if world.scenario.camera.images == "reduced" and "anchored" not in navigation.estimators:
+        # Nobody asks for the heights of rims: measuring them means making the ground.
+        return listed.select(chosen)
+    catalogue = world.terrain.measured(chosen)
+    world.terrain.release_ground()
+    world.terrain.release_thread()
+    return catalogue

@@ -1,0 +1,186 @@
+"""SQL of the telemetry of a pass: samples, packets, detections and event reports in a span."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, func, select
+
+from ground_service.http.model import Paging
+from ground_service.passes.samples import DetectionSamples, no_detections
+from ground_service.passes.span import PassSpan
+from ground_service.store import repository, telemetry
+from ground_service.store.codec import DETECTION_ITEM, unpack_detections
+from ground_service.timekeeping.core import utc_ns_of_ticks
+from lunar.arrays import IntArray
+from reports.values import PassEvent
+from tmtc.dictionary import DICTIONARY
+from tmtc.event_texts import event_text
+
+_SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
+
+
+def samples(connection: Connection, span: PassSpan, kind: str, names: Sequence[str]) -> dict[str, list[Any]]:
+    """Return columns of the samples of one kind in a span, in order of time."""
+    return telemetry.samples(
+        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
+    )
+
+
+def sample_arrays(
+    connection: Connection, span: PassSpan, kind: str, names: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
+    return telemetry.sample_arrays(
+        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
+    )
+
+
+def packet_octets(connection: Connection, span: PassSpan, apid: int) -> bytes:
+    """Return the packets of one APID in a span, end to end in order of time."""
+    return telemetry.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
+
+
+def detection_samples(connection: Connection, span: PassSpan) -> DetectionSamples:
+    """Detections of every frame, in time order; of two reports on one image the first by content counts."""
+    rows = samples(connection, span, "detections", ("ticks", "frame_number", "image_quality", "items"))
+    if not rows["ticks"]:
+        return no_detections()
+    chosen = _first_reports(rows)
+    items, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
+    quality = [rows["image_quality"][i] for i in chosen]
+    utc_ns, correlation_ids = utc_ns_of_ticks(
+        np.array([rows["ticks"][i] for i in chosen], dtype=np.int64), span.correlations
+    )
+    return DetectionSamples(
+        frame_number=np.array([rows["frame_number"][i] for i in chosen], dtype=np.int64),
+        utc_ns=utc_ns,
+        correlation_id=correlation_ids,
+        usable=np.array([code == 0 for code in quality], dtype=np.bool_),
+        quality=code_labels(DICTIONARY.labels("detections", "image_quality"), np.array(quality)),
+        offsets=offsets,
+        u_px=items["u_px"].astype(np.float64),
+        v_px=items["v_px"].astype(np.float64),
+        diameter_px=items["diameter_px"].astype(np.float64),
+        score=items["score"].astype(np.float64),
+        size_class=items["size_class"].astype(np.int64),
+    )
+
+
+def _first_reports(rows: Mapping[str, list[Any]]) -> list[int]:
+    """Numbers of the rows to count, in time order: of those on one image the first by content."""
+    order = sorted(
+        range(len(rows["ticks"])),
+        key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i])),
+    )
+    return [
+        i
+        for place, i in enumerate(order)
+        if place == 0
+        or (rows["ticks"][i], rows["frame_number"][i])
+        != (rows["ticks"][order[place - 1]], rows["frame_number"][order[place - 1]])
+    ]
+
+
+def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
+    """On-board time of every frame (n,), ascending, and where its detections begin among all of the span (n + 1,)."""
+    table = repository.SAMPLES["detections"]
+    query = (
+        select(table.c.ticks, table.c.frame_number, func.length(table.c["items"]))
+        .where(
+            table.c.vehicle_id == span.vehicle,
+            table.c.dictionary_version == span.dictionary_version,
+            table.c.ticks.between(span.start_ticks, span.stop_ticks),
+        )
+        .order_by(table.c.ticks, table.c.frame_number)
+    )
+    rows = telemetry.whole_numbers(connection, query)
+    if (np.diff(rows[:, :2], axis=0) == 0).all(axis=1).any():
+        return _detection_frames_by_content(connection, span)
+    return rows[:, 0], np.concatenate(([0], np.cumsum(rows[:, 2] // DETECTION_ITEM.itemsize)))
+
+
+def _detection_frames_by_content(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
+    """As `detection_frames`, where images were reported twice: of two reports the first by content counts."""
+    rows = samples(connection, span, "detections", ("ticks", "frame_number", "items"))
+    chosen = _first_reports(rows)
+    _, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
+    return np.array([rows["ticks"][i] for i in chosen], dtype=np.int64), offsets
+
+
+def code_labels(labels: Mapping[int, str], codes: NDArray[Any]) -> tuple[str, ...]:
+    return tuple(labels.get(int(code), str(int(code))) for code in codes)
+
+
+_EVENT_COLUMNS = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
+
+
+def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
+    """Event reports of a pass, in time order."""
+    rows = samples(connection, span, "events", _EVENT_COLUMNS)
+    events = _pass_events(list(zip(*rows.values(), strict=True)), span)
+    return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
+
+
+def event_page(
+    connection: Connection,
+    span: PassSpan,
+    asked: Paging,
+    *,
+    severities: Sequence[str] | None = None,
+    name: str | None = None,
+    newest_first: bool = True,
+) -> tuple[list[PassEvent], int]:
+    """Return a page of the event reports of a span that match, in time order, and their number.
+
+    No severities: all. `name` is a part of the name of the event. Reports of one time are in the order of their
+    content, whatever the order in which they came.
+    """
+    table = repository.SAMPLES["events"]
+    query = select(*(table.c[column] for column in _EVENT_COLUMNS)).where(
+        table.c.vehicle_id == span.vehicle,
+        table.c.dictionary_version == span.dictionary_version,
+        table.c.ticks.between(span.start_ticks, span.stop_ticks),
+    )
+    if severities:
+        codes = [code for code, one in _SEVERITIES.items() if one in severities]
+        query = query.where(table.c.severity.in_(codes))
+    if name is not None:
+        part = name.strip().lower().replace(" ", "_")
+        labels = DICTIONARY.labels("event_info", "event_id")
+        query = query.where(table.c.event_id.in_([code for code, label in labels.items() if part in label]))
+    order = [
+        table.c[column] for column in ("ticks", "event_id", "frame_number", "value_1", "value_2", "packet_id")
+    ]
+    rows, total = repository.page(
+        connection, query, asked, *(column.desc() if newest_first else column for column in order)
+    )
+    return _pass_events([tuple(row.values()) for row in rows], span), total
+
+
+def _pass_events(rows: Sequence[tuple[Any, ...]], span: PassSpan) -> list[PassEvent]:
+    """Return event reports of rows of `_EVENT_COLUMNS`."""
+    labels = DICTIONARY.labels("event_info", "event_id")
+    utc_ns, correlation_ids = utc_ns_of_ticks(
+        np.array([row[0] for row in rows], dtype=np.int64), span.correlations
+    )
+    return [
+        PassEvent(
+            utc_ns=int(utc),
+            severity=_SEVERITIES.get(severity, str(severity)),
+            name=labels.get(event_id, str(event_id)),
+            detail=_event_detail(labels.get(event_id, ""), *values),
+            correlation_id=int(correlation),
+        )
+        for (_, severity, event_id, *values), utc, correlation in zip(
+            rows, utc_ns, correlation_ids, strict=True
+        )
+    ]
+
+
+def _event_detail(name: str, frame_number: int, *values: float | None) -> str:
+    text = event_text(name, *values)
+    return f"frame {frame_number}: {text}" if text else f"frame {frame_number}"
