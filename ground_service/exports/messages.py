@@ -57,7 +57,7 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
     Raises
     ------
     EvaluationError
-        If there are no such states, or they have no velocities.
+        If there are no such states, they have no velocities, or cannot be turned into ICRF.
     """
     if states == REFERENCE:
         if inputs.reference is None:
@@ -70,6 +70,10 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
         raise EvaluationError(
             f"states: expected {REFERENCE} or {FILTER} (downlinked with velocities), found {states!r}"
         )
+    if inputs.orientation is None:
+        reason = inputs.refused.get("orientation", "no lunar orientation is given")
+        raise EvaluationError(f"states: expected an orientation that turns {FILTER} into ICRF; {reason}")
+    found = found.in_icrf(inputs.orientation)
     covariances = tuple(
         Covariance(int(utc), "ICRF", matrix[:6, :6])
         for utc, matrix in zip(found.utc_ns, found.covariance, strict=True)
@@ -81,7 +85,10 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
         craft.name,
         interpolation="HERMITE",
         degree=3,
-        comments=("states of the on-board navigation filter after each frame, downlinked",),
+        comments=(
+            "states of the on-board navigation filter after each frame, downlinked;",
+            f"turned into ICRF with the orientation {inputs.orientation.name}",
+        ),
         covariances=covariances,
     )
 

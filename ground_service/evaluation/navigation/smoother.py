@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
-from lunar.frames import rtn_from_inertial
+from lunar.frames import IauOrientation, Orientation, rtn_from_inertial
 from lunar.gravity_omission import FieldNoise, densities_at
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import tdb_s_from_utc_ns
@@ -39,7 +39,8 @@ class FilterStates:
     utc_ns
         Time tags, shape (n,).
     state
-        Position (m) and velocity (m/s), Moon-centred ICRF, empirical acceleration (m/s^2; R, T, N), shape (n, 9).
+        Position (m) and velocity (m/s), Moon-centred in the inertial axes of the payload, which follow from its own
+        lunar orientation (`in_icrf` turns them), empirical acceleration (m/s^2; R, T, N), shape (n, 9).
     covariance
         Shape (n, 9, 9).
     innovation_degrees
@@ -59,6 +60,23 @@ class FilterStates:
         """Return the states that a mask selects."""
         degrees = None if self.innovation_degrees is None else self.innovation_degrees[which]
         return FilterStates(self.utc_ns[which], self.state[which], self.covariance[which], degrees)
+
+    def in_icrf(self, orientation: Orientation) -> FilterStates:
+        """Return the states with position, velocity and their covariance in ICRF.
+
+        The payload knows where it is over the ground, from craters, and turns this into its inertial axes with the IAU
+        series. The ground beneath a state is the same in both, so the turn is ICRF from Moon-fixed by `orientation`
+        times Moon-fixed from inertial by the series.
+        """
+        tdb_s = np.asarray(tdb_s_from_utc_ns(self.utc_ns), dtype=np.float64)
+        icrf_from_mcmf = np.swapaxes(orientation.mcmf_from_icrf(tdb_s), -1, -2)
+        turn = icrf_from_mcmf @ IauOrientation().mcmf_from_icrf(tdb_s)
+        state, jacobian = self.state.copy(), np.tile(np.eye(SIZE), (len(self), 1, 1))
+        for part in (_POSITION, _VELOCITY):
+            state[:, part] = np.einsum("nij,nj->ni", turn, state[:, part])
+            jacobian[:, part, part] = turn
+        covariance = jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2)
+        return FilterStates(self.utc_ns, state, covariance, self.innovation_degrees)
 
     @property
     def position_covariance_rtn_m2(self) -> FloatArray:

@@ -7,6 +7,7 @@ import json
 import tracemalloc
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas
@@ -17,6 +18,7 @@ import xarray
 from PIL import Image
 
 from ground_service.errors import EvaluationError, FileDamaged, NotFound
+from ground_service.evaluation.navigation.smoother import FilterStates
 from ground_service.exports import service
 from ground_service.exports.formats import FORMATS
 from ground_service.exports.model import ExportRequest
@@ -74,7 +76,40 @@ def test_oem_of_the_filter_has_its_states_and_covariances(rich_ground: Ground, r
         FILTER_OFFSET_M + np.zeros((FRAMES, 1)),
         atol=1e-3,
     )
-    np.testing.assert_allclose(segment.covariances[3].matrix, np.diag([100.0] * 3 + [1e-4] * 3), rtol=1e-6)
+    np.testing.assert_allclose(
+        segment.covariances[3].matrix, np.diag([100.0] * 3 + [1e-4] * 3), rtol=1e-6, atol=1e-12
+    )
+
+
+def test_states_of_the_filter_are_turned_from_the_axes_of_the_payload_into_icrf() -> None:
+    """The payload has the IAU series; the declared orientation is turned from it by 20 arc seconds about one axis."""
+    utc_ns = parse_utc("2029-08-07T06:00:00Z") + np.arange(3, dtype=np.int64) * 15_000_000_000
+    angle = np.radians(20.0 / 3600.0)
+    turned = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+    class Declared:
+        name = "declared"
+
+        def mcmf_from_icrf(self, tdb_s: Any) -> Any:
+            return turned @ IauOrientation().mcmf_from_icrf(tdb_s)
+
+    tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
+    ground_m, ground_m_s = np.array([1.2e6, 0.9e6, 0.9e6]), np.array([-1000.0, 1300.0, 100.0])
+    place = np.concatenate([ground_m, ground_m_s])
+    both = np.kron(np.eye(2), turned.T)
+    series = IauOrientation().mcmf_from_icrf(tdb_s)
+    onboard = np.array([np.kron(np.eye(2), one.T) @ place for one in series])
+    spread = np.diag([100.0, 400.0, 900.0, 1e-4, 2e-4, 3e-4, 1e-12, 1e-12, 1e-12])
+    states = np.concatenate([onboard, np.zeros((3, 3))], axis=1)
+    found = FilterStates(utc_ns, states, np.tile(spread, (3, 1, 1))).in_icrf(Declared())
+    for k, one in enumerate(series):
+        icrf = np.kron(np.eye(2), one.T) @ both @ place
+        np.testing.assert_allclose(found.state[k, :6], icrf, atol=1e-6)
+        assert np.linalg.norm(found.state[k, :3] - states[k, :3]) > 100.0
+        turn = one.T @ turned.T @ one
+        expected = turn @ spread[:3, :3] @ turn.T
+        np.testing.assert_allclose(found.covariance[k, :3, :3], expected, atol=1e-9)
+        np.testing.assert_array_equal(found.covariance[k, 6:, 6:], spread[6:, 6:])
 
 
 def test_aem_has_the_attitude_of_each_frame(rich_ground: Ground, rich_pass: RichPass) -> None:
