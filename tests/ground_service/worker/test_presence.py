@@ -25,7 +25,6 @@ from ground_service.worker.doctor import examine
 from ground_service.worker.presence import all_disagreements, present, running_processes, statement_of
 from linna import cli
 from tests.ground_service.access.openid import running_provider
-from tests.ground_service.conftest import wait_for
 
 
 @pytest.fixture
@@ -184,11 +183,3 @@ def test_the_statement_fits_into_its_column() -> None:
     text = presence.Statement("10.10.10.dev1000", digests, -86_400_000, "yes").text()
     assert len(text) <= 96 and presence.Statement.of_text(text).digests == digests
     assert presence.Statement.of_text("1.0 aa bb 0 -") is None
-
-
-def test_beats_continue(opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(presence, "BEAT_S", 0.05)
-    monkeypatch.setattr(presence, "LEASE_NS", 400_000_000)
-    with present(opened, settings, "api"):
-        time.sleep(1.0)
-        wait_for(lambda: len(running_processes(opened.database)) == 1, "the statement", 5.0)
