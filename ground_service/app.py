@@ -132,7 +132,8 @@ def _set_state(app: FastAPI, settings: Settings) -> None:
     app.state.openmct = settings.openmct or FOLDER
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
     app.state.backups = settings.backups
-    app.state.metrics = Metrics(settings.backups)
+    app.state.broker = settings.resolved_broker_url()
+    app.state.metrics = Metrics(settings.backups, app.state.broker)
 
 
 def _add_middleware(app: FastAPI, settings: Settings) -> None:

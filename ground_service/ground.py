@@ -6,8 +6,8 @@ import functools
 import logging
 import stat
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
@@ -94,6 +94,7 @@ def open_ground(
     database_url: str | None = None,
     runner: Path | None = None,
     objects: ObjectStore | None = None,
+    networks: Sequence[str] = (),
 ) -> Ground:
     """Return the ground service under `home`; its SQLite database is created or upgraded.
 
@@ -109,6 +110,8 @@ def open_ground(
         Exchange folder of the runner that executes payload builds; None: a local sandbox.
     objects
         Object store that has the files; None: folders under `home`.
+    networks
+        Networks of receivers of notifications that are not public.
     """
     home = home.expanduser().absolute()
     try:
@@ -123,7 +126,8 @@ def open_ground(
         make_durable_folder(files.root)
     files.remove_leftovers()
     remove_leftovers(home, UNPACKING)
-    return Ground(database, files, home, data if data is not None else DataFolder(), runner, objects)
+    listed = tuple(map(ip_network, networks))
+    return Ground(database, files, home, data if data is not None else DataFolder(), runner, objects, listed)
 
 
 def keep_private(path: Path, mode: int) -> None:
@@ -154,8 +158,8 @@ def ground_from_settings(settings: Settings) -> Ground:
         database_url=url,
         runner=settings.runner_exchange,
         objects=objects_of(settings),
+        networks=settings.notify_networks,
     )
-    ground = replace(ground, networks=tuple(map(ip_network, settings.notify_networks)))
     try:
         if not settings.allow_database_owner:
             check_role(ground.database)

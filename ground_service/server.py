@@ -19,6 +19,7 @@ from ground_service.http.origins import LOOPBACK
 from ground_service.logs import logging_config
 from ground_service.memory import limit_heaps
 from ground_service.settings import Settings
+from ground_service.worker.presence import present
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -84,7 +85,7 @@ def serve(settings: Settings) -> None:
     print(f"LINNA ground service on http://{shown}:{port}/", file=sys.stderr, flush=True)
     if settings.host not in LOOPBACK:
         print(UNLIMITED, file=sys.stderr, flush=True)
-    with listener:
+    with ground_from_settings(settings) as ground, present(ground, settings, "api"), listener:
         _server(config, app.state, settings.drain_s).run(sockets=[listener])
 
 

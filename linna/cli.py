@@ -59,6 +59,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "serve": ("serve", "run the HTTP server of the ground service"),
     "worker": ("worker", "run a job worker of the ground service"),
     "scheduler": ("scheduler", "run the recurring work of a distributed ground service"),
+    "doctor": ("doctor", "check a deployment: processes, clocks, broker, files, provider"),
     "runner": ("runner", "run payload builds for the ground service, in a separate container"),
     "db": ("db", "schema, backup and restore of the database"),
     "verify": ("verify", "check the integrity of the archive: files, packets, audit chain"),

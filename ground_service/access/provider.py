@@ -150,6 +150,16 @@ class Provider:
         self._check(claims, {"nonce": begun.nonce, "access_token": answer.get("access_token")})
         return self._identity(claims[1])
 
+    async def check(self) -> None:
+        """Read addresses and keys of the provider.
+
+        Raises
+        ------
+        ProviderUnavailable
+            If it cannot be used.
+        """
+        await self._configured()
+
     async def sign_out_address(self, redirect_uri: str) -> str | None:
         """Return the address that ends the session at the provider; None if it has none or cannot be reached."""
         try:

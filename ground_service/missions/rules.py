@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Final, Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -156,6 +157,15 @@ class Channel(Section):
     signing_secret: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", max_length=64)] | None = (
         None
     )
+
+    @property
+    def server(self) -> tuple[str, int]:
+        """Host and port of the webhook or of the mail server."""
+        if self.webhook is not None:
+            parts = urlsplit(self.webhook)
+            return parts.hostname or "", parts.port or (443 if parts.scheme == "https" else 80)
+        host, _, port = self.smtp.rpartition(":")
+        return host, int(port)
 
     @model_validator(mode="after")
     def _one(self) -> Self:

@@ -1,4 +1,4 @@
-"""Interface of the service to the sandbox: file system view of a build, launcher, and a self-test of the sandbox."""
+"""Interface of the service to the sandbox: file system view of a build, and launcher."""
 
 from __future__ import annotations
 
@@ -84,13 +84,10 @@ class Protection:
         The parts of the sandbox in force; "" if it is refused.
     refusal
         Why runs are refused; "" if they are not. The remedy is `REMEDY`.
-    checks
-        Result of each check of the probe inside the sandbox, by name.
     """
 
     isolation: str
     refusal: str
-    checks: Mapping[str, bool]
 
 
 def execute(run: Run) -> dict[str, Any]:
@@ -137,7 +134,8 @@ def execute(run: Run) -> dict[str, Any]:
     if "refused" in report:
         raise SandboxRefused(str(report["refused"]))
     if report.get("unconfined"):
-        raise SandboxRefused(tail(Path(run.printed)).strip().splitlines()[-1][:200])
+        said = tail(Path(run.printed)).strip().splitlines() or [f"{run.command[0]} could not be started"]
+        raise SandboxRefused(said[-1][:200])
     return report
 
 
@@ -200,42 +198,28 @@ def make_readable(folder: Path) -> None:
 
 @functools.cache
 def protection() -> Protection:
-    """Return how builds are isolated here, verified by a probe inside the sandbox."""
-    from ground_service.sandbox import probe
-
+    """Return how builds are isolated here: every step of the launcher refuses a run that it cannot protect."""
+    limits = {
+        "wall_s": 30,
+        "cpu_s": 20,
+        "memory_mib": 512,
+        "file_mib": 1,
+        "folder_mib": 8,
+        "open_files": 64,
+        "processes": 16,
+    }
     with tempfile.TemporaryDirectory(prefix="sandbox-") as folder:
         printed = Path(folder) / "printed.txt"
-        limits = {
-            "wall_s": 30,
-            "cpu_s": 20,
-            "memory_mib": 512,
-            "file_mib": 1,
-            "folder_mib": 8,
-            "open_files": 64,
-            "processes": 16,
-        }
-        run = Run(
-            "namespaces",
-            (sys.executable, "-I", "-S", probe.__file__, str(os.getpid())),
-            "/out",
-            {},
-            limits,
-            ("result.json",),
-            folder,
-            str(printed),
-            program_view(),
-        )
+        command = (sys.executable, "-I", "-S", "-c", "print('ready')")
+        run = Run("namespaces", command, "/out", {}, limits, (), folder, str(printed), program_view())
         try:
             report = execute(run)
-            checks = json.loads((Path(folder) / "result.json").read_text())
         except SandboxRefused as error:
-            return Protection("", error.reason, {})
-        except (OSError, ValueError):
-            return Protection("", f"the probe failed: {tail(printed)[-200:]}", {})
-    failed = [name for name, held in checks.items() if held is not True]
-    if failed:
-        return Protection("", f"not in force: {', '.join(failed)}", checks)
-    return Protection(str(report["isolation"]), "", checks)
+            return Protection("", error.reason)
+        if report.get("exit_status") != 0 or tail(printed).strip() != "ready":
+            said = tail(printed)[-200:].strip() or f"no text, exit status {report.get('exit_status')}"
+            return Protection("", f"Python does not run in the sandbox: {said}")
+    return Protection(str(report["isolation"]), "")
 
 
 def _python_folders() -> list[Path]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Connection, Table, or_, select, text, update
+from sqlalchemy import Connection, Table, delete, or_, select, text, update
 
 from ground_service.clock import utc_now_ns
 from ground_service.store import repository
@@ -75,3 +75,29 @@ def database_now_ns(connection: Connection) -> int:
         return utc_now_ns()
     query = text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")
     return 1000 * int(connection.execute(query).scalar_one())
+
+
+def state(connection: Connection, name: str, owner: str, duration_ns: int) -> None:
+    """Set the owner of a lease that no other process competes for."""
+    until = database_now_ns(connection) + duration_ns
+    repository.add_new(connection, _LEASES, name=name, owner=owner, lease_utc_ns=until)
+    connection.execute(update(_LEASES).where(_LEASES.c.name == name).values(owner=owner, lease_utc_ns=until))
+
+
+def owners(connection: Connection, prefix: str) -> dict[str, str]:
+    """Return the owners of the leases in force whose names begin with `prefix`."""
+    rows = _LEASES.c
+    now = database_now_ns(connection)
+    query = select(rows.name, rows.owner).where(rows.name.startswith(prefix), rows.lease_utc_ns >= now)
+    return {str(name): str(owner) for name, owner in connection.execute(query)}
+
+
+def remove(connection: Connection, name: str) -> None:
+    """Remove a lease."""
+    connection.execute(delete(_LEASES).where(_LEASES.c.name == name))
+
+
+def remove_ended(connection: Connection, prefix: str) -> None:
+    """Remove the leases whose names begin with `prefix` and that have ended."""
+    rows, now = _LEASES.c, database_now_ns(connection)
+    connection.execute(delete(_LEASES).where(rows.name.startswith(prefix), rows.lease_utc_ns < now))

@@ -23,6 +23,7 @@ from ground_service.memory import limit_heaps
 from ground_service.settings import Settings, start_tracing
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import run_job
+from ground_service.worker.presence import present
 
 RUN_JOB = "ground_service.run_job"
 JOB_HEADER = "linna-job"
@@ -174,7 +175,8 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
     """
     _require_broker(settings)
     limit_heaps()
-    _ground_of(settings).close()
+    ground = _ground_of(settings)
+    ground.close()
 
     @setup_logging.connect(weak=False)
     def configure(**_: Any) -> None:
@@ -187,4 +189,6 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
         "--without-gossip",
         "--without-mingle",
     ]
-    make_app(settings).worker_main(words)
+    with present(ground, settings, "worker"):
+        ground.close()  # its processes are forked without connections
+        make_app(settings).worker_main(words)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ground_service.clock import utc_now_ns
@@ -14,6 +14,7 @@ from ground_service.http.times import UtcTime
 from ground_service.store import leases
 from ground_service.worker.backup import MANIFEST
 from ground_service.worker.model import CorrelationAge, ServiceStatus
+from ground_service.worker.presence import Process, all_disagreements, running_processes
 from ground_service.worker.scheduler import LEASE
 from ground_service.worker.store import WorkCounts, count_work, newest_correlations, vehicles_received
 from lunar.timescales import parse_utc
@@ -24,6 +25,8 @@ DISK_FREE_LIMIT = 0.1
 BACKUP_AGE_LIMIT_S = 93_600.0
 CORRELATION_AGE_LIMIT_S = 172_800.0
 """Limits above (share of free disk: below) which somebody has to act, as in deploy/prometheus/linna.rules.yml."""
+
+BROKER_S = 1.0
 
 FLIGHT = "flight"
 """Instance of a spacecraft whose time correlation has to be kept; others are simulations and replays."""
@@ -41,14 +44,24 @@ class Condition:
     backup_age_s: float | None
     correlation_ages_s: dict[tuple[int, str], float]
     scheduler: str | None
+    broker: bool | None = None
+    """Whether the broker answers; None: jobs run in the service."""
+    processes: dict[str, int] = field(default_factory=dict)
+    """Running processes by kind; empty with SQLite."""
+    disagreements: tuple[str, ...] = ()
+    runner: bool | None = None
+    """Whether a worker sees a runner; None: no worker has an exchange folder."""
     backup_missing: bool = False
     """A folder of backups is set, and no complete backup is in it."""
     uncorrelated: tuple[int, ...] = ()
     """Flown spacecraft with received telemetry and without any time correlation."""
 
 
-def read_condition(ground: Ground, backups: Path | None) -> Condition:
+def read_condition(ground: Ground, backups: Path | None, broker_url: str | None = None) -> Condition:
     """Return the condition of a deployment; the age of its newest backup is unknown without a folder of backups."""
+    processes: list[Process] = []
+    if ground.database.dialect == "postgresql":
+        processes = running_processes(ground.database)
     with ground.database.reading() as connection:
         counts = count_work(connection)
         correlations = newest_correlations(connection)
@@ -70,9 +83,35 @@ def read_condition(ground: Ground, backups: Path | None) -> Condition:
         None if newest is None else age_s(newest),
         {vehicle: age_s(utc_ns) for vehicle, utc_ns in correlations.items()},
         scheduler,
+        broker=None if broker_url is None else broker_answers(broker_url),
+        processes=_kinds(processes, broker_url),
+        disagreements=tuple(all_disagreements(processes)),
+        runner=_runner(processes),
         backup_missing=backups is not None and newest is None,
         uncorrelated=tuple(one for one in received if (one, FLIGHT) not in correlations),
     )
+
+
+def broker_answers(url: str) -> bool:
+    """Return whether a Redis broker answers."""
+    import redis
+
+    try:
+        with redis.Redis.from_url(url, socket_timeout=BROKER_S, socket_connect_timeout=BROKER_S) as client:
+            return bool(client.ping())
+    except (redis.exceptions.RedisError, OSError):
+        return False
+
+
+def _kinds(processes: list[Process], broker_url: str | None) -> dict[str, int]:
+    """Return the number of processes by kind; 0 for workers that a broker needs."""
+    counts = Counter(one.kind for one in processes)
+    return dict(counts) if broker_url is None or not processes else {"worker": 0, **counts}
+
+
+def _runner(processes: list[Process]) -> bool | None:
+    words = {one.statement.runner for one in processes if one.statement is not None} - {"-"}
+    return "yes" in words if words else None
 
 
 def complaints(found: Condition) -> list[str]:
@@ -80,6 +119,14 @@ def complaints(found: Condition) -> list[str]:
     said = []
     if found.scheduler is None:
         said.append("No process does the recurring work.")
+    if found.broker is False:
+        said.append("The broker does not answer.")
+    if found.processes.get("worker") == 0:
+        said.append("No worker does jobs.")
+    if found.runner is False:
+        said.append("No runner of payload builds responds.")
+    if found.disagreements:
+        said.append(f"Processes disagree: {'; '.join(found.disagreements)}.")
     if found.queue_age_s > QUEUE_AGE_LIMIT_S:
         said.append(f"A job has waited for {found.queue_age_s:.0f} s.")
     if found.ingest_lag_s > INGEST_LAG_LIMIT_S:
@@ -97,9 +144,9 @@ def complaints(found: Condition) -> list[str]:
     return said
 
 
-def service_status(ground: Ground, backups: Path | None) -> ServiceStatus:
+def service_status(ground: Ground, backups: Path | None, broker_url: str | None = None) -> ServiceStatus:
     """Return the condition of the deployment for pages and programs."""
-    found = read_condition(ground, backups)
+    found = read_condition(ground, backups, broker_url)
     jobs: Counter[str] = Counter()
     for (_, state), count in found.counts.jobs.items():
         jobs[state] += count
@@ -114,6 +161,7 @@ def service_status(ground: Ground, backups: Path | None) -> ServiceStatus:
         disk_octets=found.disk_size,
         backup_age_s=found.backup_age_s,
         scheduler=found.scheduler,
+        processes=found.processes,
         correlations=[
             CorrelationAge(spacecraft_id=number, instance=instance, age_s=age_s)
             for (number, instance), age_s in sorted(found.correlation_ages_s.items())

@@ -35,11 +35,13 @@ class Metrics:
     ----------
     backups
         Folder of backups; None: their age is unknown and not stated.
+    broker_url
+        Broker; None: jobs run in this process.
     """
 
-    def __init__(self, backups: Path | None = None) -> None:
+    def __init__(self, backups: Path | None = None, broker_url: str | None = None) -> None:
         self._registry = CollectorRegistry()
-        self._backups = backups
+        self._backups, self._broker_url = backups, broker_url
         self.requests = Counter(
             "linna_http_requests", "Requests answered", ("method", "route", "status"), registry=self._registry
         )
@@ -67,7 +69,15 @@ class Metrics:
         self._correlation = self._gauge(
             "linna_time_correlation_age_seconds",
             "Time since the newest time correlation was made",
-            ("spacecraft_id", "instance"),
+            # Prometheus has its own label `instance`, and would rename one of the metric.
+            ("spacecraft_id", "spacecraft_instance"),
+        )
+        # With labels, so that they have no sample where they do not apply.
+        self._broker = self._gauge("linna_broker_up", "Whether the broker answers: 1 or 0", ("kind",))
+        self._runner = self._gauge("linna_runner_up", "Whether a worker sees a runner: 1 or 0", ("kind",))
+        self._processes = self._gauge("linna_processes", "Running processes of the deployment", ("kind",))
+        self._disagreements = self._gauge(
+            "linna_disagreements", "Settings and folders in which processes differ"
         )
 
     def _gauge(self, name: str, text: str, labels: tuple[str, ...] = ()) -> Gauge:
@@ -75,11 +85,19 @@ class Metrics:
 
     def answer(self, ground: Ground) -> Response:
         """All figures, those of the work read from the database now."""
-        now = read_condition(ground, self._backups)
+        now = read_condition(ground, self._backups, self._broker_url)
         counts = now.counts
         # A state that nothing is in any more has no row, and must not keep its last count.
-        for gauge in (self._jobs, self._ingests, self._backup, self._correlation):
+        labelled = (self._jobs, self._ingests, self._backup, self._correlation, self._processes)
+        for gauge in (*labelled, self._broker, self._runner):
             gauge.clear()
+        for kind, count in now.processes.items():
+            self._processes.labels(kind).set(count)
+        if now.broker is not None:
+            self._broker.labels("redis").set(float(now.broker))
+        if now.runner is not None:
+            self._runner.labels("exchange").set(float(now.runner))
+        self._disagreements.set(len(now.disagreements))
         self._queue_age.set(now.queue_age_s)
         self._lag.set(now.ingest_lag_s)
         self._free.set(now.disk_free)

@@ -35,4 +35,7 @@ class ServiceStatus(Entity):
     disk_octets: int
     backup_age_s: float | None = Field(description="Age of the newest backup, s; null: unknown")
     scheduler: str | None = Field(description="Process that does the recurring work; null: none")
+    processes: dict[str, int] = Field(
+        description="Running processes by kind; empty: the service is one process", examples=[{"api": 2}]
+    )
     correlations: list[CorrelationAge]

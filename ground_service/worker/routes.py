@@ -15,7 +15,7 @@ operations = APIRouter(include_in_schema=False)
 
 @operations.get("/healthz")
 async def healthz() -> Health:
-    """Report that the process is alive; `front` answers this if it is the first request of a connection."""
+    """Report that the process is alive."""
     return Health(status="ok")
 
 

@@ -16,4 +16,4 @@ status = operations("status")
 @status.get("/status")
 def get_status(request: Request, ground: GroundOf, _: Viewer) -> ServiceStatus:
     """Show the condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""
-    return service_status(ground, request.app.state.backups)
+    return service_status(ground, request.app.state.backups, request.app.state.broker)

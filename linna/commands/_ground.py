@@ -115,4 +115,5 @@ def open_ground_only(arguments: argparse.Namespace) -> Ground:
         database_url=settings.resolved_database_url(),
         runner=settings.runner_exchange,
         objects=objects_of(settings),
+        networks=settings.notify_networks,
     )

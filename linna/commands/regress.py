@@ -148,16 +148,14 @@ def _sandbox(arguments: argparse.Namespace) -> int:
         )
     else:
         told, refusal = f"builds are isolated by: {here.isolation}", here.refusal
-    lines = [f"builds are refused: {refusal}; remedy: {REMEDY}" if refusal else told]
-    lines += [f"  {'in force' if held else 'NOT in force'}: {name}" for name, held in here.checks.items()]
+    text = f"builds are refused: {refusal}; remedy: {REMEDY}" if refusal else told
     figures = {
         "confined": not refusal,
         "isolation": here.isolation,
         "refusal": refusal,
         "runner": str(exchange) if exchange else None,
-        "checks": dict(here.checks),
     }
-    emit(arguments, figures, text="\n".join(lines))
+    emit(arguments, figures, text=text)
     return 1 if refusal else 0
 
 

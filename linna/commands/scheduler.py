@@ -28,6 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ground_service.logs import logging_config
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
+    from ground_service.worker.presence import present
     from ground_service.worker.scheduler import Scheduler, has_scheduler
     from linna.data import data_folder
 
@@ -49,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
                 settings.kept,
                 plan_hourly=settings.plan_hourly,
             )
-            scheduler.run(stopping, first_s=0.0)
+            with present(ground, settings, "scheduler"):
+                scheduler.run(stopping, first_s=0.0)
         finally:
             dispatcher.close()
     return 0

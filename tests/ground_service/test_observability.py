@@ -71,7 +71,15 @@ def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> di
         add_correlation(ground, vehicle, utc_now_ns())
         backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
     settings = Settings(home=folder / "home", backups=folder / "backups")
-    with TestClient(create_app(settings, inline_jobs=True)) as client:
+
+    def distributed(*given: Any) -> condition.Condition:
+        return replace(read_condition(*given), broker=True, runner=True, processes={"worker": 2})
+
+    with (
+        pytest.MonkeyPatch.context() as patched,
+        TestClient(create_app(settings, inline_jobs=True)) as client,
+    ):
+        patched.setattr("ground_service.worker.metrics.read_condition", distributed)
         client.get("/api/v1/passes")
         text = client.get("/metrics").text
     return {
@@ -154,6 +162,13 @@ GOOD = condition.Condition(WorkCounts({}, {}, 0, None, None), 0.0, 0.0, 50, 100,
     ("change", "said"),
     [
         ({"scheduler": None}, "No process does the recurring work."),
+        ({"broker": False}, "The broker does not answer."),
+        ({"processes": {"api": 2, "worker": 0}}, "No worker does jobs."),
+        ({"runner": False}, "No runner of payload builds responds."),
+        (
+            {"disagreements": ("api b: other files than api a",)},
+            "Processes disagree: api b: other files than api a.",
+        ),
         ({"queue_age_s": 901.0}, "A job has waited for 901 s."),
         ({"ingest_lag_s": 601.0}, "An ingest has been unfinished for 601 s."),
         ({"disk_free": 9}, "9% of the disk of the archive are free."),
@@ -173,24 +188,62 @@ def test_the_status_names_what_has_to_be_looked_after(change: dict[str, Any], sa
     assert condition.complaints(replace(GOOD, **at_the_limit)) == []
 
 
-FIRING = {
-    "LinnaDown": ('up{job="linna"}', "1x5 0x20", "20m"),
-    "LinnaBackupOld": ("linna_backup_age_seconds", "90000+60x200", "180m"),
-    "LinnaCertificateExpires": (
-        'probe_ssl_earliest_cert_expiry{job="linna-proxy"}',
-        f"{13 * 86_400}x200",
+FAILED = 'linna_jobs{state="failed",kind="report"}'
+CORRELATION = 'linna_time_correlation_age_seconds{spacecraft_id="76",spacecraft_instance="flight"}'
+GET = 'linna_http_request_seconds_bucket{method="GET"'
+
+FIRING: dict[str, tuple[dict[str, str], str, str]] = {
+    "LinnaDown": ({'up{job="linna"}': "1x5 0x20 1x200"}, "20m", "40m"),
+    "LinnaApiLost": (
+        {'up{job="linna"}': "1x200", 'up{job="linna",instance="b"}': "1x5 0x20 1x200"},
+        "20m",
+        "40m",
+    ),
+    "LinnaNoWorker": ({'linna_processes{kind="worker"}': "2x5 0x20 2x200"}, "12m", "40m"),
+    "LinnaProcessLost": ({'linna_processes{kind="worker"}': "2x5 1x40 2x200"}, "30m", "60m"),
+    "LinnaNoRunner": ({'linna_runner_up{kind="exchange"}': "1x5 0x20 1x200"}, "20m", "40m"),
+    "LinnaBrokerDown": ({'linna_broker_up{kind="redis"}': "1x5 0x20 1x200"}, "20m", "40m"),
+    "LinnaDisagreement": ({"linna_disagreements": "0x5 1x20 0x200"}, "20m", "40m"),
+    "LinnaNoScheduler": ({"linna_scheduler": "1x5 0x20 1x200"}, "20m", "40m"),
+    "LinnaQueueOld": ({"linna_queue_age_seconds": "0+60x40 0x200"}, "40m", "60m"),
+    "LinnaIngestLag": ({"linna_ingest_lag_seconds": "0+60x40 0x200"}, "40m", "60m"),
+    "LinnaJobsFailed": ({FAILED: "0x20 1x200"}, "40m", "120m"),
+    "LinnaErrors": (
+        {
+            'linna_http_requests_total{status="200"}': "0+100x300",
+            'linna_http_requests_total{status="500"}': "0+5x40 200x200",
+        },
+        "30m",
+        "60m",
+    ),
+    "LinnaSlow": (
+        {
+            f'{GET},le="0.5"}}': "0+1x60 60+100x200",
+            f'{GET},le="1.0"}}': "0+100x60 6000+100x200",
+            f'{GET},le="+Inf"}}': "0+100x60 6000+100x200",
+        },
+        "40m",
         "120m",
     ),
-    "LinnaNoScheduler": ("linna_scheduler", "1x5 0x20", "20m"),
-    "LinnaQueueOld": ("linna_queue_age_seconds", "0+60x40", "40m"),
-    "LinnaIngestLag": ("linna_ingest_lag_seconds", "0+60x40", "40m"),
-    "LinnaJobsFailed": ('linna_jobs{state="failed",kind="report"}', "0x20 1x20", "40m"),
+    "LinnaDiskFull": ({"linna_disk_free_bytes": "50x5 9x20 50x200"}, "20m", "40m"),
+    "LinnaBackupOld": ({"linna_backup_age_seconds": "90000+60x200 60x200"}, "180m", "240m"),
     "LinnaTimeCorrelationOld": (
-        'linna_time_correlation_age_seconds{spacecraft_id="76",instance="flight"}',
-        "172000+60x120",
+        {f"{CORRELATION}": "172000+60x120 0x200"},
         "120m",
+        "160m",
+    ),
+    "LinnaCertificateExpires": (
+        {'probe_ssl_earliest_cert_expiry{job="linna-proxy"}': f"{13 * 86_400}x120 {90 * 86_400}x200"},
+        "120m",
+        "160m",
     ),
 }
+"""Alerts with the series that let them fire, and times at which they fire and have cleared."""
+
+
+def test_prometheus_renames_no_label_of_a_metric(samples: dict[str, set[str]]) -> None:
+    """Its own labels `job` and `instance` replace those of a metric, so that a rule with them never fires."""
+    assert not any({"job", "instance"} & labels for labels in samples.values())
 
 
 def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts() -> None:
@@ -227,6 +280,7 @@ def replicas_test(healthy: list[dict[str, str]]) -> dict[str, Any]:
         "input_series": [*others, *added],
         "promql_expr_test": [
             expectation('count(ALERTS{alertname="LinnaDown"}) or vector(0)', "20m", "{}", 0),
+            expectation('count(ALERTS{alertstate="firing",alertname="LinnaApiLost"})', "20m", "{}", 1),
             expectation(f"count({failed})", "70m", "{}", 1),
             expectation(f"round({rule})", "70m", '{kind="report", state="failed"}', 1),
             expectation(f"count({failed}) or vector(0)", "150m", "{}", 0),
@@ -261,6 +315,10 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
         {"series": "linna_backup_configured", "values": "1x200"},
         {"series": 'probe_ssl_earliest_cert_expiry{job="linna-proxy"}', "values": f"{15 * 86_400}x200"},
         {"series": "linna_queue_age_seconds", "values": "30x200"},
+        {"series": 'linna_processes{kind="worker"}', "values": "2x200"},
+        {"series": 'linna_broker_up{kind="redis"}', "values": "1x200"},
+        {"series": 'linna_runner_up{kind="exchange"}', "values": "1x200"},
+        {"series": "linna_disagreements", "values": "0x200"},
         {"series": "linna_disk_free_bytes", "values": "50x200"},
         {"series": "linna_disk_size_bytes", "values": "100x200"},
         {"series": 'linna_jobs{state="failed",kind="report"}', "values": "2x200"},
@@ -276,19 +334,18 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
             ],
         }
     ]  # fmt: skip
-    for name, (series, values, at) in FIRING.items():
-        assert name in names
-        others = [one for one in healthy if one["series"] != series]
+    assert set(FIRING) == set(names)
+    for name, (series, fires, clears) in FIRING.items():
+        others = [one for one in healthy if one["series"] not in series]
+        firing = f'count(ALERTS{{alertstate="firing",alertname="{name}"}}) or vector(0)'
         tests.append(
             {
                 "interval": "1m",
-                "input_series": [*others, {"series": series, "values": values}],
+                "input_series": [*others, *({"series": key, "values": one} for key, one in series.items())],
                 "promql_expr_test": [
-                    {
-                        "expr": f'count by (alertname) (ALERTS{{alertstate="firing",alertname=~"{name}"}})',
-                        "eval_time": at,
-                        "exp_samples": [{"labels": f'{{alertname="{name}"}}', "value": 1}],
-                    }
+                    expectation(firing, "1m", "{}", 0),
+                    expectation(firing, fires, "{}", 1),
+                    expectation(firing, clears, "{}", 0),
                 ],
             }
         )

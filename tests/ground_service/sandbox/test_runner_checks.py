@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from ground_service.regression import runner
-from ground_service.sandbox import kernel, launcher
+from ground_service.sandbox import host, kernel, launcher
 from ground_service.sandbox.host import SandboxRefused
 from ground_service.sandbox.runner_checks import build_remains
 from tests.serving import wait_for
@@ -32,6 +32,13 @@ def shared(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         folder.chmod(0o1777)
         monkeypatch.setattr(launcher, "WORLD_WRITABLE", (name,))
         yield folder
+
+
+def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    host.protection.cache_clear()
+    monkeypatch.setattr(host, "execute", lambda run: {"exit_status": 1, "isolation": "namespaces"})
+    assert host.protection().refusal == "Python does not run in the sandbox: no text, exit status 1"
+    host.protection.cache_clear()
 
 
 def test_files_in_a_folder_without_permissions_are_removed(shared: Path) -> None:

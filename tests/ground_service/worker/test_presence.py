@@ -1,0 +1,185 @@
+"""Processes of a deployment compare what they work with, and `linna doctor` names what is wrong."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.errors import ServerError
+from ground_service.ground import Ground, ground_from_settings
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
+from ground_service.settings import Settings
+from ground_service.store import leases
+from ground_service.store.stored_files import file_names
+from ground_service.worker import presence
+from ground_service.worker.condition import complaints, read_condition
+from ground_service.worker.doctor import examine
+from ground_service.worker.presence import all_disagreements, present, running_processes, statement_of
+from linna import cli
+from tests.ground_service.access.openid import running_provider
+
+
+@pytest.fixture
+def settings(tmp_path: Path, migrated_postgres: Callable[[], str]) -> Settings:
+    return Settings(home=tmp_path / "home", database_url=migrated_postgres(), allow_database_owner=True)
+
+
+@pytest.fixture
+def opened(settings: Settings) -> Iterator[Ground]:
+    with ground_from_settings(settings) as ground:
+        yield ground
+
+
+def test_a_process_is_known_while_it_runs(
+    opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(presence, "BEAT_S", 0.05)
+    assert running_processes(opened.database) == []
+    with present(opened, settings, "worker"):
+        [one] = running_processes(opened.database)
+        assert one.kind == "worker" and one.statement is not None
+        assert replace(one.statement, clock_ms=0) == statement_of(opened, settings)
+        assert abs(one.statement.clock_ms) < presence.CLOCK_LIMIT_MS
+        assert read_condition(opened, None).processes == {"worker": 1}
+        with opened.database.writing() as connection:  # of a process that was killed
+            leases.state(connection, f"{presence.PREFIX}api gone:1", one.statement.text(), 0)
+        time.sleep(0.2)
+        assert running_processes(opened.database) == [one]
+    assert running_processes(opened.database) == []
+    assert complaints(read_condition(opened, None, "redis://127.0.0.1:1/0"))[:2] == [
+        "No process does the recurring work.",
+        "The broker does not answer.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "group"),
+    [
+        ({"objects": "s3://linna/operations"}, "files"),
+        ({"broker_url": "redis://elsewhere:6379/0"}, "broker"),
+        ({"oidc_issuer": "https://login.example", "oidc_client_id": "linna"}, "provider"),
+        ({"retention_days": 7}, "settings"),
+    ],
+)
+def test_a_start_with_disagreeing_peers_fails(
+    opened: Ground, settings: Settings, change: dict[str, Any], group: str
+) -> None:
+    """An upload acknowledged by one process must not be invisible to the other."""
+    other = Settings(**{**settings.model_dump(), **change})
+    with present(opened, settings, "api"):
+        with present(opened, settings.model_copy(update={"port": 9, "host": "0.0.0.0"}), "worker"):
+            pass  # what one process has for itself
+        refused = pytest.raises(ServerError, match=f"expected the same .*: other {group} than here")
+        with refused, present(opened, other, "worker"):
+            raise AssertionError
+        assert len(running_processes(opened.database)) == 1
+
+
+def test_another_home_folder_and_other_data_are_noticed(
+    opened: Ground, settings: Settings, tmp_path: Path
+) -> None:
+    mine = statement_of(opened, settings)
+    (tmp_path / "elsewhere").mkdir()
+    other = replace(opened, home=tmp_path / "elsewhere")
+    assert [a == b for a, b in zip(mine.digests, statement_of(other, settings).digests, strict=True)] == [
+        group != "files" for group in presence.GROUPS
+    ]
+    processes = [
+        presence.Process("api", "a:1", mine),
+        presence.Process("worker", "b:2", statement_of(other, settings)),
+        presence.Process("worker", "c:3", None),
+    ]
+    assert all_disagreements(processes) == ["worker b:2: other files than api a:1"]
+
+
+def faults(ground: Ground, settings: Settings) -> dict[str, str]:
+    return {one.name: one.found for one in examine(ground, settings) if not one.ok}
+
+
+def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
+    opened: Ground, settings: Settings, redis_url: str, synthetic_pass: Any, tmp_path: Path
+) -> None:
+    with_broker = settings.model_copy(update={"broker_url": None})
+    given = Settings(
+        **{**with_broker.model_dump(), "broker_url": redis_url, "database_url": settings.database_url}
+    )
+    ingest_file(opened, synthetic_pass.folder / "downlink.cadu")
+    with opened.database.writing() as connection:
+        leases.acquire(connection, "scheduler", "somebody", 60_000_000_000)
+    with ExitStack() as running:
+        for kind in ("api", "worker"):
+            running.enter_context(present(opened, given, kind))
+        assert faults(opened, given) == {}
+        names = {one.name for one in examine(opened, given)}
+        assert names == {*("schema", "processes", "clocks", "recurring work", "broker", "archive", "files")}
+
+        # 1. A file that a row names is missing, another one cannot be read.
+        with opened.database.reading() as connection:
+            [sha256] = file_names(connection)
+        place = opened.files.place(sha256)
+        place.rename(tmp_path / "moved")
+        assert faults(opened, given) == {"files": f"{sha256[:16]}: expected the file, found none"}
+        (tmp_path / "moved").rename(place)
+
+        # 2. This process has another broker, which does not answer.
+        away = Settings(**{**given.model_dump(), "broker_url": "redis://127.0.0.1:1/0"})
+        found = faults(opened, away)
+        assert set(found) == {"processes", "broker"} and "other broker than here" in found["processes"]
+
+        # 3. The provider is down.
+        with running_provider() as provider:
+            oidc = {
+                "oidc_issuer": provider.issuer,
+                "oidc_client_id": "linna",
+                "oidc_roles": ("admin=a",),
+            }
+            signed = given.model_copy(update=oidc)
+            assert "provider" not in faults(opened, signed)
+        assert "provider" in faults(opened, signed)
+
+        # 4. A clock is wrong, and a worker sees no runner.
+        [api, _] = running_processes(opened.database)
+        assert api.statement is not None
+        with opened.database.writing() as connection:
+            late = replace(api.statement, clock_ms=90_000, runner="no")
+            leases.state(connection, f"{presence.PREFIX}worker late:1", late.text(), 60_000_000_000)
+        found = faults(opened, given)
+        assert found["clocks"] == "worker late:1: expected within 2000 ms of the database, found 90000 ms"
+        assert "expected a runner" in found["processes"]
+        with opened.database.writing() as connection:
+            leases.remove(connection, f"{presence.PREFIX}worker late:1")
+
+        # 5. A channel leads to an address that is not permitted.
+        text = 'name = "m"\n[spacecraft]\nid = 76\n[automation.channels.people]\nemail = ["a@b.example"]\n'
+        add_mission(opened, text.encode())
+        assert (
+            "channel people of spacecraft 76: localhost: expected a public address"
+            in (faults(opened, given)["notifications"])
+        )
+    found = faults(opened, given)
+    assert "expected a running api, found none; expected a running worker" in found["processes"]
+
+
+def test_the_command_has_an_exit_status_and_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
+    assert cli.run(["doctor", "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"] == "broken"
+    assert [one["name"] for one in told["checks"] if not one["ok"]] == ["recurring work"]
+
+
+def test_the_statement_fits_into_its_column() -> None:
+    digests = tuple("f" * presence.DIGITS for _ in presence.GROUPS)
+    text = presence.Statement("10.10.10.dev1000", digests, -86_400_000, "yes").text()
+    assert len(text) <= 96 and presence.Statement.of_text(text).digests == digests
+    assert presence.Statement.of_text("1.0 aa bb 0 -") is None
