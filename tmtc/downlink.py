@@ -19,17 +19,14 @@ from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import UnknownCoding, ValueRefused
-from tmtc.frame_reading import proof_of, read_frames
+from tmtc.frame_reading import Frames, proof_of, read_frames
 from tmtc.frames import (
     FRAME_HEADER_LENGTH,
     IDLE_CHANNEL,
     NO_PACKET_BEGINS,
     OCF_LENGTH,
     ONLY_IDLE_DATA,
-    TmFrameHeaders,
     append_frame_checksums,
-    frame_checksums_hold,
-    frame_headers,
     idle_data,
 )
 from tmtc.link import Coding, LinkSettings
@@ -450,43 +447,38 @@ def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: boo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Section:
-    """Frames (n, frame_length) of one section; `offset` (n,) in the whole stream."""
+    """Frames (n,) of one section; `offset` (n,) in the whole stream."""
 
     settings: LinkSettings
     offset: IntArray
     marker_errors: IntArray
     truncated: int
-    frames: OctetArray
-    corrected: npt.NDArray[np.int16]
-    header: TmFrameHeaders
-    verdict: npt.NDArray[np.int8]
+    found: Frames
+
+    @property
+    def verdict(self) -> npt.NDArray[np.int8]:
+        """Index of `FRAME_VERDICTS` (n,), by code and checksum."""
+        verdict = np.full(len(self.offset), FRAME_GOOD, dtype=np.int8)
+        verdict[~self.found.valid] = FRAME_BAD_CHECKSUM
+        verdict[(self.found.corrected < 0).any(axis=1)] = FRAME_UNCORRECTABLE
+        return verdict
 
 
 def _read_section(part: OctetArray, sync: cadu.CaduSync, section: LinkSection) -> _Section:
     """Return the frames of a section from its octets and their synchronisation."""
-    settings = section.settings
-    frames, corrected = read_frames(part, sync, settings)
-    verdict = np.full(frames.shape[0], FRAME_GOOD, dtype=np.int8)
-    verdict[(corrected < 0).any(axis=1)] = FRAME_UNCORRECTABLE
-    if settings.checksum:
-        usable = np.flatnonzero(verdict == FRAME_GOOD)
-        verdict[usable[~frame_checksums_hold(frames[usable])]] = FRAME_BAD_CHECKSUM
     return _Section(
-        settings,
+        section.settings,
         sync.offsets + section.start,
         sync.marker_errors,
         int(sync.truncated.size),
-        frames,
-        corrected,
-        frame_headers(frames),
-        verdict,
+        read_frames(part, sync, section.settings),
     )
 
 
 def _commonest_spacecraft(sections: Sequence[_Section]) -> int | None:
     ids = np.concatenate(
         [
-            one.header.spacecraft_id[(one.verdict == FRAME_GOOD) & (one.header.version == 0)]
+            one.found.header.spacecraft_id[one.found.valid & (one.found.header.version == 0)]
             for one in sections
         ]
     )
@@ -509,8 +501,8 @@ class _Filling:
 
     def add(self, section: _Section, spacecraft_id: int | None, depth: int, error_control: bool) -> None:
         """Add the packet octets of a section; `depth` is the largest interleaving depth of all sections."""
-        settings, frames, header = section.settings, section.frames, section.header
-        verdict = section.verdict.copy()
+        settings, frames, header = section.settings, section.found.octets, section.found.header
+        verdict = section.verdict
         foreign = (header.version != 0) | (header.spacecraft_id != spacecraft_id)
         verdict[(verdict == FRAME_GOOD) & foreign] = FRAME_FOREIGN
         good = verdict == FRAME_GOOD
@@ -552,7 +544,7 @@ class _Filling:
         self.overhead += n_good * settings.cadu_length - zone_octets
         self.bad += (frames.shape[0] - n_good) * settings.cadu_length
         corrected = np.zeros((frames.shape[0], depth), dtype=np.int16)
-        corrected[:, : section.corrected.shape[1]] = section.corrected
+        corrected[:, : section.found.corrected.shape[1]] = section.found.corrected
         self.tables.append(
             FrameTable(
                 offset=section.offset,
@@ -591,7 +583,7 @@ def _frames_to_packets(
     if spacecraft_id is None:
         spacecraft_id = _commonest_spacecraft(sections)
     filling = _Filling()
-    depth = max(one.corrected.shape[1] for one in sections)
+    depth = max(one.found.corrected.shape[1] for one in sections)
     for section in sections:
         filling.add(section, spacecraft_id, depth, error_control)
     parts, segments = filling.parts, filling.segments

@@ -1,27 +1,43 @@
-"""Frames of synchronised CADUs: de-randomised and corrected."""
+"""Frames of synchronised CADUs: de-randomised, corrected and checked."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
-from tmtc.arrays import BoolArray, OctetArray
-from tmtc.frames import frame_checksums_hold
+from tmtc.arrays import BoolArray, IntArray, OctetArray
+from tmtc.frames import TmFrameHeaders, frame_checksums_hold, frame_headers
 from tmtc.link import LinkSettings
 from tmtc.randomiser import randomise
 
 _BATCH = 512
 
 
-def read_frames(
-    stream: OctetArray, sync: cadu.CaduSync, settings: LinkSettings
-) -> tuple[OctetArray, npt.NDArray[np.int16]]:
-    """Return frames (n, frame_length) and corrected symbols (n, interleave), -1 where a codeword is lost."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """Frames (n, frame_length) of CADUs, and their headers.
+
+    `corrected` (n, interleave): corrected symbols of each codeword, -1 where it is lost. `wrong_bits` (n,): corrected
+    bits. `valid` (n,): codes and checksum are valid; True for frames that have neither.
+    """
+
+    octets: OctetArray
+    header: TmFrameHeaders
+    corrected: npt.NDArray[np.int16]
+    wrong_bits: IntArray
+    valid: BoolArray
+
+
+def read_frames(stream: OctetArray, sync: cadu.CaduSync, settings: LinkSettings) -> Frames:
+    """Return the frames of synchronised CADUs of a stream."""
     code = settings.code
     n = sync.start_bits.size
     frames = np.empty((n, settings.frame_length), dtype=np.uint8)
     corrected = np.zeros((n, code.interleave if code else 1), dtype=np.int16)
+    wrong_bits = np.zeros(n, dtype=np.int64)
     for first in range(0, n, _BATCH):
         part = slice(first, min(first + _BATCH, n))
         cadus = cadu.cadu_octets(stream, sync.take(np.arange(part.start, part.stop)))
@@ -31,17 +47,16 @@ def read_frames(
         else:
             repaired = reed_solomon.decode(blocks, code)
             frames[part], corrected[part] = repaired.frames, repaired.corrected
-    return frames, corrected
+            wrong_bits[part] = repaired.wrong_bits
+    valid: BoolArray = np.all(corrected >= 0, axis=1)
+    if settings.checksum and n:
+        usable = np.flatnonzero(valid)
+        valid[usable[~frame_checksums_hold(frames[usable])]] = False
+    return Frames(frames, frame_headers(frames), corrected, wrong_bits, valid)
 
 
 def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:
     """Return a function that checks the code or checksum of CADUs; None if frames have neither."""
     if not settings.proves_frames:
         return None
-
-    def proves(sync: cadu.CaduSync) -> BoolArray:
-        frames, corrected = read_frames(stream, sync, settings)
-        repaired: BoolArray = np.all(corrected >= 0, axis=1)
-        return repaired & frame_checksums_hold(frames) if settings.checksum else repaired
-
-    return proves
+    return lambda sync: read_frames(stream, sync, settings).valid

@@ -92,6 +92,7 @@ def cut_packets(
     final: bool = True,
     error_control: bool = True,
     unchecked_apids: Collection[int] = (),
+    begins: bool = True,
 ) -> PacketCut:
     """Where packets stand in `buffer`.
 
@@ -109,6 +110,8 @@ def cut_packets(
     unchecked_apids
         APIDs whose packets do not end with a checksum, in a stream of others that do. Such a packet is accepted if
         another one, or the end of its segment, follows it.
+    begins
+        Whether a packet is expected at the beginning of each segment, for packets without error control.
     """
     if not error_control and not final:
         raise ValueRefused("packet stream", "final", final, "true for packets without error control")
@@ -119,7 +122,7 @@ def cut_packets(
     consumed = 0
     cutter: _Cutter | _UncheckedCutter
     if not error_control:
-        cutter = _UncheckedCutter(octets, packet_type)
+        cutter = _UncheckedCutter(octets, packet_type, begins)
     elif unchecked_apids:
         cutter = _MixedCutter(octets, packet_type, unchecked_apids)
     else:
@@ -308,10 +311,11 @@ class _MixedCutter(_Cutter):
 class _UncheckedCutter:
     """One pass over packets without error control: walk over headers, search where they end."""
 
-    def __init__(self, octets: OctetArray, packet_type: int) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int, begins: bool) -> None:
         from tmtc import _cutting
 
         self.kernels: Any = _cutting
+        self.begins = begins
         self.octets = octets
         self.packet_type = packet_type
         self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
@@ -322,7 +326,7 @@ class _UncheckedCutter:
         """Cut [start, stop), where a packet is expected at `start`."""
         kernels, key = self.kernels, (stop, self.packet_type)
         p = start
-        if p < stop and not kernels.proves(self.octets, p, *key, self.last, True):
+        if p < stop and not kernels.proves(self.octets, p, *key, self.last, self.begins):
             p = self.skip(p, *key)
         while p < stop:
             before = self.count

@@ -34,7 +34,7 @@ class ReceivedSection(Entity):
 
 
 class ReceivedLink(Entity):
-    """Link quality of one file, see `ingest.quality.LinkQuality`; null: unknown."""
+    """Link quality of one piece, see `ingest.quality.Found`; null: unknown."""
 
     station: str = Field(description="Empty: not stated", examples=["madrid"])
     ambiguous: bool = Field(description="Other link settings have equal support")
@@ -78,7 +78,7 @@ class ReceivedControlWords(Entity):
 
 
 class IngestResult(Entity):
-    """Content of an ingested file, and the new part of it.
+    """Content of an ingested piece of a recording with what it completes, and the new part of it.
 
     `first_ticks` and `last_ticks` are the earliest and the latest on-board time of the complete packets in the file.
     """
@@ -86,17 +86,20 @@ class IngestResult(Entity):
     ingest_id: int
     vehicle_id: int | None
     octets: int
+    octets_repeated: int = Field(default=0, description="Octets that earlier pieces of the recording have")
     packets: int
     packets_new: int = Field(description="Packets that were not in the archive")
-    packets_joined: int = Field(description="Packets completed with earlier files")
+    packets_joined: int = Field(description="New packets completed with earlier pieces or other recordings")
     packets_repeated: int
     samples: int
     crc_errors: int
     octets_skipped: int
-    octets_pending: int = Field(description="Octets that wait for the octets before or after them")
+    octets_pending: int = Field(
+        description="Octets of an incomplete frame or packet at the ends of the recording as far as received"
+    )
     frames: int
     frames_bad: int
-    frames_joined: int = Field(description="Frames completed with earlier files")
+    frames_joined: int = Field(description="Frames completed with earlier pieces")
     symbols_corrected: int
     unknown: int = Field(description="Packets without a definition")
     first_ticks: int | None = None

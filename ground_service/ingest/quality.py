@@ -1,13 +1,13 @@
-"""Link quality of a reception: frames, corrected errors, lock, and reception times."""
+"""What a piece of a recording contains: frames, corrected errors, lock, octets and reception times."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from lunar.arrays import IntArray, OctetArray
+from tmtc.clcw import UplinkSeen
 
 DAY_NS = 86_400_000_000_000
 CDS_EPOCH_DAYS = 4383
@@ -55,25 +55,41 @@ NO_RECORD = RecordFormat()
 
 
 @dataclass(slots=True)
-class LinkQuality:
-    """Counts of a reception.
+class Found:
+    """Counts of what a piece of a recording has completed: frames, packets, link quality, octets.
 
     Attributes
     ----------
+    frames_bad
+        Frames that cannot be used, truncated ones included.
+    frames_joined
+        Frames of which other pieces have a part.
+    wrong_bits, checked_bits
+        Corrected bits, and all bits, of the codewords that could be corrected and of the markers of good frames.
     lock_losses
         Frames that do not follow the previous one at the usual distance.
     frames_inverted
         Frames received with the wrong polarity.
-    wrong_bits, checked_bits
-        Corrected bits, and all bits, of the codewords that could be corrected and of the markers of good frames.
     octets_frames, octets_records
-        Octets of CADUs, and of the station's records around them.
+        Octets of the frames with their markers, and of the station's records around them.
+    octets_used
+        Octets of the piece itself in frames and records, or in packets without frames.
+    octets_unused
+        Octets of frames in no packet.
+    octets_waiting
+        Octets at the ends of the recording, as far as it is known, that may belong to an incomplete frame or packet.
     first_utc_ns, last_utc_ns
         First and last reception time of the station's records; None without.
+    uplink
+        Telecommand channels by spacecraft and number, as the frames show them.
     """
 
+    packets: int = 0
+    crc_errors: int = 0
     frames: int = 0
     frames_good: int = 0
+    frames_bad: int = 0
+    frames_joined: int = 0
     codewords: int = 0
     codewords_lost: int = 0
     symbols_corrected: int = 0
@@ -81,11 +97,14 @@ class LinkQuality:
     checked_bits: int = 0
     lock_losses: int = 0
     frames_inverted: int = 0
-    octets: int = 0
     octets_frames: int = 0
     octets_records: int = 0
+    octets_used: int = 0
+    octets_unused: int = 0
+    octets_waiting: int = 0
     first_utc_ns: int | None = None
     last_utc_ns: int | None = None
+    uplink: dict[tuple[int, int], UplinkSeen] = field(default_factory=dict)
 
     @property
     def bit_error_rate(self) -> float | None:
@@ -99,31 +118,3 @@ class LinkQuality:
             first, last = int(times_utc_ns.min()), int(times_utc_ns.max())
             self.first_utc_ns = first if self.first_utc_ns is None else min(self.first_utc_ns, first)
             self.last_utc_ns = last if self.last_utc_ns is None else max(self.last_utc_ns, last)
-
-    def add(self, later: LinkQuality) -> None:
-        """Add the counts of a later section."""
-        for name in _COUNTS:
-            setattr(self, name, getattr(self, name) + getattr(later, name))
-        times = [later.first_utc_ns, later.last_utc_ns]
-        self.add_times(np.array([one for one in times if one is not None], dtype=np.int64))
-
-    def describe(self) -> dict[str, Any]:
-        """Return the counts by name, for output."""
-        other = self.octets - self.octets_frames - self.octets_records
-        return {**asdict(self), "octets_other": other, "bit_error_rate": self.bit_error_rate}
-
-
-_COUNTS = (
-    "frames",
-    "frames_good",
-    "codewords",
-    "codewords_lost",
-    "symbols_corrected",
-    "wrong_bits",
-    "checked_bits",
-    "lock_losses",
-    "frames_inverted",
-    "octets",
-    "octets_frames",
-    "octets_records",
-)

@@ -1,120 +1,502 @@
-"""Link settings and station records that apply to a piece: stated, of the mission description, or remembered.
+"""Reading of one piece of a recording: the contiguous octets around it, their frames and packets, and their storage.
 
-The settings of a description or of earlier receptions are tried on the whole file and used where they hold. Other
-settings follow from the evidence of the file. Only settings that the sender states are used without evidence.
+The piece is entered before it is read, and pieces of a recording are entered one after another. Each piece is read with
+the octets that earlier pieces have before and behind it, so that every frame is completed by exactly one of them,
+whatever the order and whatever process reads. Packets are stored once, by content.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 
+import numpy as np
 from sqlalchemy import Connection
 
-from ground_service.access.service import audit
-from ground_service.ingest.edge_store import Piece, add_good_link, good_links
-from ground_service.ingest.quality import NO_RECORD, RecordFormat
-from ground_service.missions.model import FrameSettings, Link, StationLink
-from ground_service.missions.store import links_in_force
+from ground_service.clock import utc_now_ns
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground
+from ground_service.ingest import bare, frames, store
+from ground_service.ingest import recording_store as recordings
+from ground_service.ingest.bare import PacketReader
+from ground_service.ingest.fragments import Fragment, complete, join
+from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
+from ground_service.ingest.link_settings import known_before, remember_link
+from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
+from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
+from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
+from ground_service.ingest.quality import Found
+from ground_service.ingest.recording_store import Part, Piece
+from ground_service.ingest.redecode import catch_up, note_dictionary
+from ground_service.missions.definitions import PacketDefinitions
+from ground_service.store.files import FileArchive, mapped_octets, read_blocks
+from ground_service.store.stored_files import recorded_name
+from ground_service.store.vehicles import vehicle_id
+from lunar.arrays import OctetArray
+from tmtc.arrays import as_octets
+from tmtc.cuc import NO_TICKS
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import plan_of
+from tmtc.errors import UnknownCoding
 from tmtc.link import LinkSettings
+from tmtc.packets import PACKET_MAX_LENGTH
+from tmtc.stream import cut_packets, whole_packets
 
-STATED, MISSION, REMEMBERED, PROPOSED = "stated", "mission", "remembered", "proposed"
-ACTOR = "ingest"
+Progress = Callable[[float], None]
 
-_NAMES = {
-    "frame_length": "frame_length",
-    "coding": "coding",
-    "randomiser": "randomiser",
-    "interleave": "interleave",
-    "rs_errors": "rs_errors",
-    "dual_basis": "dual_basis",
-    "frame_checksum": "checksum",
-}
+WINDOW_OCTETS = 2 << 20
+"""Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory:
+decoding and storing take about ten times as much."""
+
+LEAST_GOOD_FRAMES = 2
+"""Smallest number of good frames from which their link settings are remembered."""
+
+CERTAIN_OCTETS = 4 * CADU_MAX_OCTETS
+"""Length of a piece from which an unknown coding is an error, and not a lack of evidence."""
+
+HINT = "pieces of one recording are ingested with its name and their offsets (--recording NAME FILE...)"
 
 
 @dataclass(frozen=True, slots=True)
-class ExpectedLink:
-    """What is known of the link of a piece before it is read.
+class Run:
+    """Contiguous octets of a recording: a piece, and what earlier pieces have before and behind it.
 
-    `stated` settings are used as they are. `mission` and `remembered` settings are tried in this order.
-    `error_control` is False if the packets of the spacecraft do not end with a checksum.
+    `new`: ranges [start, stop) of the run that are read now. `begins`, `ends`: no earlier piece has the octets before
+    or behind the run.
     """
 
-    stated: LinkSettings | None = None
-    mission: tuple[LinkSettings, ...] = ()
-    remembered: tuple[LinkSettings, ...] = ()
-    record: RecordFormat = NO_RECORD
-    error_control: bool = True
+    files: FileArchive
+    piece: Piece
+    before: tuple[Part, ...]
+    behind: tuple[Part, ...]
+    new: tuple[tuple[int, int], ...]
+    begins: bool = True
+    ends: bool = True
 
-    def source_of(self, settings: LinkSettings) -> str:
-        """Return where settings come from."""
-        same = describe(settings)
-        if self.stated is not None:
-            return STATED
-        if same in [describe(one) for one in self.mission]:
-            return MISSION
-        return REMEMBERED if same in [describe(one) for one in self.remembered] else PROPOSED
+    @property
+    def first(self) -> int:
+        """Octets before the piece."""
+        return sum(one.stop - one.start for one in self.before)
+
+    @property
+    def octets(self) -> int:
+        """Octets of the run."""
+        return sum(one.stop - one.start for one in self.parts)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """All octets of the run, as parts of files."""
+        return *self.before, Part(self.piece.file_sha256, 0, self.piece.octets), *self.behind
+
+    def whole(self) -> OctetArray:
+        """Return all octets; a memory map for a piece without others."""
+        if not self.before and not self.behind:
+            return mapped_octets(self.files.path(self.piece.file_sha256))
+        return self.read(0, self.octets)
+
+    def read(self, start: int, stop: int) -> OctetArray:
+        """Return the octets [start, stop)."""
+        return as_octets(b"".join(self._blocks(start, stop)))
+
+    def windows(self, start: int, stop: int) -> Iterator[tuple[OctetArray, bool]]:
+        """Yield the octets [start, stop) in windows, and whether each is the last one."""
+        held: list[bytes] = []
+        size = reached = 0
+        for block in self._blocks(start, stop):
+            held.append(block)
+            size, reached = size + len(block), reached + len(block)
+            if size >= WINDOW_OCTETS or reached == stop - start:
+                yield as_octets(b"".join(held)), reached == stop - start
+                held, size = [], 0
+
+    def _blocks(self, start: int, stop: int) -> Iterator[bytes]:
+        at = 0
+        for part in self.parts:
+            low, high = max(start - at, 0), min(stop - at, part.stop - part.start)
+            at += part.stop - part.start
+            if low < high:
+                path = self.files.path(part.file_sha256)
+                yield from read_blocks(path, start=part.start + low, stop=part.start + high)
 
 
-def describe(settings: LinkSettings) -> dict[str, Any]:
-    """Return settings by name; equal for settings that give equal frames."""
-    return settings.describe()
-
-
-def expected_link(connection: Connection, piece: Piece) -> ExpectedLink:
-    """Return what is known of the link of a piece."""
-    links = links_in_force(connection, piece.spacecraft_id, piece.scope)
-    found = [settings_of(link, piece.station) for link in links.values()]
-    stations = [station for link in links.values() if (station := _station(link, piece.station))]
-    remembered = [*good_links(connection, piece, piece.station), *good_links(connection, piece, None)]
-    own = links.get(piece.spacecraft_id) if piece.spacecraft_id is not None else None
-    return ExpectedLink(
-        stated=None if piece.link is None else LinkSettings.parse(piece.link).explicit,
-        mission=tuple(dict.fromkeys(one for one in found if one is not None)),
-        remembered=tuple(dict.fromkeys(remembered)),
-        record=_record(stations[0]) if stations else NO_RECORD,
-        error_control=own is None or own.packet_checksum != "none",
+def run_around(connection: Connection, files: FileArchive, piece: Piece, reach: int) -> Run:
+    """Return the octets of a recording around a piece, at most `reach` octets on each side."""
+    if not piece.stream:
+        return Run(files, piece, (), (), ((0, piece.octets),))
+    found = recordings.neighbours(connection, piece, reach)
+    run = Run(files, piece, found.before, found.behind, ())
+    shift = piece.position - run.first
+    return replace(
+        run,
+        new=tuple((start - shift, stop - shift) for start, stop in found.new),
+        begins=run.first < reach,
+        ends=run.octets - run.first - piece.octets < reach,
     )
 
 
-def settings_of(link: Link, station: str) -> LinkSettings | None:
-    """Return the settings that a description states for a station; None if coding or frame length are not stated."""
-    parts: list[FrameSettings] = [link]
-    if (special := _station(link, station)) is not None:
-        parts.append(special)
-    values: dict[str, Any] = {}
-    for part in parts:
-        stated: Mapping[str, Any] = part.model_dump(exclude_none=True)
-        values |= {_NAMES[name]: value for name, value in stated.items() if name in _NAMES}
-    if not {"frame_length", "coding"} <= values.keys():
-        return None
-    return LinkSettings(**values).explicit
+def _sections(
+    run: Run, links: Sequence[tuple[int, int, LinkSettings | None]], reach: int
+) -> Iterator[Section]:
+    """Yield the sections of a run that are read now, with the octets around them."""
+    position, stream = run.piece.position - run.first, run.piece.stream
+    for start, stop, settings in links:
+        for new in run.new:
+            first, last = max(new[0], start), min(new[1], stop)
+            if first < last:
+                low, high = max(start, first - reach), min(stop, last + reach)
+                begins, ends = run.begins and low == 0, run.ends and high == run.octets
+                yield Section(settings, low, high, first, last, begins, ends, position, stream)
 
 
-def _station(link: Link, station: str) -> StationLink | None:
-    return (link.stations or {}).get(station)
+class Reading:
+    """Reading of one piece whose ingest is entered; `progress` is called with the share that is stored."""
 
+    def __init__(self, ground: Ground, piece: Piece, progress: Progress | None = None) -> None:
+        self.ground, self.piece, self.progress = ground, piece, progress
+        with ground.database.reading() as connection:
+            self.known = known_before(connection, piece)
+        self.expected = self.known.expected
+        self.vehicles: dict[int, int] = {}
+        if piece.spacecraft_id is not None and self.known.around.vehicle_id is not None:
+            self.vehicles[piece.spacecraft_id] = self.known.around.vehicle_id
+        self.definitions: dict[int, PacketDefinitions] = {}
+        if piece.spacecraft_id is not None and self.known.definitions is not None:
+            self.definitions[piece.spacecraft_id] = self.known.definitions
+        self.found = Found()
+        self.unknown = 0
+        self.ticks: list[int] = []
+        self.sections: list[Section] = []
+        self.has_link = False
+        self.octets_new = piece.octets
+        self.ambiguous = False
+        self.is_started = False
+        self.result: IngestResult
 
-def _record(station: StationLink) -> RecordFormat:
-    return RecordFormat(
-        station.header_octets or 0,
-        station.trailer_octets or 0,
-        station.time_code,
-        station.time_offset or 0,
-    )
+    def read(self) -> None:
+        """Read the piece and store what it has completed."""
+        run = self._run()
+        readers = [self._reader(run, section) for section in self.sections]
+        held: PacketBatch | None = None
+        end = 0
+        for reader in readers:
+            reader.begin_at(end)
+            for batch in reader.batches(run.windows(reader.section.start, reader.section.stop)):
+                self.ground.check_stopping()
+                if not len(batch):
+                    continue
+                if held is not None:
+                    self._store_early(held)
+                held = batch
+            end = reader.end
+        fragments = [one for reader in readers if isinstance(reader, FrameReader) for one in reader.fragments]
+        if not self.piece.stream and not self.found.frames and not self.found.packets:
+            self._refuse("no valid frame or packet")
+        self._finish(held, fragments)
 
+    # The run and its sections
 
-def remember_link(
-    connection: Connection,
-    piece: Piece,
-    vehicles: Sequence[int],
-    settings: LinkSettings,
-    now_utc_ns: int,
-) -> None:
-    """Record settings under which frames of spacecraft were valid, if they differ from the last ones."""
-    for vehicle in vehicles:
-        if not add_good_link(connection, piece, vehicle, settings, now_utc_ns):
-            continue
-        detail = {"ingest_id": piece.ingest_id, "station": piece.station, "settings": describe(settings)}
-        audit(connection, ACTOR, "remember link settings", f"vehicle {vehicle}", detail)
+    def _run(self) -> Run:
+        """Return the run around the piece, and set the sections of it that are read."""
+        for reach in (frames.REACH_OCTETS, bare.REACH_OCTETS):
+            with self.ground.database.reading() as connection:
+                run = run_around(connection, self.ground.files, self.piece, reach)
+            self.octets_new = sum(stop - start for start, stop in run.new)
+            links = self._links(run) if run.new else []
+            self.has_link = bool(links) or not run.new
+            if any(one is not None for _, _, one in links) or not self.piece.stream or not run.new:
+                break
+        if not self.has_link:
+            links = self._links_of_recording(run)
+            self.has_link = bool(links)
+        self.sections = list(_sections(run, links, reach))
+        return run
+
+    def _links(self, run: Run) -> list[tuple[int, int, LinkSettings | None]]:
+        """Return the parts [start, stop) of a run with their link settings; none without evidence.
+
+        Raises
+        ------
+        InvalidInput
+            If the piece has frames whose coding is unknown.
+        """
+        if self.expected.stated is not None:
+            return [(0, run.octets, self.expected.stated)]
+        around = self.piece.octets <= WINDOW_OCTETS
+        octets = run.whole() if around else mapped_octets(run.files.path(self.piece.file_sha256))
+        try:
+            plan = plan_of(octets, self.expected.candidates, error_control=self.expected.error_control)
+        except UnknownCoding as error:
+            if self.piece.octets >= CERTAIN_OCTETS or not self.piece.stream:
+                self._refuse(error.found, error.expected)
+            return []
+        self.ambiguous = plan.ambiguous
+        if not plan.sections:
+            # few frames without proof look like packets
+            has_markers = plan.proposal is not None and plan.proposal.markers > 0
+            if has_markers and self.piece.stream and octets.size < CERTAIN_OCTETS:
+                return []
+            return [(0, run.octets, None)] if self._has_packets(octets) else []
+        shift = 0 if around else run.first
+        starts = [0, *(one.start + shift for one in plan.sections[1:])]
+        settings = [one.settings.explicit for one in plan.sections]
+        return list(zip(starts, [*starts[1:], run.octets], settings, strict=True))
+
+    def _links_of_recording(self, run: Run) -> list[tuple[int, int, LinkSettings | None]]:
+        """Return the link settings of other pieces of the recording, for one without evidence; none if not known."""
+        with self.ground.database.reading() as connection:
+            known = recordings.accounting_of_recording(connection, self.piece)
+        if known is None:
+            return []
+        names = {one.name for one in fields(LinkSettings)}
+        reception = IngestResult.model_validate({**known, "ingest_id": 0}).reception
+        if reception is None:
+            return [(0, run.octets, None)]
+        last = reception.sections[-1].model_dump(include=names, exclude_none=True)
+        return [(0, run.octets, LinkSettings(**last))]
+
+    def _has_packets(self, octets: OctetArray) -> bool:
+        """Return whether octets are packets without frames."""
+        unchecked = frozenset[int]()
+        if self.piece.spacecraft_id is not None:
+            unchecked = self._unchecked_apids(self.piece.spacecraft_id)
+        for start in range(0, octets.size, WINDOW_OCTETS):
+            window = octets[start : start + WINDOW_OCTETS + PACKET_MAX_LENGTH]
+            cut = cut_packets(window, error_control=self.expected.error_control, unchecked_apids=unchecked)
+            packets = int(np.count_nonzero(cut.crc_ok))
+            fills = 2 * int(cut.lengths[cut.crc_ok].sum()) >= window.size
+            if fills if unchecked or not self.expected.error_control else packets >= 2 or (packets and fills):
+                return True
+            if not self.expected.error_control:
+                return False
+        return False
+
+    def _reader(self, run: Run, section: Section) -> FrameReader | PacketReader:
+        piece = self.piece
+        reader: FrameReader | PacketReader
+        if section.settings is not None:
+            reader = FrameReader(
+                section,
+                section.settings,
+                self.found,
+                spacecraft_id=piece.spacecraft_id,
+                unchecked_apids=self._unchecked_apids,
+                record=self.expected.record,
+                error_control=self.expected.error_control,
+            )
+        elif piece.spacecraft_id is None:
+            raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
+        else:
+            reader = PacketReader(
+                section,
+                self.found,
+                spacecraft_id=piece.spacecraft_id,
+                unchecked_apids=self._unchecked_apids(piece.spacecraft_id),
+                error_control=self.expected.error_control,
+            )
+        if section.start < section.first or section.last < section.stop:
+            reader.exclude(run.read(section.start, section.first), run.read(section.last, section.stop))
+        return reader
+
+    def _unchecked_apids(self, spacecraft: int) -> frozenset[int]:
+        return self._definitions(spacecraft).unchecked_apids
+
+    def _definitions(self, spacecraft: int) -> PacketDefinitions:
+        """Return the packets that the mission description of a spacecraft declares."""
+        if spacecraft not in self.definitions:
+            with self.ground.database.reading() as connection:
+                self.definitions[spacecraft], _ = definitions_of_spacecraft(
+                    connection, spacecraft, self.piece.scope
+                )
+        return self.definitions[spacecraft]
+
+    def _refuse(self, found: str, expected: str = "a stream of CADUs or of space packets") -> None:
+        """Refuse a piece.
+
+        Raises
+        ------
+        InvalidInput
+            Always.
+        """
+        with self.ground.database.reading() as connection:
+            name = recorded_name(connection, self.piece.file_sha256)
+        if self.piece.octets < CERTAIN_OCTETS and not self.piece.stream:
+            found += f"; {HINT}"
+        raise InvalidInput(name, "", expected, f"{self.piece.octets} octets with {found}")
+
+    # Storage
+
+    def _store_early(self, batch: PacketBatch) -> None:
+        """Store a batch that is not the last one."""
+        with self.ground.database.writing() as connection:
+            if not self.is_started:
+                store.start_ingest(connection, self.piece.ingest_id)
+                self.is_started = True
+            self._store(connection, batch)
+        if self.progress is not None:
+            self.progress(min(self.found.octets_used / max(self.piece.octets, 1), 1.0))
+
+    def _finish(self, batch: PacketBatch | None, fragments: list[Fragment]) -> None:
+        """Store the last batch and the fragments, complete packets with fragments, and finish the ingest."""
+        packets, fragments = join(fragments, self._unchecked_apids)
+        with self.ground.database.writing() as connection:
+            if batch is not None:
+                self._store(connection, batch)
+            self._store_packets(connection, packets, joined=False)
+            for spacecraft in sorted({one.channel[0] for one in fragments}):
+                mine = [one for one in fragments if one.channel[0] == spacecraft]
+                recordings.add_fragments(connection, self._vehicle(connection, spacecraft), mine)
+            self._remember(connection)
+            if not fragments:
+                self._done(connection)
+                return
+        # of two pieces that are ingested at the same time, at least the later one sees the fragments of both
+        used: list[tuple[int, Fragment]] = []
+        with self.ground.database.reading() as connection:
+            for one in fragments:
+                if any(one == other for _, other in used):
+                    continue
+                vehicle, spacecraft = self.vehicles[one.channel[0]], one.channel[0]
+                found = complete(
+                    one,
+                    partial(recordings.fragments_before, connection, vehicle),
+                    partial(recordings.fragments_behind, connection, vehicle),
+                    self._unchecked_apids(spacecraft),
+                )
+                if found is not None:
+                    used += [(vehicle, fragment) for fragment in found[0]]
+                    packets.append((spacecraft, found[1]))
+        with self.ground.database.writing() as connection:
+            self._store_packets(connection, packets, joined=True)
+            for vehicle in sorted(set(self.vehicles.values())):
+                recordings.remove_fragments(connection, vehicle, [one for key, one in used if key == vehicle])
+            self._done(connection)
+
+    def _store(self, connection: Connection, packets: PacketBatch, *, joined: bool = False) -> None:
+        assert packets.spacecraft_id is not None
+        vehicle = self._vehicle(connection, packets.spacecraft_id)
+        stored = store.store_batch(connection, vehicle, packets)
+        store.note_receptions(connection, vehicle, self.piece.station, time_receptions(packets))
+        recordings.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=joined)
+        defined = np.isin(packets.apid, self._definitions(packets.spacecraft_id).apids)
+        self.unknown += packets.unknown - int(np.count_nonzero(defined))
+        timed = packets.ticks[packets.ticks != NO_TICKS]
+        if timed.size:
+            self.ticks = [min([*self.ticks, int(timed.min())]), max([*self.ticks, int(timed.max())])]
+
+    def _store_packets(
+        self, connection: Connection, packets: list[tuple[int, bytes]], *, joined: bool
+    ) -> None:
+        """Store packets that were completed with fragments: of this reading, or `joined` with others."""
+        for spacecraft in sorted({one for one, _ in packets}):
+            octets = [packet for one, packet in packets if one == spacecraft]
+            cut = whole_packets(np.array([len(one) for one in octets], dtype=np.int64))
+            self._store(
+                connection, batch_of_cut(b"".join(octets), cut, DICTIONARY, spacecraft), joined=joined
+            )
+            if not joined:
+                self.found.packets += len(octets)
+                self.found.octets_unused -= sum(len(one) for one in octets)
+        if not joined:
+            packets.clear()
+
+    def _vehicle(self, connection: Connection, spacecraft: int) -> int:
+        """Return the vehicle id of a spacecraft; create it if it is new."""
+        is_current = self.known.around.decoded_version == DICTIONARY.version
+        if spacecraft not in self.vehicles or not (spacecraft == self.piece.spacecraft_id and is_current):
+            vehicle = vehicle_id(connection, spacecraft, self.piece.scope)
+            note_dictionary(connection, vehicle)
+            self.vehicles[spacecraft] = vehicle
+        return self.vehicles[spacecraft]
+
+    def _remember(self, connection: Connection) -> None:
+        """Remember link settings under which frames were valid."""
+        settings = [one.settings for one in self.sections if one.settings is not None]
+        if self.found.frames_good >= LEAST_GOOD_FRAMES:
+            for one in settings:
+                remember_link(connection, self.piece, self.vehicles.values(), one, utc_now_ns())
+
+    def _done(self, connection: Connection) -> None:
+        self.result = self._result(recordings.stored_by(connection, self.piece.ingest_id))
+        store.finish_ingest(connection, self.result, utc_now_ns())
+        recordings.set_waiting(connection, self.piece.ingest_id, waits=not self.has_link)
+
+    def readable_now(self) -> list[int]:
+        """Return the ingests of pieces that can be read because the link of their recording is known."""
+        if not self.piece.stream:
+            return []
+        with self.ground.database.reading() as connection:
+            if self.has_link:
+                return recordings.waiting_pieces(connection, self.piece)
+            # another piece may have been read in the meantime
+            known = recordings.accounting_of_recording(connection, self.piece)
+            return [] if known is None else [self.piece.ingest_id]
+
+    def decode(self) -> None:
+        """Decode what the description of a vehicle declares, or an older dictionary has decoded."""
+        around, mine = self.known.around, self.piece.spacecraft_id
+        is_current = around.decoded_version == DICTIONARY.version and not around.has_decodings
+        for spacecraft, vehicle in self.vehicles.items():
+            if spacecraft == mine and is_current and not self._definitions(spacecraft).declared:
+                continue
+            catch_up(self.ground, vehicle)
+            decode_declared(self.ground, vehicle)
+
+    def _result(self, totals: tuple[int, int, int]) -> IngestResult:
+        """Return the result with the totals of `recording_store.stored_by`."""
+        found = self.found
+        new, joined, samples = totals
+        return IngestResult(
+            ingest_id=self.piece.ingest_id,
+            vehicle_id=next(iter(self.vehicles.values()), None),
+            octets=self.piece.octets,
+            packets=found.packets,
+            packets_new=new,
+            packets_joined=joined,
+            packets_repeated=found.packets - (new - joined),
+            samples=samples,
+            crc_errors=found.crc_errors,
+            octets_skipped=self.piece.octets - found.octets_used + found.octets_unused,
+            octets_pending=min(found.octets_waiting, self.piece.octets)
+            if self.sections
+            else self.piece.octets,
+            frames=found.frames,
+            frames_bad=found.frames_bad,
+            frames_joined=found.frames_joined,
+            symbols_corrected=found.symbols_corrected,
+            unknown=self.unknown,
+            first_ticks=self.ticks[0] if self.ticks else None,
+            last_ticks=self.ticks[-1] if self.ticks else None,
+            vehicle_ids=tuple(sorted(self.vehicles.values())),
+            reception=self._reception(),
+            uplink=tuple(
+                ReceivedControlWords(spacecraft_id=spacecraft_id, **asdict(seen))
+                for (spacecraft_id, _), seen in sorted(found.uplink.items())
+            ),
+        )
+
+    def _reception(self) -> ReceivedLink | None:
+        """Return the link quality, the sections of the file and the origin of their settings."""
+        framed = [(one, one.settings) for one in self.sections if one.settings is not None]
+        if not framed:
+            return None
+        names = {one.name for one in fields(Found)} & set(ReceivedLink.model_fields)
+        return ReceivedLink(
+            station=self.piece.station,
+            ambiguous=self.ambiguous,
+            bit_error_rate=self.found.bit_error_rate,
+            octets=self.octets_new,
+            octets_other=self.octets_new - self.found.octets_used,
+            **{name: getattr(self.found, name) for name in names},
+            sections=tuple(
+                ReceivedSection.model_validate(
+                    {
+                        "start": one.first + one.position - self.piece.position,
+                        "stop": one.last + one.position - self.piece.position,
+                        "source": self.expected.source_of(settings),
+                        **settings.describe(),
+                    }
+                )
+                for one, settings in framed
+            ),
+        )

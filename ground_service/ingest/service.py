@@ -1,27 +1,27 @@
-"""Ingest of a downlink file: the raw file is archived, its packets are stored once each, everything is accounted for.
+"""Ingest of downlink files: the raw file is archived, its packets are stored once each, everything is accounted for.
 
-The archive that results depends only on the octets that were ingested, not on their order, on how they were split into
-files or on how often they came. An ingest that was cut off can simply be run again.
+The archive that results depends only on the octets of the recordings, not on their order, on how they were split into
+pieces or on how often they came. An ingest that was cut off can simply be run again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput
 from ground_service.ground import Ground
-from ground_service.ingest import edge_store as edges
 from ground_service.ingest import store
 from ground_service.ingest.model import IngestResult
 from ground_service.ingest.parameters import decode_declared, definitions_in_force
-from ground_service.ingest.reading import Progress, Reading
-from ground_service.ingest.redecode import catch_up, redecode
+from ground_service.ingest.reception import Progress, Reading
+from ground_service.ingest.recording_store import Piece, add_piece, get_piece
+from ground_service.ingest.redecode import redecode
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.jobs.store import find_job
@@ -34,13 +34,10 @@ from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.link import LinkSettings
 
-AT_ONCE_OCTETS = 256 << 10
-"""Size up to which a piece of complete frames is stored and accounted for in one transaction."""
-
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Position of a file in a stream of octets, as stated by its sender."""
+    """Position of a file in its recording, as stated by its sender."""
 
     stream: str
     offset: int
@@ -67,7 +64,7 @@ def ingest_file(
     instance
         Instance of the spacecraft to which the telemetry belongs.
     place
-        Position of the file in its stream; None: joined by order of arrival and by content.
+        Recording of which the file is a piece, and its offset; None: the file is a whole recording.
     station
         Name of the station in the mission description; empty: not stated.
     link
@@ -76,14 +73,13 @@ def ingest_file(
     Raises
     ------
     InvalidInput
-        If the file is unreadable or contains no part of a downlink.
+        If the file is unreadable, or a whole recording without a frame or packet.
     """
     if not path.is_file():
         raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
-    stored = ground.files.put_file(path)
     return ingest_stored(
         ground,
-        stored,
+        ground.files.put_file(path),
         spacecraft_id=spacecraft_id,
         instance=instance,
         name=name or path.name,
@@ -105,90 +101,9 @@ def ingest_stored(
     link: str | None = None,
 ) -> IngestResult:
     """Store what is in an archived downlink file; see `ingest_file`."""
-    piece = _new_piece(
-        stored, spacecraft_id=spacecraft_id, instance=instance, place=place, station=station, link=link
-    )
-    now = utc_now_ns()
-
-    def enter(connection: Connection, reading: Reading, packets: int, samples: int) -> IngestResult:
-        result = reading.result_of((packets, 0, samples))
-        register_file(connection, stored, "downlink", name, now)
-        ingest_id = store.add_finished(connection, stored.sha256, result, now, utc_now_ns())
-        edges.add_piece(connection, _entered(piece, ingest_id), packets, samples)
-        return result.model_copy(update={"ingest_id": ingest_id})
-
-    at_once = _store_at_once(ground, piece, enter)
-    if at_once is not None:
-        return at_once
     with ground.database.writing() as connection:
-        ingest_id = _add_ingest(connection, stored, name, piece, "running")
-    return _run(ground, ingest_id)
-
-
-def add_ingest(
-    connection: Connection,
-    stored: StoredFile,
-    name: str,
-    *,
-    spacecraft_id: int | None = None,
-    instance: str = FLOWN,
-    place: Place | None = None,
-    station: str = "",
-    link: str | None = None,
-) -> int:
-    """Add an ingest of an archived file, within the caller's transaction; return its id."""
-    piece = _new_piece(
-        stored, spacecraft_id=spacecraft_id, instance=instance, place=place, station=station, link=link
-    )
-    return _add_ingest(connection, stored, name, piece, "queued")
-
-
-def _new_piece(
-    stored: StoredFile,
-    *,
-    spacecraft_id: int | None,
-    instance: str,
-    place: Place | None,
-    station: str,
-    link: str | None,
-) -> edges.Piece:
-    """Return a piece whose ingest is not entered yet."""
-    if link is not None:
-        _check_link(link)
-    return edges.Piece(
-        ingest_id=0,
-        scope=instance,
-        spacecraft_id=spacecraft_id,
-        file_sha256=stored.sha256,
-        octets=stored.octets,
-        stream=place.stream if place is not None else "",
-        position=place.offset if place is not None else 0,
-        links_tried=None,
-        station=station,
-        link=link,
-    )
-
-
-def _entered(piece: edges.Piece, ingest_id: int) -> edges.Piece:
-    """Return a piece with its ingest; without a stream its position is the order of arrival."""
-    return replace(piece, ingest_id=ingest_id, position=piece.position if piece.stream else ingest_id)
-
-
-def _add_ingest(connection: Connection, stored: StoredFile, name: str, piece: edges.Piece, state: str) -> int:
-    now = utc_now_ns()
-    register_file(connection, stored, "downlink", name, now)
-    ingest_id = store.add_ingest(
-        connection, stored.sha256, state=state, dictionary_version=DICTIONARY.version, now_utc_ns=now
-    )
-    edges.add_piece(connection, _entered(piece, ingest_id))
-    return ingest_id
-
-
-def _check_link(text: str) -> None:
-    try:
-        LinkSettings.parse(text)
-    except TmtcError as error:
-        raise InvalidInput("telemetry", "link", "link settings", str(error)) from error
+        ingest_id = _add(connection, stored, name, "running", spacecraft_id, instance, place, station, link)
+    return run_ingest(ground, ingest_id)
 
 
 def enter_ingest(
@@ -210,35 +125,48 @@ def enter_ingest(
     Conflict
         If the id belongs to another ingest.
     """
+    arguments = {"spacecraft_id": spacecraft_id, "instance": instance}
     with ground.database.writing() as connection:
         if job_id is not None:
             hold(connection, f"job {job_id}")
             known = find_job(connection, job_id)
             if known is not None:
-                return _known_ingest(connection, known, stored, spacecraft_id, instance), job_id
-        ingest_id = add_ingest(
-            connection,
-            stored,
-            name,
-            spacecraft_id=spacecraft_id,
-            instance=instance,
-            place=place,
-            station=station,
-            link=link,
-        )
-        arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
-        return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
+                return _known_ingest(connection, known, stored, arguments), job_id
+        ingest_id = _add(connection, stored, name, "queued", spacecraft_id, instance, place, station, link)
+        return ingest_id, add_job(connection, "ingest", {"ingest_id": ingest_id, **arguments}, job_id=job_id)
 
 
-def _known_ingest(
+def _add(
     connection: Connection,
-    job: Job,
     stored: StoredFile,
+    name: str,
+    state: str,
     spacecraft_id: int | None,
     instance: str,
+    place: Place | None,
+    station: str,
+    link: str | None,
 ) -> int:
+    """Add the ingest of an archived file as a piece of its recording; return its id."""
+    try:
+        assert link is None or LinkSettings.parse(link)
+    except TmtcError as error:
+        raise InvalidInput("telemetry", "link", "link settings", str(error)) from error
+    now = utc_now_ns()
+    register_file(connection, stored, "downlink", name, now)
+    ingest_id = store.add_ingest(
+        connection, stored.sha256, state=state, dictionary_version=DICTIONARY.version, now_utc_ns=now
+    )
+    stream, position = ("", 0) if place is None else (place.stream, place.offset)
+    piece = Piece(
+        ingest_id, instance, spacecraft_id, stored.sha256, stored.octets, stream, position, station, link
+    )
+    add_piece(connection, piece)
+    return ingest_id
+
+
+def _known_ingest(connection: Connection, job: Job, stored: StoredFile, asked: dict[str, Any]) -> int:
     """Return the ingest of an existing job with the same file and the same spacecraft."""
-    asked = {"spacecraft_id": spacecraft_id, "instance": instance}
     if job.kind == "ingest" and asked.items() <= job.arguments.items():
         ingest_id = int(job.arguments["ingest_id"])
         if store.get_ingest(connection, ingest_id).sha256 == stored.sha256:
@@ -246,102 +174,33 @@ def _known_ingest(
     raise Conflict(OTHER_REQUEST)
 
 
-def run_ingest(
-    ground: Ground,
-    ingest_id: int,
-    *,
-    progress: Progress | None = None,
-) -> IngestResult:
-    """Run an ingest that was added with `add_ingest`; a repetition changes nothing.
+def run_ingest(ground: Ground, ingest_id: int, *, progress: Progress | None = None) -> IngestResult:
+    """Read the piece of an ingest that was entered; a repetition changes nothing.
 
     `progress` is called with the stored share of the file, several times for a long file.
     """
-    at_once = _run_at_once(ground, ingest_id)
-    if at_once is not None:
-        return at_once
-    with ground.database.writing() as connection:
-        store.start_ingest(connection, ingest_id)
-    return _run(ground, ingest_id, progress=progress)
-
-
-def _run_at_once(ground: Ground, ingest_id: int) -> IngestResult | None:
-    """Run the ingest of a small piece as `_store_at_once` does; None for any other piece."""
-    with ground.database.reading() as connection:
-        piece = edges.find_piece(connection, ingest_id)
-
-    def finish(connection: Connection, reading: Reading, packets: int, samples: int) -> IngestResult:
-        result = reading.result_of(edges.finish_piece(connection, ingest_id, packets, samples))
-        store.finish_ingest(connection, result, utc_now_ns())
-        return result
-
-    return None if piece is None else _store_at_once(ground, piece, finish)
-
-
-def _store_at_once(
-    ground: Ground,
-    piece: edges.Piece,
-    finish: Callable[[Connection, Reading, int, int], IngestResult],
-) -> IngestResult | None:
-    """Store a small piece that nothing waits for, with its accounting, in one transaction; None for any other piece.
-
-    `finish` receives the numbers of new packets and samples. After an error that does not pass nothing is stored, and
-    the piece is read as any other, which records the error.
-    """
-    if piece.octets > AT_ONCE_OCTETS:
-        return None
-    try:
-        reading = Reading(ground, piece, None)
-        batches = reading.complete_batches()
-        if batches is None:
-            return None
-        with ground.database.writing() as connection:
-            result = finish(connection, reading, *reading.store_complete(connection, batches))
-            reading.remember(connection, replace(piece, ingest_id=result.ingest_id))
-        return result
-    except PASSING:
-        raise
-    except (GroundError, TmtcError):
-        return None
-
-
-def _run(ground: Ground, ingest_id: int, *, progress: Progress | None = None) -> IngestResult:
     with ground.database.listeners.held():  # one call for the whole file, not one for each batch
-        return _run_held(ground, ingest_id, progress)
+        try:
+            reading = _read(ground, ingest_id, progress)
+            for other in reading.readable_now():
+                with suppress(InvalidInput):
+                    _read(ground, other)
+        except PASSING:
+            raise
+        except (GroundError, TmtcError) as error:
+            with ground.database.writing() as connection:
+                store.fail_ingest(connection, ingest_id, str(error), utc_now_ns())
+            raise
+    return reading.result
 
 
-def _run_held(ground: Ground, ingest_id: int, progress: Progress | None) -> IngestResult:
-    try:
-        result = _read_piece(ground, ingest_id, progress)
-    except PASSING:
-        raise
-    except (GroundError, TmtcError) as error:
-        with ground.database.writing() as connection:
-            store.fail_ingest(connection, ingest_id, str(error), utc_now_ns())
-        raise
-    with ground.database.writing() as connection:
-        store.finish_ingest(connection, result, utc_now_ns())
-    return result
-
-
-def _read_piece(
-    ground: Ground,
-    ingest_id: int,
-    progress: Progress | None,
-) -> IngestResult:
-    """Store the content of a piece and the units joined with others, and read pieces that wait for its link."""
+def _read(ground: Ground, ingest_id: int, progress: Progress | None = None) -> Reading:
     with ground.database.reading() as connection:
-        piece = edges.piece_of(connection, ingest_id)
+        piece = get_piece(connection, ingest_id)
     reading = Reading(ground, piece, progress)
-    learned = reading.read()
-    for other in learned:
-        late = Reading(ground, other, None, vehicles=reading.vehicles)
-        late.read()
-        with ground.database.writing() as connection:
-            store.change_result(connection, late.result())
-    for vehicle in reading.vehicles.values():
-        catch_up(ground, vehicle)
-        decode_declared(ground, vehicle)
-    return reading.result()
+    reading.read()
+    reading.decode()
+    return reading
 
 
 def apply_definition(ground: Ground, vehicle: int) -> int:

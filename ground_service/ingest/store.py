@@ -34,6 +34,12 @@ _PACKETS: Any = PACKETS
 _INGESTS = repository.INGESTS
 _FILES = repository.FILES
 _RECEPTIONS = repository.RECEPTIONS
+_PIECES = repository.PIECES
+_PLACE = (
+    _PIECES.c.scope,
+    func.coalesce(_PIECES.c.stream, "").label("stream"),
+    func.coalesce(_PIECES.c.position, 0).label("position"),
+)
 
 RECEPTIONS_LIMIT = 100_000
 """Largest number of reception times of time reports of a vehicle."""
@@ -372,25 +378,48 @@ def _accounting(result: IngestResult) -> dict[str, Any]:
     return {"accounting": result.model_dump(mode="json", exclude={"ingest_id"}), **times}
 
 
-def results_of_vehicle(
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A piece of a recording with its result; `stream` is empty for a file that is a recording of its own."""
+
+    sha256: str
+    octets: int
+    stream: str
+    position: int
+    result: IngestResult | None
+
+
+def recordings_of_vehicle(
     connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int
-) -> list[tuple[str, int, IngestResult | None]]:
-    """Return hash, octets and result of the ingests that may have packets of a vehicle in a time, ordered by hash."""
+) -> list[list[Received]]:
+    """Return the recordings that may have packets of a vehicle in a time: the different pieces of each, by position."""
     query = (
-        select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.id, _INGESTS.c.accounting)
+        select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.id, _INGESTS.c.accounting, *_PLACE)
         .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
-        .where(*_may_have_packets(vehicle, start_ticks, stop_ticks))
-        .order_by(_INGESTS.c.file_sha256)
+        .outerjoin(_PIECES, _PIECES.c.ingest_id == _INGESTS.c.id)
+        .order_by(_INGESTS.c.file_sha256, _INGESTS.c.id)
     )
-    found = (
-        (sha256, int(octets), _result(ingest_id, accounting))
-        for sha256, octets, ingest_id, accounting in connection.execute(query)
-    )
-    return [one for one in found if one[2] is None or vehicle in one[2].vehicle_ids]
+    found: dict[tuple[str, str], dict[tuple[int, str], Received]] = {}
+    streams = set()
+    for row in connection.execute(query.where(*_may_have_packets(vehicle, start_ticks, stop_ticks))):
+        result = _result(row.id, row.accounting)
+        if result is not None and vehicle not in result.vehicle_ids:
+            continue
+        if row.stream:
+            streams.add((row.scope, row.stream))
+        else:
+            found["", row.file_sha256] = {(0, ""): Received(row.file_sha256, row.octets, "", 0, result)}
+    for scope, stream in sorted(streams):
+        pieces = found.setdefault((scope, stream), {})
+        mine = query.where(_PIECES.c.scope == scope, _PIECES.c.stream == stream)
+        for row in connection.execute(mine):
+            one = Received(row.file_sha256, row.octets, stream, row.position, _result(row.id, row.accounting))
+            pieces.setdefault((one.position, one.sha256), one)
+    return [[one for _, one in sorted(pieces.items())] for _, pieces in sorted(found.items())]
 
 
 def results_state(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> Hashable:
-    """Return a value that differs after another ingest of `results_of_vehicle`."""
+    """Return a value that differs after another ingest of `recordings_of_vehicle`."""
     columns = func.count(), func.count(_INGESTS.c.last_ticks), func.max(_INGESTS.c.finished_utc_ns)
     query = select(*columns).where(*_may_have_packets(vehicle, start_ticks, stop_ticks))
     return tuple(connection.execute(query).one())

@@ -1,6 +1,6 @@
 """Accounting of the packets, frames and octets of one pass: received, missing, damaged and duplicate.
 
-Missing packets follow from sequence counts and from the planned frames. Frames and octets are those of the raw files
+Missing packets follow from sequence counts and from the planned frames. Frames and octets are those of the recordings
 with on-board times in the pass (`passes.downlink_accounting`); other passes of the spacecraft have no influence.
 """
 
@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 
 from ground_service.ingest.core import Gap, account_sequence
 from ground_service.ingest.model import ReceivedLink
-from ground_service.ingest.store import results_of_vehicle
+from ground_service.ingest.store import Received, recordings_of_vehicle
 from ground_service.passes import store
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
 from ground_service.passes.model import PassRecord
@@ -43,7 +43,7 @@ KEPT_OCTETS = 64 << 20
 """Memory of the contents of raw files that are kept: those of about a million packets, in files of any size."""
 
 RAW_LIMIT_OCTETS = 128 << 20
-"""Largest size of raw files that are read again for a report; above it, the dependent values are not computed."""
+"""Largest size of recordings that are read again for a report; above it, the dependent values are not computed."""
 
 
 def packet_accounting(
@@ -51,8 +51,9 @@ def packet_accounting(
 ) -> PacketAccounting:
     """Return the packet and octet accounting of a pass."""
     headers = telemetry.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
-    ingested = _raw_files(connection, span)
-    raw = _raw_account(files, get_vehicle(connection, span.vehicle).ccsds_id, ingested, span)
+    recordings = recordings_of_vehicle(connection, span.vehicle, span.start_ticks, span.stop_ticks)
+    runs = [run for pieces in recordings for run in _runs(pieces)]
+    raw = _raw_account(files, get_vehicle(connection, span.vehicle).ccsds_id, runs, span)
     names = _apid_names()
     by_apid: dict[int, ApidAccounting] = {}
     lost = np.zeros((0, 2), dtype=np.float64)
@@ -90,87 +91,126 @@ def packet_accounting(
         symbols_corrected=None if raw is None else raw.symbols_corrected,
         lost_at_edges=None if edges is None else sum(apid.lost_at_edges or 0 for apid in by_apid.values()),
         octets=None if raw is None else raw.octets,
-        receptions=_receptions(ingested),
+        receptions=_receptions(recordings),
         by_apid=by_apid,
         completeness=_completeness(record, span, headers["ticks"], lost),
     )
 
 
-def _raw_account(
-    files: FileArchive, spacecraft: int, ingested: list[_Ingested], span: PassSpan
-) -> RawAccount | None:
-    """Return sums over the raw files of the vehicle; None without files, or if one is too large."""
-    found = []
-    for one in ingested:
-        if one.octets > RAW_LIMIT_OCTETS:
-            return None
-        found.append(_RAW_FILES.get(files, one.sha256, spacecraft, one.sections))
-    return account_raw(found, span.start_ticks, span.stop_ticks) if found else None
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Octets [start, stop) of a file."""
+
+    sha256: str
+    start: int
+    stop: int
 
 
 @dataclass(frozen=True, slots=True)
-class _Ingested:
-    """Ingested file: its size, the sections of its link settings, and its reception if it has frames."""
+class _Run:
+    """Contiguous octets of a recording, and the sections of its link settings; none: they follow from the octets."""
 
-    sha256: str
-    octets: int
+    parts: tuple[_Part, ...]
     sections: tuple[LinkSection, ...]
-    reception: ReceivedLink | None
+
+    @property
+    def octets(self) -> int:
+        """Number of octets."""
+        return sum(one.stop - one.start for one in self.parts)
 
 
-def _receptions(ingested: list[_Ingested]) -> tuple[ReceptionQuality, ...]:
-    """Return the link quality of the files of the pass, by station and hash."""
-    names = {one.name for one in fields(ReceptionQuality)}
-    found = [(one.reception, one.sha256) for one in ingested if one.reception is not None]
-    return tuple(
-        ReceptionQuality(
-            source=", ".join(sorted({section.source for section in reception.sections})),
-            **reception.model_dump(include=names),
-        )
-        for reception, _ in sorted(found, key=lambda one: (one[0].station, one[1]))
-    )
+def _raw_account(files: FileArchive, spacecraft: int, runs: list[_Run], span: PassSpan) -> RawAccount | None:
+    """Return sums over the recordings of the vehicle; None without any, or if one is too large."""
+    if not runs or any(one.octets > RAW_LIMIT_OCTETS for one in runs):
+        return None
+    found = [_RAW_FILES.get(files, one, spacecraft) for one in runs]
+    return account_raw(found, span.start_ticks, span.stop_ticks)
 
 
-def _raw_files(connection: Connection, span: PassSpan) -> list[_Ingested]:
-    """Return the ingested files that may contain data of the pass, each once, ordered by hash."""
-    chosen: dict[str, _Ingested] = {}
-    found = results_of_vehicle(connection, span.vehicle, span.start_ticks, span.stop_ticks)
-    for sha256, octets, result in found:
-        reception = None if result is None else result.reception
-        chosen[sha256] = _Ingested(sha256, octets, _sections(reception), reception)
-    return list(chosen.values())
+def _runs(pieces: list[Received]) -> list[_Run]:
+    """Return the contiguous octets of a recording, each octet once."""
+    runs: list[list[tuple[Received, _Part]]] = []
+    reached = -1
+    for one in pieces:
+        start = max(reached - one.position, 0)
+        if one.position > reached:
+            runs.append([])
+        if start < one.octets or not runs[-1]:
+            runs[-1].append((one, _Part(one.sha256, start, one.octets)))
+            reached = one.position + one.octets
+    return [_Run(tuple(part for _, part in run), _sections([one for one, _ in run])) for run in runs]
 
 
-def _sections(reception: ReceivedLink | None) -> tuple[LinkSection, ...]:
+def _sections(pieces: list[Received]) -> tuple[LinkSection, ...]:
+    """Return the sections of a run; none if they are not known, or are different in its pieces."""
     names = {one.name for one in fields(LinkSettings)}
-    return tuple(
-        LinkSection(
-            section.start,
-            section.stop,
-            LinkSettings(**section.model_dump(include=names, exclude_none=True)),
-        )
-        for section in (() if reception is None else reception.sections)
+    receptions = [one.result.reception for one in pieces if one.result and one.result.reception]
+    found = [
+        LinkSection(one.start, one.stop, LinkSettings(**one.model_dump(include=names, exclude_none=True)))
+        for reception in receptions
+        for one in reception.sections
+    ]
+    if len(pieces) == 1:
+        return tuple(found)
+    octets = pieces[-1].position + pieces[-1].octets - pieces[0].position
+    same = {one.settings for one in found}
+    return (LinkSection(0, octets, same.pop()),) if len(same) == 1 else ()
+
+
+def _receptions(recordings: list[list[Received]]) -> tuple[ReceptionQuality, ...]:
+    """Return the link quality of the recordings of the pass, by station and time."""
+    found = []
+    for pieces in recordings:
+        received = [one.result.reception for one in pieces if one.result and one.result.reception]
+        if received:
+            octets = sum(run.octets for run in _runs(pieces))
+            found.append(_reception(received, octets))
+    return tuple(sorted(found, key=lambda one: (one.station, one.first_utc_ns or 0, one.octets)))
+
+
+def _reception(received: list[ReceivedLink], octets: int) -> ReceptionQuality:
+    """Return the link quality of a recording of this number of octets from that of its pieces."""
+
+    def total(name: str) -> int:
+        return sum(getattr(one, name) for one in received)
+
+    checked = total("checked_bits")
+    firsts = [one.first_utc_ns for one in received if one.first_utc_ns is not None]
+    lasts = [one.last_utc_ns for one in received if one.last_utc_ns is not None]
+    return ReceptionQuality(
+        station=received[0].station,
+        source=", ".join(sorted({section.source for one in received for section in one.sections})),
+        ambiguous=any(one.ambiguous for one in received),
+        frames=total("frames"),
+        frames_good=total("frames_good"),
+        symbols_corrected=total("symbols_corrected"),
+        bit_error_rate=total("wrong_bits") / checked if checked else None,
+        lock_losses=total("lock_losses"),
+        octets=octets,
+        # frames that cannot be used may be counted with both pieces at a border
+        octets_other=max(octets - total("octets_frames") - total("octets_records"), 0),
+        first_utc_ns=min(firsts, default=None),
+        last_utc_ns=max(lasts, default=None),
     )
 
 
 class _RawFiles:
-    """Content of raw files, of which the last ones used are kept: the file of a hash never changes."""
+    """Content of recordings, of which the last ones used are kept: the file of a hash never changes."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._kept: OrderedDict[Hashable, RawFile] = OrderedDict()
         self._octets = 0
 
-    def get(
-        self, files: FileArchive, sha256: str, spacecraft_id: int, sections: tuple[LinkSection, ...]
-    ) -> RawFile:
-        """Return the content of a raw file."""
-        key = (files.root, sha256, spacecraft_id, sections)
+    def get(self, files: FileArchive, run: _Run, spacecraft_id: int) -> RawFile:
+        """Return the content of a run."""
+        key = (files.root, run, spacecraft_id)
         with self._lock:
             if (found := self._kept.get(key)) is not None:
                 self._kept.move_to_end(key)
                 return found
-        found = read_raw(files.get(sha256), spacecraft_id, sections)
+        octets = b"".join(files.get(one.sha256)[one.start : one.stop] for one in run.parts)
+        found = read_raw(octets, spacecraft_id, run.sections)
         with self._lock:
             if key not in self._kept:
                 self._kept[key] = found

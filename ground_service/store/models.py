@@ -147,24 +147,24 @@ PIECES = Table(
     column("octets", BigInteger),
     column("stream", String(200)),
     column("position", BigInteger),
-    optional("links_tried", Integer),
+    optional("waits", Integer),
     column("station", String(64)),
     optional("link", String(200)),
     column("packets_stored", BigInteger, default=0),
     column("packets_joined", BigInteger, default=0),
     column("samples_stored", BigInteger, default=0),
     Index("ix_pieces_place", "scope", "stream", "position"),
-    Index("ix_pieces_unread", "scope", "links_tried"),
+    Index("ix_pieces_waiting", "scope", "waits"),
 )
-"""Ingested file of a downlink, and its position in its stream.
+"""Ingested file of a downlink, and its position in its recording.
 
-Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` selects the frames of
-one spacecraft; NULL: those of every spacecraft. `stream` and `position` (octets from its start) are stated by the
-sender. Otherwise, `stream` is empty and `position` is the number of the ingest, so that successive ingests are
-adjacent. `station` (empty: not stated) and `link` (text of the settings, NULL: not stated) are those of the sender.
-`links_tried` is the number of known links of the scope that could not read it; NULL if one could.
-`packets_stored` counts the new packets that the ingest added to the archive, `packets_joined` those of them that
-were joined with other pieces, and `samples_stored` their samples, over all attempts of the ingest.
+A recording is one reception of one station: `stream` and `position` (octets from its start) are stated by the sender. A
+file without them is a recording of its own; `stream` is empty. Pieces of one `scope` (instance of the spacecraft) and
+`stream` adjoin. `spacecraft_id` selects the frames of one spacecraft; NULL: those of every spacecraft. `station`
+(empty: not stated) and `link` (text of the settings, NULL: not stated) are those of the sender. `waits` is 1 for a
+piece that is to be read again when the link of its recording is known, otherwise NULL. `packets_stored` counts the new
+packets that the ingest added to the archive, `packets_joined` those of them that were completed with fragments, and
+`samples_stored` their samples, over all attempts of the ingest.
 """
 
 
@@ -182,46 +182,29 @@ GOOD_LINKS = Table(
 """Link settings under which a spacecraft was received by a station; the newest row is used first."""
 
 
-KNOWN_LINKS = Table(
-    "known_links",
-    METADATA,
-    key("id", Integer),
-    column("scope", String(128)),
-    column("digest", String(16)),
-    optional("settings", JSON),
-    UniqueConstraint("scope", "digest"),
-)
-"""Link found for the downlinks of a scope; `settings` NULL: bare packets."""
-
-
-STREAM_EDGES = Table(
-    "stream_edges",
+FRAGMENTS = Table(
+    "fragments",
     METADATA,
     key("id", BigKey),
-    column("domain", String(200)),
-    column("identity", LargeBinary(16)),
-    column("role", SmallInteger),
-    column("open", SmallInteger),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("channel", String(24)),
+    column("begins", SmallInteger),
+    column("ends", SmallInteger),
     column("count", SmallInteger),
     column("next_count", SmallInteger),
+    column("first", BigInteger),
+    column("last", BigInteger),
+    column("stream", String(200)),
     column("fit", Integer),
-    optional("file_sha256", String(64)),
-    optional("start", BigInteger),
-    column("length", Integer),
+    column("digest", LargeBinary(16)),
     column("octets", LargeBinary),
-    UniqueConstraint("domain", "identity"),
-    Index("ix_stream_edges_fit", "domain", "role", "open", "fit", "count"),
-    Index("ix_stream_edges_count", "domain", "role", "open", "count"),
-    Index("ix_stream_edges_next", "domain", "role", "open", "next_count"),
-    Index("ix_stream_edges_newest", "domain", "role", "open", "id"),
-    Index("ix_stream_edges_file", "file_sha256", "open"),
+    UniqueConstraint("vehicle_id", "channel", "digest"),
+    Index("ix_fragments_first", "vehicle_id", "channel", "count", "fit"),
+    Index("ix_fragments_last", "vehicle_id", "channel", "next_count", "fit"),
 )
-"""Octets of a CADU or packet that was cut, stored until the adjacent octets are received.
+"""Octets of a packet that was cut, stored until the others are received; see `ingest.fragments.Fragment`.
 
-`domain` names the edges that may be joined: those of the raw octets of one link, or of one virtual channel. `role`,
-`count`, `next_count` and `fit` are those of `link.edges.Edge`, -1 if unknown; the `count` of an opener is its
-`next_count`. `open` is 0 when the octets have been used; they are then deleted. `start` is their position in
-`file_sha256`, NULL for octets of a channel.
+`channel`: number of the virtual channel, start and end of the packet zone in its frames.
 """
 
 
