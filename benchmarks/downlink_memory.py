@@ -18,9 +18,11 @@ import numpy as np
 
 from benchmarks._rows import Row
 from benchmarks.downlink import cadus
-from ground_service.errors import GroundError
-from ground_service.ingest.stream import DownlinkReader, reaches_of
-from ground_service.store.files import mapped_octets, read_blocks
+from ground_service.ingest.frames import FrameReader, Section
+from ground_service.ingest.quality import NO_RECORD, Found
+from ground_service.ingest.reception import WINDOW_OCTETS
+from ground_service.store.files import mapped_octets
+from tmtc.downlink import plan_of
 from tmtc.errors import TmtcError
 
 PART = 16 << 20
@@ -36,16 +38,20 @@ def contents() -> Iterator[tuple[str, bytes | None]]:
 
 def read(path: Path) -> int:
     """Plan and read a file; return the number of packets."""
+    octets = mapped_octets(path)
     try:
-        reaches, _ = reaches_of(mapped_octets(path))
-    except (GroundError, TmtcError):
+        plan = plan_of(octets)
+    except TmtcError:
         return 0
     packets = 0
-    for reach in reaches:
-        reader = DownlinkReader(reach, 76)
-        for _ in reader.batches(read_blocks(path, reach.start, reach.stop)):
-            reader.take_channel_edges()
-        packets += reader.accounting.packets
+    for one in plan.sections:
+        section = Section(one.settings, one.start, one.stop, one.start, one.stop)
+        reader = FrameReader(section, one.settings, Found(), spacecraft_id=76, record=NO_RECORD)
+        starts = range(one.start, one.stop, WINDOW_OCTETS)
+        windows = ((octets[at : min(at + WINDOW_OCTETS, one.stop)], at == starts[-1]) for at in starts)
+        for _ in reader.batches(windows):
+            reader.take_fragments()
+        packets += reader.found.packets
     return packets
 
 

@@ -61,9 +61,8 @@ MISSIONS = (
     f'name = "foreign"\n[spacecraft]\nid = {FOREIGN}\n'
     '[[packets]]\nname = "bus"\napids = [100, 101]\npacket_checksum = "none"\n',
 )
-SUMS = (
-    "packets_new", "samples", "crc_errors", "frames", "frames_bad", "symbols_corrected",
-)  # fmt: skip
+NEW = ("packets_new", "samples")
+SUMS = ("crc_errors", "frames", "frames_bad", "symbols_corrected")
 RECEPTION_SUMS = (
     "frames_good", "codewords", "codewords_lost", "wrong_bits", "checked_bits", "lock_losses", "frames_inverted",
     "octets_frames", "octets_records",
@@ -345,12 +344,17 @@ def contents(ground: Ground, case: Case, instance: str) -> dict[str, Any]:
     return found
 
 
-def sums(ground: Ground, case: Case, results: dict[Piece, int]) -> dict[str, int]:
-    """Return the sums over the ingests of different pieces, as stored."""
-    total = Counter(dict.fromkeys((*SUMS, *RECEPTION_SUMS), 0))
-    for ingest_id in results.values():
+def sums(ground: Ground, case: Case, results: Sequence[tuple[Piece, int]]) -> dict[str, int]:
+    """Return the sums over the ingests: what is new over all, the rest over the first ingest of each piece."""
+    total = Counter(dict.fromkeys((*NEW, *SUMS, *RECEPTION_SUMS), 0))
+    counted: set[Piece] = set()
+    for piece, ingest_id in sorted(results, key=lambda one: one[1]):
         values = get_ingest(ground, ingest_id).accounting
         assert values is not None
+        total.update({name: getattr(values, name) for name in NEW})
+        if piece in counted:
+            continue
+        counted.add(piece)
         total.update({name: getattr(values, name) for name in SUMS})
         if values.reception is not None:
             total.update({name: getattr(values.reception, name) for name in RECEPTION_SUMS})
@@ -388,10 +392,8 @@ class Archive:
             return f"refused: {error}"
 
     def _difference(self, case: Case, instances: tuple[str, str], packets_only: bool) -> str:
-        whole = dict(zip(wholes(case), self.ingest(wholes(case), instances[0]), strict=True))
-        results: dict[Piece, int] = {}
-        for piece, ingest_id in zip(case.pieces, self.ingest(case.pieces, instances[1]), strict=True):
-            results[piece] = min(ingest_id, results.get(piece, ingest_id))
+        whole = list(zip(wholes(case), self.ingest(wholes(case), instances[0]), strict=True))
+        results = list(zip(case.pieces, self.ingest(case.pieces, instances[1]), strict=True))
         expected, found = (contents(self.ground, case, one) for one in instances)
         if expected["archive"] != found["archive"]:
             return f"{found['packets']} of {expected['packets']} packets"

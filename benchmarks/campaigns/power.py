@@ -34,7 +34,7 @@ from sqlalchemy import select
 from benchmarks.campaigns._deployment import service_environment
 from benchmarks.ground import mixed_downlink
 from ground_service.ground import open_ground
-from ground_service.ingest.service import ingest_file
+from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import archive_hash
@@ -176,11 +176,13 @@ CHILD = """
 import os, sys
 from pathlib import Path
 from ground_service.ground import open_ground
-from ground_service.ingest.service import ingest_file
+from ground_service.ingest.service import Place, ingest_file
 home, pieces = Path(sys.argv[1]), Path(sys.argv[2])
+offset = 0
 with open_ground(home) as ground:
     for path in sorted(pieces.iterdir()):
-        ingest_file(ground, path)
+        ingest_file(ground, path, place=Place("power", offset))
+        offset += path.stat().st_size
         with open(home / "acknowledged" / path.name, "w") as note:
             note.write("done")
 """
@@ -356,9 +358,11 @@ def check(folder: Path, pieces: list[bytes], acknowledged: list[str], expected: 
             for row in rows:
                 ground.files.get(row["file_sha256"])
             if expected is not None:
+                offset = sum(map(len, pieces[: len(acknowledged)]))
                 for octets in pieces[len(acknowledged) :]:
                     (folder / "piece").write_bytes(octets)
-                    ingest_file(ground, folder / "piece")
+                    ingest_file(ground, folder / "piece", place=Place("power", offset))
+                    offset += len(octets)
                 with ground.database.writing() as connection:
                     vehicle = vehicle_id(connection, SPACECRAFT, "flight")
                     if archive_hash(connection, vehicle) != expected:

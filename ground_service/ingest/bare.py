@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from ground_service.ingest.fragments import Fragment
 from ground_service.ingest.frames import Section
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from ground_service.ingest.quality import Found
@@ -70,6 +71,10 @@ class PacketReader:
             section.start + int(stops.max(initial=0)),
             section.last + int(starts[0]) if starts.size else section.stop,
         )
+
+    def take_fragments(self) -> list[Fragment]:
+        """Return no fragments: packets without frames have no count by which parts could be found."""
+        return []
 
     def batches(self, windows: Iterable[tuple[OctetArray, bool]]) -> Iterator[PacketBatch]:
         """Yield the packets of the section; `windows` are its octets, each with whether it is the last one."""

@@ -156,10 +156,10 @@ class FrameReader:
         self._context = 0
         self._position = section.start
 
-    @property
-    def fragments(self) -> list[Fragment]:
-        """Fragments of packets, after the last batch."""
-        return self._channels.fragments
+    def take_fragments(self) -> list[Fragment]:
+        """Return the fragments of packets since the last call."""
+        fragments, self._channels.fragments = self._channels.fragments, []
+        return fragments
 
     def begin_at(self, end: int) -> None:
         """Read only frames from an octet on, up to which another reader has read."""

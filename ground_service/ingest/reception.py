@@ -29,6 +29,7 @@ from ground_service.ingest.parameters import decode_declared, definitions_of_spa
 from ground_service.ingest.quality import Found
 from ground_service.ingest.recording_store import Part, Piece
 from ground_service.ingest.redecode import catch_up, note_dictionary
+from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store.files import FileArchive, mapped_octets, read_blocks
 from ground_service.store.stored_files import recorded_name
@@ -51,6 +52,9 @@ decoding and storing take about ten times as much."""
 
 LEAST_GOOD_FRAMES = 2
 """Smallest number of good frames from which their link settings are remembered."""
+
+FRAGMENTS_LIMIT = 1_000
+"""Number of fragments of packets from which they are stored before the end of a piece."""
 
 CERTAIN_OCTETS = 4 * CADU_MAX_OCTETS
 """Length of a piece from which an unknown coding is an error, and not a lack of evidence."""
@@ -177,22 +181,22 @@ class Reading:
         """Read the piece and store what it has completed."""
         run = self._run()
         readers = [self._reader(run, section) for section in self.sections]
+        fragments: list[Fragment] = []
         held: PacketBatch | None = None
         end = 0
         for reader in readers:
             reader.begin_at(end)
             for batch in reader.batches(run.windows(reader.section.start, reader.section.stop)):
                 self.ground.check_stopping()
-                if not len(batch):
-                    continue
-                if held is not None:
-                    self._store_early(held)
+                fragments += reader.take_fragments()
+                if held is not None and len(held):
+                    self._store_early(held, fragments)
                 held = batch
+            fragments += reader.take_fragments()
             end = reader.end
-        fragments = [one for reader in readers if isinstance(reader, FrameReader) for one in reader.fragments]
         if not self.piece.stream and not self.found.frames and not self.found.packets:
             self._refuse("no valid frame or packet")
-        self._finish(held, fragments)
+        self._settle(held, fragments, is_last=True)
 
     # The run and its sections
 
@@ -326,79 +330,95 @@ class Reading:
 
     # Storage
 
-    def _store_early(self, batch: PacketBatch) -> None:
-        """Store a batch that is not the last one."""
-        with self.ground.database.writing() as connection:
-            if not self.is_started:
+    def _store_early(self, batch: PacketBatch, fragments: list[Fragment]) -> None:
+        """Store a batch that is not the last one, and the fragments once there are many."""
+        if not self.is_started:
+            with self.ground.database.writing() as connection:
                 store.start_ingest(connection, self.piece.ingest_id)
-                self.is_started = True
-            self._store(connection, batch)
+            self.is_started = True
+        if len(fragments) < FRAGMENTS_LIMIT:
+            with self.ground.database.writing() as connection:
+                self._count(connection, self._store(connection, batch))
+        else:
+            self._settle(batch, fragments, is_last=False)
+            fragments.clear()
         if self.progress is not None:
             self.progress(min(self.found.octets_used / max(self.piece.octets, 1), 1.0))
 
-    def _finish(self, batch: PacketBatch | None, fragments: list[Fragment]) -> None:
-        """Store the last batch and the fragments, complete packets with fragments, and finish the ingest."""
-        packets, fragments = join(fragments, self._unchecked_apids)
+    def _settle(self, batch: PacketBatch | None, fragments: list[Fragment], *, is_last: bool) -> None:
+        """Store a batch and fragments, and complete packets with fragments; finish the ingest if it is the last one."""
+        packets, rest = join(fragments, self._unchecked_apids)
         with self.ground.database.writing() as connection:
-            if batch is not None:
-                self._store(connection, batch)
-            self._store_packets(connection, packets, joined=False)
-            for spacecraft in sorted({one.channel[0] for one in fragments}):
-                mine = [one for one in fragments if one.channel[0] == spacecraft]
+            stored = Stored(0, 0, 0) if batch is None or not len(batch) else self._store(connection, batch)
+            stored += self._store_whole(connection, packets)
+            self.found.packets += len(packets)
+            self.found.octets_unused -= sum(len(octets) for _, octets in packets)
+            for spacecraft in sorted({one.channel[0] for one in rest}):
+                mine = [one for one in rest if one.channel[0] == spacecraft]
                 recordings.add_fragments(connection, self._vehicle(connection, spacecraft), mine)
-            self._remember(connection)
-            if not fragments:
-                self._done(connection)
-                return
+            self._count(connection, stored, is_last=is_last and not rest)
+        if not rest:
+            return
         # of two pieces that are ingested at the same time, at least the later one sees the fragments of both
-        used: list[tuple[int, Fragment]] = []
+        packets, used = self._completed(rest)
+        with self.ground.database.writing() as connection:
+            stored = self._store_whole(connection, packets)
+            for spacecraft in sorted({one.channel[0] for one in used}):
+                mine = [one for one in used if one.channel[0] == spacecraft]
+                recordings.remove_fragments(connection, self.vehicles[spacecraft], mine)
+            self._count(connection, stored, joined=stored.new, is_last=is_last)
+
+    def _completed(self, fragments: list[Fragment]) -> tuple[list[tuple[int, bytes]], set[Fragment]]:
+        """Return the packets that stored fragments complete, with their spacecraft, and the fragments of them."""
+        packets: list[tuple[int, bytes]] = []
+        used: set[Fragment] = set()
         with self.ground.database.reading() as connection:
             for one in fragments:
-                if any(one == other for _, other in used):
+                spacecraft = one.channel[0]
+                vehicle = self.vehicles[spacecraft]
+                before = partial(recordings.fragments_before, connection, vehicle)
+                behind = partial(recordings.fragments_behind, connection, vehicle)
+                if one in used:
                     continue
-                vehicle, spacecraft = self.vehicles[one.channel[0]], one.channel[0]
-                found = complete(
-                    one,
-                    partial(recordings.fragments_before, connection, vehicle),
-                    partial(recordings.fragments_behind, connection, vehicle),
-                    self._unchecked_apids(spacecraft),
-                )
-                if found is not None:
-                    used += [(vehicle, fragment) for fragment in found[0]]
+                if found := complete(one, before, behind, self._unchecked_apids(spacecraft)):
+                    used.update(found[0])
                     packets.append((spacecraft, found[1]))
-        with self.ground.database.writing() as connection:
-            self._store_packets(connection, packets, joined=True)
-            for vehicle in sorted(set(self.vehicles.values())):
-                recordings.remove_fragments(connection, vehicle, [one for key, one in used if key == vehicle])
-            self._done(connection)
+        return packets, used
 
-    def _store(self, connection: Connection, packets: PacketBatch, *, joined: bool = False) -> None:
+    def _store(self, connection: Connection, packets: PacketBatch) -> Stored:
         assert packets.spacecraft_id is not None
         vehicle = self._vehicle(connection, packets.spacecraft_id)
         stored = store.store_batch(connection, vehicle, packets)
         store.note_receptions(connection, vehicle, self.piece.station, time_receptions(packets))
-        recordings.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=joined)
         defined = np.isin(packets.apid, self._definitions(packets.spacecraft_id).apids)
         self.unknown += packets.unknown - int(np.count_nonzero(defined))
         timed = packets.ticks[packets.ticks != NO_TICKS]
         if timed.size:
             self.ticks = [min([*self.ticks, int(timed.min())]), max([*self.ticks, int(timed.max())])]
+        return stored
 
-    def _store_packets(
-        self, connection: Connection, packets: list[tuple[int, bytes]], *, joined: bool
-    ) -> None:
-        """Store packets that were completed with fragments: of this reading, or `joined` with others."""
+    def _store_whole(self, connection: Connection, packets: list[tuple[int, bytes]]) -> Stored:
+        """Store packets of spacecraft that were completed with fragments."""
+        stored = Stored(0, 0, 0)
         for spacecraft in sorted({one for one, _ in packets}):
             octets = [packet for one, packet in packets if one == spacecraft]
             cut = whole_packets(np.array([len(one) for one in octets], dtype=np.int64))
-            self._store(
-                connection, batch_of_cut(b"".join(octets), cut, DICTIONARY, spacecraft), joined=joined
-            )
-            if not joined:
-                self.found.packets += len(octets)
-                self.found.octets_unused -= sum(len(one) for one in octets)
-        if not joined:
-            packets.clear()
+            stored += self._store(connection, batch_of_cut(b"".join(octets), cut, DICTIONARY, spacecraft))
+        return stored
+
+    def _count(
+        self, connection: Connection, stored: Stored, *, joined: int = 0, is_last: bool = False
+    ) -> None:
+        """Add to the totals of the ingest; finish it if it is the last time."""
+        key = self.piece.ingest_id
+        added = {"packets_stored": stored.new, "packets_joined": joined, "samples_stored": stored.samples}
+        if not is_last:
+            recordings.count_stored(connection, key, added)
+            return
+        self._remember(connection)
+        waits = None if self.has_link else 1
+        self.result = self._result(recordings.count_stored(connection, key, added, waits=waits))
+        store.finish_ingest(connection, self.result, utc_now_ns())
 
     def _vehicle(self, connection: Connection, spacecraft: int) -> int:
         """Return the vehicle id of a spacecraft; create it if it is new."""
@@ -411,18 +431,14 @@ class Reading:
 
     def _remember(self, connection: Connection) -> None:
         """Remember link settings under which frames were valid."""
-        settings = [one.settings for one in self.sections if one.settings is not None]
-        if self.found.frames_good >= LEAST_GOOD_FRAMES:
+        settings = tuple({one.settings for one in self.sections if one.settings is not None})
+        is_last = self.piece.spacecraft_id is not None and settings == self.expected.remembered[:1]
+        if self.found.frames_good >= LEAST_GOOD_FRAMES and not is_last:
             for one in settings:
                 remember_link(connection, self.piece, self.vehicles.values(), one, utc_now_ns())
 
-    def _done(self, connection: Connection) -> None:
-        self.result = self._result(recordings.stored_by(connection, self.piece.ingest_id))
-        store.finish_ingest(connection, self.result, utc_now_ns())
-        recordings.set_waiting(connection, self.piece.ingest_id, waits=not self.has_link)
-
-    def readable_now(self) -> list[int]:
-        """Return the ingests of pieces that can be read because the link of their recording is known."""
+    def readable_now(self) -> list[Piece]:
+        """Return the pieces that can be read because the link of their recording is known."""
         if not self.piece.stream:
             return []
         with self.ground.database.reading() as connection:
@@ -430,7 +446,7 @@ class Reading:
                 return recordings.waiting_pieces(connection, self.piece)
             # another piece may have been read in the meantime
             known = recordings.accounting_of_recording(connection, self.piece)
-            return [] if known is None else [self.piece.ingest_id]
+            return [] if known is None else [self.piece]
 
     def decode(self) -> None:
         """Decode what the description of a vehicle declares, or an older dictionary has decoded."""
@@ -443,7 +459,7 @@ class Reading:
             decode_declared(self.ground, vehicle)
 
     def _result(self, totals: tuple[int, int, int]) -> IngestResult:
-        """Return the result with the totals of `recording_store.stored_by`."""
+        """Return the result with the totals of `recording_store.count_stored`."""
         found = self.found
         new, joined, samples = totals
         return IngestResult(
@@ -456,10 +472,9 @@ class Reading:
             packets_repeated=found.packets - (new - joined),
             samples=samples,
             crc_errors=found.crc_errors,
-            octets_skipped=self.piece.octets - found.octets_used + found.octets_unused,
-            octets_pending=min(found.octets_waiting, self.piece.octets)
-            if self.sections
-            else self.piece.octets,
+            octets_repeated=self.piece.octets - self.octets_new,
+            octets_skipped=self.octets_new - found.octets_used + found.octets_unused,
+            octets_pending=min(found.octets_waiting, self.octets_new) if self.has_link else self.octets_new,
             frames=found.frames,
             frames_bad=found.frames_bad,
             frames_joined=found.frames_joined,

@@ -6,7 +6,7 @@ Every query uses an index and returns a bounded number of rows, so its cost does
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -92,10 +92,20 @@ def add_piece(connection: Connection, piece: Piece) -> None:
 
 def get_piece(connection: Connection, ingest_id: int) -> Piece:
     """Return the piece of an ingest."""
+    (piece,) = _pieces(connection, PIECES.c.ingest_id == ingest_id)
+    return piece
+
+
+def waiting_pieces(connection: Connection, piece: Piece) -> list[Piece]:
+    """Return the pieces of the recording of a piece that wait for its link."""
+    here = PIECES.c.scope == piece.scope, PIECES.c.waits == 1, PIECES.c.stream == piece.stream
+    return _pieces(connection, *here)
+
+
+def _pieces(connection: Connection, *conditions: Any) -> list[Piece]:
     columns = [PIECES.c[field.name] for field in fields(Piece)]
-    return Piece(
-        **connection.execute(select(*columns).where(PIECES.c.ingest_id == ingest_id)).mappings().one()
-    )
+    rows = connection.execute(select(*columns).where(*conditions).order_by(PIECES.c.ingest_id))
+    return [Piece(**row) for row in rows.mappings()]
 
 
 def neighbours(connection: Connection, piece: Piece, reach: int) -> Neighbours:
@@ -160,39 +170,18 @@ def _between(start: int, stop: int, known: Iterable[tuple[int, int]]) -> tuple[t
 
 
 def count_stored(
-    connection: Connection, ingest_id: int, packets: int, samples: int, *, joined: bool = False
-) -> None:
-    """Add to the totals of an ingest, in the transaction that stores the packets.
+    connection: Connection, ingest_id: int, added: Mapping[str, int], **changes: int | None
+) -> tuple[int, int, int]:
+    """Add to the totals of an ingest, in the transaction that stores the packets, and change other columns.
 
-    An ingest that is interrupted and run again finds its own packets in the archive: the totals stay complete.
+    Return the new packets, those of them that were joined, and the samples that the ingest has stored. An ingest that
+    is interrupted and run again finds its own packets in the archive: the totals stay complete.
     """
-    if not packets and not samples:
-        return
-    added = {"packets_stored": packets, "samples_stored": samples, "packets_joined": packets if joined else 0}
-    values = {name: PIECES.c[name] + number for name, number in added.items() if number}
-    connection.execute(update(PIECES).where(PIECES.c.ingest_id == ingest_id).values(values))
-
-
-def stored_by(connection: Connection, ingest_id: int) -> tuple[int, int, int]:
-    """Return the new packets, those of them that were joined, and the samples that an ingest has stored."""
-    columns = PIECES.c.packets_stored, PIECES.c.packets_joined, PIECES.c.samples_stored
-    row = connection.execute(select(*columns).where(PIECES.c.ingest_id == ingest_id)).one()
-    return int(row[0]), int(row[1]), int(row[2])
-
-
-def set_waiting(connection: Connection, ingest_id: int, *, waits: bool) -> None:
-    """Record whether a piece is to be read again when the link of its recording is known."""
-    table, value = PIECES, 1 if waits else None
-    changed = table.c.waits.is_(None) if waits else table.c.waits.is_not(None)
-    connection.execute(update(table).where(table.c.ingest_id == ingest_id, changed).values(waits=value))
-
-
-def waiting_pieces(connection: Connection, piece: Piece) -> list[int]:
-    """Return the ingests of the pieces of a recording that wait for its link."""
-    query = select(PIECES.c.ingest_id).where(
-        PIECES.c.scope == piece.scope, PIECES.c.waits == 1, PIECES.c.stream == piece.stream
-    )
-    return [int(key) for key in connection.execute(query.order_by(PIECES.c.ingest_id)).scalars()]
+    totals = PIECES.c.packets_stored, PIECES.c.packets_joined, PIECES.c.samples_stored
+    values = {name: PIECES.c[name] + number for name, number in added.items()}
+    query = update(PIECES).where(PIECES.c.ingest_id == ingest_id).values({**values, **changes})
+    packets, joined, samples = connection.execute(query.returning(*totals)).one()
+    return int(packets), int(joined), int(samples)
 
 
 def accounting_of_recording(connection: Connection, piece: Piece) -> dict[str, Any] | None:

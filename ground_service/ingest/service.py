@@ -102,8 +102,8 @@ def ingest_stored(
 ) -> IngestResult:
     """Store what is in an archived downlink file; see `ingest_file`."""
     with ground.database.writing() as connection:
-        ingest_id = _add(connection, stored, name, "running", spacecraft_id, instance, place, station, link)
-    return run_ingest(ground, ingest_id)
+        piece = _add(connection, stored, name, "running", spacecraft_id, instance, place, station, link)
+    return _ingest(ground, piece)
 
 
 def enter_ingest(
@@ -132,7 +132,9 @@ def enter_ingest(
             known = find_job(connection, job_id)
             if known is not None:
                 return _known_ingest(connection, known, stored, arguments), job_id
-        ingest_id = _add(connection, stored, name, "queued", spacecraft_id, instance, place, station, link)
+        ingest_id = _add(
+            connection, stored, name, "queued", spacecraft_id, instance, place, station, link
+        ).ingest_id
         return ingest_id, add_job(connection, "ingest", {"ingest_id": ingest_id, **arguments}, job_id=job_id)
 
 
@@ -146,8 +148,8 @@ def _add(
     place: Place | None,
     station: str,
     link: str | None,
-) -> int:
-    """Add the ingest of an archived file as a piece of its recording; return its id."""
+) -> Piece:
+    """Add the ingest of an archived file as a piece of its recording; return the piece."""
     try:
         assert link is None or LinkSettings.parse(link)
     except TmtcError as error:
@@ -162,7 +164,7 @@ def _add(
         ingest_id, instance, spacecraft_id, stored.sha256, stored.octets, stream, position, station, link
     )
     add_piece(connection, piece)
-    return ingest_id
+    return piece
 
 
 def _known_ingest(connection: Connection, job: Job, stored: StoredFile, asked: dict[str, Any]) -> int:
@@ -179,28 +181,27 @@ def run_ingest(ground: Ground, ingest_id: int, *, progress: Progress | None = No
 
     `progress` is called with the stored share of the file, several times for a long file.
     """
+    with ground.database.reading() as connection:
+        piece = get_piece(connection, ingest_id)
+    return _ingest(ground, piece, progress)
+
+
+def _ingest(ground: Ground, piece: Piece, progress: Progress | None = None) -> IngestResult:
     with ground.database.listeners.held():  # one call for the whole file, not one for each batch
         try:
-            reading = _read(ground, ingest_id, progress)
+            reading = Reading(ground, piece, progress)
+            reading.read()
             for other in reading.readable_now():
                 with suppress(InvalidInput):
-                    _read(ground, other)
+                    Reading(ground, other).read()
+            reading.decode()
         except PASSING:
             raise
         except (GroundError, TmtcError) as error:
             with ground.database.writing() as connection:
-                store.fail_ingest(connection, ingest_id, str(error), utc_now_ns())
+                store.fail_ingest(connection, piece.ingest_id, str(error), utc_now_ns())
             raise
     return reading.result
-
-
-def _read(ground: Ground, ingest_id: int, progress: Progress | None = None) -> Reading:
-    with ground.database.reading() as connection:
-        piece = get_piece(connection, ingest_id)
-    reading = Reading(ground, piece, progress)
-    reading.read()
-    reading.decode()
-    return reading
 
 
 def apply_definition(ground: Ground, vehicle: int) -> int:

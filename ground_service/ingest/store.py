@@ -102,6 +102,9 @@ class Stored:
     repeated: int
     samples: int
 
+    def __add__(self, other: Stored) -> Stored:
+        return Stored(self.new + other.new, self.repeated + other.repeated, self.samples + other.samples)
+
 
 def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored:
     """Store the packets of a batch that are not stored yet, inside the caller's write transaction.

@@ -412,7 +412,7 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, 
 def test_a_bare_stream_without_checksums_is_read_in_windows(
     ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ground_service.ingest.stream.WINDOW_OCTETS", 5_000)
+    monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", 5_000)
     enter(ground, tmp_path / "m")
     path = tmp_path / "bare.packets"
     path.write_bytes(b"".join(bus_packets(400)))

@@ -4,7 +4,7 @@ from typing import Any
 
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
-from ground_service.ingest.store import results_of_vehicle
+from ground_service.ingest.store import recordings_of_vehicle
 from ground_service.store import repository
 
 
@@ -15,7 +15,7 @@ def test_only_ingests_with_packets_in_the_time_are_returned(either: Ground, synt
 
     def found(start_ticks: int, stop_ticks: int) -> int:
         with either.database.reading() as connection:
-            return len(results_of_vehicle(connection, result.vehicle_id or 0, start_ticks, stop_ticks))
+            return len(recordings_of_vehicle(connection, result.vehicle_id or 0, start_ticks, stop_ticks))
 
     assert found(first, last) == found(first - 9, first) == found(last, last + 9) == 1
     assert found(first + 1, first + 2) == 1

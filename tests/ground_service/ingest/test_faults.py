@@ -27,12 +27,12 @@ KILLS = 4
 INGEST = """
 import sys
 from pathlib import Path
-from ground_service.ingest import stream
+from ground_service.ingest import reception
 from ground_service.store import files
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 files.BLOCK_OCTETS = 4_000
-stream.DownlinkReader.__init__.__defaults__ = (None, stream.DICTIONARY, 4_000)
+reception.WINDOW_OCTETS = 4_000
 with open_ground(Path(sys.argv[1])) as ground:
     print("ready", flush=True)
     ingest_file(ground, Path(sys.argv[2]))

@@ -1,9 +1,6 @@
-"""Ingest: any order, any split, any repetition of the same octets gives the same archive."""
+"""Ingest of whole recordings and of pieces: what is stored, counted, refused and made up for after a failure."""
 
 import contextlib
-import itertools
-import multiprocessing
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import event, func, select
 
-from ground_service.errors import DatabaseBusy, InvalidInput
+from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest import edge_store as edges
-from ground_service.ingest.edges import MIDDLE
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
@@ -134,8 +129,8 @@ def test_two_spacecraft_in_one_file_have_archives_of_their_own(
     assert archive(ground) == expected
     with ground.database.reading() as connection:
         other = vehicle_id(connection, 33, "flight")
-        stored = repository.newest(connection, repository.PACKETS, Paging(), vehicle_id=other)
-    assert stored[1] == 20
+        _, stored = repository.newest(connection, repository.PACKETS, Paging(), vehicle_id=other)
+    assert stored == 20
 
 
 def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(
@@ -155,11 +150,12 @@ def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(
     assert set(strangers) <= kept
 
 
-def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: Path) -> None:
+@pytest.mark.parametrize("octets", [1_000, 70_000])
+def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: Path, octets: int) -> None:
     with pytest.raises(
-        InvalidInput, match=r"noise\.bin: expected a stream of CADUs or of space packets, found 70000"
+        InvalidInput, match=rf"noise\.bin: expected a stream of CADUs or of space packets, found {octets}"
     ):
-        ingest(ground, np.random.default_rng(3).bytes(70_000), tmp_path, "noise.bin")
+        ingest(ground, np.random.default_rng(3).bytes(octets), tmp_path, "noise.bin")
     with ground.database.reading() as connection:
         record = repository.newest(connection, repository.INGESTS, Paging())[0][0]
     assert record["state"] == "failed"
@@ -171,137 +167,101 @@ def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path) -> None:
         ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
 
 
-def random_pieces(octets: bytes, seed: int, count: int, smallest: int = 1) -> list[bytes]:
-    """Pieces cut at random octets, in random order, some of them twice."""
-    rng = np.random.default_rng(seed)
-    cuts = [0]
-    for cut in sorted(rng.integers(1, len(octets), count).tolist()):
-        if cut - cuts[-1] >= smallest and len(octets) - cut >= smallest:
-            cuts.append(cut)
-    pieces = [octets[a:b] for a, b in itertools.pairwise([*cuts, len(octets)])]
-    order = [*rng.permutation(len(pieces)).tolist(), *rng.integers(0, len(pieces), 2).tolist()]
-    return [pieces[i] for i in order]
+def place(
+    ground: Ground, octets: bytes, start: int, folder: Path, stream: str = "stream", **more: Any
+) -> Any:
+    return ingest_file(ground, written(folder, octets), place=Place(stream, start), **more)
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("frame_length", [223, 1115])
-def test_a_stream_of_frames_may_be_cut_at_any_octet(
-    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, seed: int, frame_length: int
+def test_octets_that_wait_are_counted_and_are_no_error(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path
 ) -> None:
-    """Pieces of any size without position: shorter than a CADU, without a marker, or cut within one."""
-    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=frame_length)
-    pieces = random_pieces(stream, seed, 12)
-    if frame_length == 223:  # a piece has to show the link where it is not the usual one
-        pieces = [*pieces[1:], stream[:1200], pieces[0]]
-    for piece in pieces:
-        result = ingest(ground, piece, tmp_path)
-    assert archive(ground) == expected
-    assert result.octets_pending == 0
-
-
-@pytest.mark.parametrize("placed", [False, True])
-@pytest.mark.parametrize("bare", [False, True])
-def test_pieces_are_joined_whether_or_not_their_spacecraft_is_stated(
-    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, bare: bool, placed: bool
-) -> None:
-    """Bare packets always need it; another spacecraft's pieces in between are not joined with them."""
-    stream = b"".join(packets) if bare else encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    cuts = np.unique(np.random.default_rng(6).integers(1, len(stream), 8)).tolist()
-    pieces = list(itertools.pairwise([0, *cuts, len(stream)]))
-    if placed:
-        pieces.reverse()
-    for number, (start, stop) in enumerate(pieces):
-        for spacecraft in (SPACECRAFT if bare or number % 2 else None, SPACECRAFT + 1):
-            ingest_file(
-                ground,
-                written(tmp_path, stream[start:stop]),
-                spacecraft_id=spacecraft,
-                place=Place(f"of {spacecraft}" if bare else "stream", start) if placed else None,
-            )
-    assert archive(ground) == expected
-    other = repository.PACKETS
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    first = place(ground, stream[300:900], 300, tmp_path)
+    assert (first.packets, first.octets_pending) == (0, 600)
     with ground.database.reading() as connection:
-        vehicle = vehicle_id(connection, SPACECRAFT + 1, "flight")
-        count = select(func.count()).select_from(other).where(other.c.vehicle_id == vehicle)
-        assert connection.execute(count).scalar_one() == (len(packets) if bare else 0)
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_bare_packets_may_be_cut_at_any_octet(
-    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, seed: int
-) -> None:
-    for piece in random_pieces(b"".join(packets), seed, 8):
-        ingest(ground, piece, tmp_path)
+        record = repository.newest(connection, repository.INGESTS, Paging())[0][0]
+    assert (record["state"], record["error"]) == ("done", None)
+    assert record["accounting"]["octets_pending"] == 600
+    last = place(ground, stream[900:], 900, tmp_path)
+    assert (last.frames_joined, last.octets_pending) == (0, 979)
+    both = place(ground, stream[:300], 0, tmp_path)
+    assert both.frames_joined == 1 and both.packets > 0 and both.packets_joined == 1
     assert archive(ground) == expected
 
 
-@pytest.mark.parametrize("bare", [False, True])
-@pytest.mark.parametrize("placed", [False, True])
-def test_pieces_of_a_few_octets_are_joined_by_their_place(
-    ground: Ground, packets: list[bytes], tmp_path: Path, bare: bool, placed: bool
+def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(
+    ground: Ground, packets: list[bytes], tmp_path: Path
 ) -> None:
-    """In order of arrival without a position, in any order with one."""
-    chosen = packets[:4]
-    stream = b"".join(chosen) if bare else encode_cadus(chosen, spacecraft_id=SPACECRAFT, frame_length=223)
-    size = 40
-    starts = list(range(0, len(stream), size))
-    if placed:
-        starts = np.random.default_rng(3).permutation(starts).tolist()
-    for start in starts:
-        (tmp_path / "piece").write_bytes(stream[start : start + size])
-        place = Place("stream", start) if placed else None
-        ingest_file(
-            ground,
-            tmp_path / "piece",
-            spacecraft_id=SPACECRAFT if bare else None,
-            place=place,
-        )
-    table = repository.PACKETS
-    with ground.database.reading() as connection:
-        assert set(connection.execute(select(table.c.octets)).scalars()) == set(chosen)
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    result = ingest(ground, stream[300 : 4 * 1279 + 100], tmp_path)
+    assert (result.frames, result.octets_pending) == (3, 979 + 100)
+    with pytest.raises(
+        InvalidInput, match=r"600 octets with no valid frame or packet; .*--recording NAME FILE"
+    ):
+        ingest(ground, stream[300:900], tmp_path)
+
+
+def test_a_frame_of_two_recordings_is_none(ground: Ground, packets: list[bytes], tmp_path: Path) -> None:
+    """The octets before and behind a cut belong together only in one recording of one instance."""
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    place(ground, stream[:4000], 0, tmp_path)
+    for name, instance in (("other", "flight"), ("stream", "twin")):
+        assert place(ground, stream[4000:], 4000, tmp_path, name, instance=instance).frames_joined == 0
+    assert place(ground, stream[4000:], 4000, tmp_path).frames_joined == 1
+
+
+def test_pieces_for_one_spacecraft_and_for_any_adjoin(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path
+) -> None:
+    """The same octets read for another spacecraft before are read again."""
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    for number, start in enumerate(range(0, len(stream), 1_000)):
+        mine = SPACECRAFT if number % 2 else None
+        for spacecraft in (SPACECRAFT + 1, mine):
+            place(ground, stream[start : start + 1_000], start, tmp_path, spacecraft_id=spacecraft)
+    assert archive(ground) == expected
+
+
+def test_octets_that_came_before_are_counted_as_repeated(
+    ground: Ground, packets: list[bytes], tmp_path: Path
+) -> None:
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    first = place(ground, stream[:5_000], 0, tmp_path)
+    again = place(ground, stream[:5_000], 0, tmp_path)
+    assert (again.frames, again.packets_new, again.octets_repeated) == (first.frames, 0, 0)
+    part = place(ground, stream[1_000:6_000], 1_000, tmp_path)
+    assert (part.octets_repeated, part.frames, part.frames_joined) == (4_000, 1, 1)
+    inside = place(ground, stream[2_000:3_000], 2_000, tmp_path)
+    assert (inside.octets_repeated, inside.frames, inside.octets_skipped) == (1_000, 0, 0)
 
 
 def test_single_octets_are_joined_by_their_place(
     ground: Ground, packets: list[bytes], tmp_path: Path
 ) -> None:
     stream = encode_cadus(packets[:1], spacecraft_id=SPACECRAFT)
-    ingest_file(ground, written(tmp_path, stream[:900]), place=Place("stream", 0))
+    place(ground, stream[:900], 0, tmp_path)
     for start in np.random.default_rng(1).permutation(np.arange(900, 912)).tolist():
-        ingest_file(ground, written(tmp_path, stream[start : start + 1]), place=Place("stream", start))
+        place(ground, stream[start : start + 1], start, tmp_path)
     assert rows(ground, repository.PACKETS) == 0
-    ingest_file(ground, written(tmp_path, stream[912:]), place=Place("stream", 912))
+    place(ground, stream[912:], 912, tmp_path)
     assert rows(ground, repository.PACKETS) == 1
 
 
-def test_octets_that_wait_are_counted_and_are_no_error(
+def test_fragments_that_fit_by_length_and_count_alone_make_no_packet(
     ground: Ground, packets: list[bytes], tmp_path: Path
 ) -> None:
+    """The rest of other packets with the same frame counts: the checksum shows that it does not belong here."""
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    first = ingest(ground, stream[300:900], tmp_path)
-    assert (first.packets, first.packets_new, first.octets_pending) == (0, 0, 600)
-    with ground.database.reading() as connection:
-        record = repository.newest(connection, repository.INGESTS, Paging())[0][0]
-    assert (record["state"], record["error"]) == ("done", None)
-    assert record["accounting"]["octets_pending"] == 600
-    last = ingest(ground, stream[900:2000], tmp_path)
-    assert (last.frames_joined, last.packets_new) == (0, 0)
-    both = ingest(ground, stream[:300], tmp_path)
-    assert both.frames_joined == 1 and both.packets_joined > 0
-
-
-def test_octets_that_fit_by_length_and_count_alone_make_no_packet(
-    ground: Ground, packets: list[bytes], tmp_path: Path
-) -> None:
-    """The end of another spacecraft's CADU of the same count: the code shows that it does not belong here."""
-    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    other = encode_cadus([bytes(reversed(packet)) for packet in packets], spacecraft_id=SPACECRAFT)
-    ingest(ground, stream[:700], tmp_path)
-    assert ingest(ground, other[700 : 3 * 1279], tmp_path).frames_joined == 0
-    assert ingest(ground, stream[700 : 3 * 1279], tmp_path).frames_joined == 1
-    kept = set(packets)
+    others = [append_crc(one[:9] + b"?" + one[10:-2]) for one in packets]
+    other = encode_cadus(others, spacecraft_id=SPACECRAFT)
+    ingest(ground, stream[: 2 * 1279], tmp_path)
+    ingest(ground, other[2 * 1279 : 4 * 1279], tmp_path)
     table = repository.PACKETS
     with ground.database.reading() as connection:
-        assert set(connection.execute(select(table.c.octets)).scalars()) <= kept
+        stored = set(connection.execute(select(table.c.octets)).scalars())
+    assert stored <= {*packets, *others}
+    assert ingest(ground, stream[2 * 1279 :], tmp_path).packets_joined == 1
 
 
 def test_frames_of_two_receivers_are_merged(
@@ -317,62 +277,29 @@ def test_frames_of_two_receivers_are_merged(
     assert archive(ground) == expected
 
 
-@pytest.mark.parametrize("bare", [False, True])
-def test_pieces_with_a_place_are_not_searched_for_by_content(
-    ground: Ground, packets: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: bool
+def test_many_fragments_are_stored_before_the_end_of_a_recording(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise, many small pieces would be tried in every order for each new piece."""
-    roles: list[int] = []
-    original = edges.candidates
-    monkeypatch.setattr(
-        edges,
-        "candidates",
-        lambda connection, domain, role, **wanted: (
-            roles.append(role) or original(connection, domain, role, **wanted)
-            if not domain.startswith("channel")
-            else original(connection, domain, role, **wanted)
-        ),
-    )
-    chosen = packets[:2]
-    stream = b"".join(chosen) if bare else encode_cadus(chosen, spacecraft_id=SPACECRAFT, frame_length=223)
-    for start in range(len(stream) - len(stream) % 60, -1, -60):
-        ingest_file(
-            ground,
-            written(tmp_path, stream[start : start + 60]),
-            spacecraft_id=SPACECRAFT if bare else None,
-            place=Place("stream", start),
-        )
-    assert rows(ground, repository.PACKETS) == 2
-    assert MIDDLE not in roles
+    monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", 2_000)
+    monkeypatch.setattr("ground_service.ingest.reception.FRAGMENTS_LIMIT", 3)
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
+    frames = [stream[at : at + 259] for at in range(0, len(stream), 259)]
+    ingest(ground, b"".join(frames[1::2] + frames[::2]), tmp_path)
+    assert archive(ground) == expected
+    assert rows(ground, repository.FRAGMENTS) == 0
 
 
 def test_a_piece_is_stored_in_few_transactions(ground: Ground, packets: list[bytes], tmp_path: Path) -> None:
-    """Each commit waits for the disk: entered, read, joined (CADU, packets), correlated and accounted for."""
+    """Each commit waits for the disk: entered, read, completed with fragments, correlated."""
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
     middle = len(stream) // 2
-    ingest(ground, stream[:middle], tmp_path)
+    place(ground, stream[:middle], 0, tmp_path)
     commits = []
     event.listen(
         ground.database.engine, "commit", lambda c: commits.append(c.get_execution_options()["linna_write"])
     )
-    assert ingest(ground, stream[middle:], tmp_path).frames_joined == 1
-    assert len(commits) <= 6
-
-
-@pytest.mark.parametrize("order", [(0, 3, 2, 1), (3, 0, 1, 2), (2, 0, 3, 1)])
-def test_the_beginning_of_another_cadu_that_the_code_repairs_is_not_used_up(
-    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, order: tuple[int, ...]
-) -> None:
-    """Two CADUs are cut at the same octet; 73 wrong octets of a frame are within what the code corrects.
-
-    A third piece of the first CADU keeps its end from being repaired in the same way.
-    """
-    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    cuts = [0, 1279 + 77, 1279 + 300, 3 * 1279 + 77, len(stream)]
-    pieces = [stream[a:b] for a, b in itertools.pairwise(cuts)]
-    for number in order:
-        ingest(ground, pieces[number], tmp_path)
-    assert archive(ground) == expected
+    assert place(ground, stream[middle:], middle, tmp_path).frames_joined == 1
+    assert len(commits) <= 5
 
 
 class PowerFailure(Exception):
@@ -385,13 +312,13 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
 ) -> None:
     """A CADU of three pieces, with packets that reach into its neighbours; the piece that completes it is cut off."""
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    pieces = [stream[:1700], stream[1700:2300], stream[2300:]]
+    pieces = [(0, stream[:1700]), (1700, stream[1700:2300]), (2300, stream[2300:])]
     if shuffled:
         pieces = [pieces[2], pieces[0], pieces[1]]
     for commits in range(1, 8):
         with open_ground(tmp_path / f"{commits}") as ground:
-            for piece in pieces[:2]:
-                ingest(ground, piece, tmp_path)
+            for start, octets in pieces[:2]:
+                place(ground, octets, start, tmp_path)
             dialect, left = ground.database.engine.dialect, [commits]
             commit = dialect.do_commit
 
@@ -402,66 +329,15 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
                     raise PowerFailure
 
             dialect.do_commit = failing
+            start, octets = pieces[2]
             with contextlib.suppress(PowerFailure):
-                ingest(ground, pieces[2], tmp_path)
+                place(ground, octets, start, tmp_path)
             dialect.do_commit = commit
-            ingest(ground, pieces[2], tmp_path)
+            place(ground, octets, start, tmp_path)
             assert archive(ground) == expected, f"after commit {commits}"
             with ground.database.reading() as connection:
                 stored = connection.execute(select(func.sum(repository.PIECES.c.packets_stored))).scalar_one()
             assert stored == len(packets), f"after commit {commits}"
-
-
-def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]], placed: bool) -> None:
-    """Ingest pieces as one worker process."""
-    with open_ground(Path(home), database_url=url) as ground:
-        for number, (start, octets) in enumerate(pieces):
-            path = Path(home) / f"piece-{os.getpid()}-{number}"
-            path.write_bytes(octets)
-            place = Place("stream", start) if placed else None
-            for attempt in range(20):
-                try:
-                    ingest_file(ground, path, place=place)
-                    break
-                except DatabaseBusy:
-                    assert attempt < 19
-
-
-@pytest.mark.parametrize("placed", [True, False])
-@pytest.mark.parametrize("seed", [4, 5])
-def test_two_workers_give_the_same_archive(
-    packets: list[bytes],
-    expected: str,
-    tmp_path: Path,
-    migrated_postgres: Callable[[], str],
-    seed: int,
-    placed: bool,
-) -> None:
-    """Neighbours are ingested at the same time by different processes; every third piece by both.
-
-    Without places no CADU is cut more often than `MIDDLES_IN_A_CADU` allows.
-    """
-    url = migrated_postgres()
-    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    cuts = np.unique(np.random.default_rng(seed).integers(1, len(stream), 24 if placed else 10)).tolist()
-    pieces = [(a, stream[a:b]) for a, b in itertools.pairwise([0, *cuts, len(stream)])]
-    shares = [[one for k, one in enumerate(pieces) if k % 2 == half or k % 3 == 0] for half in (0, 1)]
-    context = multiprocessing.get_context("spawn")
-    workers = [
-        context.Process(target=ingest_pieces, args=(url, str(tmp_path / "home"), share, placed))
-        for share in shares
-    ]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join(120)
-        assert worker.exitcode == 0
-    with open_ground(tmp_path / "home", database_url=url) as ground:
-        assert archive(ground) == expected
-        table = repository.INGESTS
-        with ground.database.reading() as connection:
-            records = connection.execute(select(table.c.accounting)).scalars().all()
-        assert sum(one["packets_new"] for one in records) == len(packets)
 
 
 def written(folder: Path, octets: bytes) -> Path:

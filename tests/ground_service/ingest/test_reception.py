@@ -27,7 +27,7 @@ from ground_service.access.store import list_audit
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.model import IngestResult
-from ground_service.ingest.service import ingest_file
+from ground_service.ingest.service import Place, ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.missions.store import links_in_force
 from ground_service.passes.archive_import import import_archive
@@ -233,9 +233,10 @@ def test_receptions_of_two_stations_are_merged_in_any_order_and_split(
     pieces = []
     for station, octets in zip(("madrid-x", "goldstone"), stream.files, strict=True):
         cuts = [0, *sorted(rng.integers(0, len(octets), 2).tolist()), len(octets)]
-        pieces += [(station, octets[a:b]) for a, b in itertools.pairwise(cuts) if b > a]
+        pieces += [(station, a, octets[a:b]) for a, b in itertools.pairwise(cuts) if b > a]
     for k in rng.permutation(len(pieces)).tolist():
-        ingest(ground, tmp_path, pieces[k][1], station=pieces[k][0])
+        station, start, octets = pieces[k]
+        ingest(ground, tmp_path, octets, station=station, place=Place(station, start))
     assert stored(ground) == stream.packets[SPACECRAFT]
 
 
@@ -244,9 +245,9 @@ def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path
     hashes = set()
     for cut in (0, 1279 * 301, 400_001):
         ground = open_ground(tmp_path / str(cut))
-        for part in (stream.files[0][cut:], stream.files[0][:cut]):
+        for start, part in ((cut, stream.files[0][cut:]), (0, stream.files[0][:cut])):
             if part:
-                ingest(ground, tmp_path, part)
+                ingest(ground, tmp_path, part, place=Place("both", start))
         assert {one: stored(ground, one) for one in stream.packets} == stream.packets
         with ground.database.reading() as connection:
             vehicles = [vehicle_id(connection, one, "flight") for one in sorted(stream.packets)]

@@ -11,13 +11,14 @@ import pytest
 from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest import store
+from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.packets import CLOCKS_AGREE_NS, PacketBatch, batch_of_cut, time_receptions
-from ground_service.ingest.quality import NO_TIME, RecordFormat
-from ground_service.ingest.stream import DownlinkReader, Link, Reach
+from ground_service.ingest.quality import NO_TIME, Found, RecordFormat
 from ground_service.store.repository import RECEPTIONS
 from ground_service.store.vehicles import vehicle_id
 from lunar.arrays import IntArray
 from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tmtc.arrays import as_octets
 from tmtc.crc import CRC_LENGTH
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -50,11 +51,11 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
     rows = [cadus[at : at + length] for at in range(0, len(cadus), length)]
     times = START + np.arange(len(rows), dtype=np.int64) * NS
     stream = b"".join(struct.pack(">q", time) + row for time, row in zip(times.tolist(), rows, strict=True))
-    reach = Reach(Link(SETTINGS), 0, len(stream), len(stream))
-    reader = DownlinkReader(reach, 76, record=RECORD, window_octets=window_octets)
-    blocks = [stream[at : at + 1_000] for at in range(0, len(stream), 1_000)]
+    section = Section(SETTINGS, 0, len(stream), 0, len(stream))
+    reader = FrameReader(section, SETTINGS, Found(), spacecraft_id=76, record=RECORD)
+    blocks = [stream[at : at + window_octets] for at in range(0, len(stream), window_octets)]
     found: dict[int, int] = {}
-    for batch in reader.batches(blocks):
+    for batch in reader.batches((as_octets(one), one is blocks[-1]) for one in blocks):
         assert batch.received_utc_ns is not None
         found |= dict(zip(batch.sequence_count.tolist(), batch.received_utc_ns.tolist(), strict=True))
     starts = np.cumsum([0, *map(len, packets)])
@@ -67,8 +68,8 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
             {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
         )
         assert found[k] in expected
-    assert reader.accounting.quality.first_utc_ns == times[0]
-    assert reader.accounting.quality.last_utc_ns == times[-1]
+    assert reader.found.first_utc_ns == times[0]
+    assert reader.found.last_utc_ns == times[-1]
 
 
 def test_reports_of_clocks_that_differ_are_left_out() -> None:

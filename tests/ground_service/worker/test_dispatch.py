@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import threading
 from collections.abc import Callable
@@ -13,10 +12,9 @@ import pytest
 
 from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest import reading as ingesting
+from ground_service.ingest import reception
 from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest, ingest_file
-from ground_service.ingest.stream import DownlinkReader
 from ground_service.store import files, repository
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import dispatch
@@ -33,7 +31,7 @@ def downlink(make_pass: Callable[..., Any]) -> Path:
 def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stream is stored in about ten transactions."""
     monkeypatch.setattr(files, "BLOCK_OCTETS", 4_000)
-    monkeypatch.setattr(ingesting, "DownlinkReader", functools.partial(DownlinkReader, window_octets=4_000))
+    monkeypatch.setattr(reception, "WINDOW_OCTETS", 4_000)
 
 
 def hash_of(ground: Ground) -> str:

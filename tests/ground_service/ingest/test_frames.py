@@ -1,15 +1,17 @@
 """Reading a downlink in windows: no packet lost at a border, the same accounting as read at once."""
 
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ground_service.ingest.stream import DownlinkReader, reaches_of
+from ground_service.ingest.bare import PacketReader
+from ground_service.ingest.frames import FrameReader, Section
+from ground_service.ingest.quality import NO_RECORD, Found
 from tmtc.arrays import as_octets
-from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus
+from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus, plan_of
 from tmtc.frames import Clcw, pack_clcw
 
 SPACECRAFT = 76
@@ -20,29 +22,36 @@ def packets(make_pass: Callable[..., Any]) -> list[bytes]:
     return list(make_pass(frames=30).packets)
 
 
-def reader_of(octets: bytes, spacecraft_id: int | None = None, **options: Any) -> DownlinkReader:
-    ((reach,), _) = reaches_of(as_octets(octets))
-    return DownlinkReader(reach, spacecraft_id, **options)
+def windows(octets: bytes, size: int) -> Iterator[tuple[Any, bool]]:
+    for start in range(0, len(octets), size):
+        yield as_octets(octets[start : start + size]), start + size >= len(octets)
 
 
-def read(octets: bytes, block: int, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], Any]:
-    reader = reader_of(octets, spacecraft_id, window_octets=window)
-    blocks = (octets[i : i + block] for i in range(0, len(octets), block))
-    found = [packet for batch in reader.batches(blocks) for packet in batch.octets]
-    return found, reader.accounting
+def reader_of(octets: bytes, spacecraft_id: int | None = None) -> FrameReader | PacketReader:
+    sections = plan_of(octets).sections
+    section = Section(None, 0, len(octets), 0, len(octets))
+    if not sections:
+        return PacketReader(section, Found(), spacecraft_id=spacecraft_id)
+    return FrameReader(section, sections[0].settings, Found(), spacecraft_id=spacecraft_id, record=NO_RECORD)
 
 
-@pytest.mark.parametrize(("block", "window"), [(997, 1 << 20), (997, 8_000), (1 << 20, 1 << 20)])
-def test_every_packet_comes_through_whatever_the_blocks(
-    packets: list[bytes], block: int, window: int
-) -> None:
+def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], Found, int]:
+    """The packets, the counts, and the octets in no frame or packet."""
+    reader = reader_of(octets, spacecraft_id)
+    packets = [packet for batch in reader.batches(windows(octets, window)) for packet in batch.octets]
+    found = reader.found
+    return packets, found, len(octets) - found.octets_used + found.octets_unused
+
+
+@pytest.mark.parametrize("window", [1 << 20, 8_000, 997])
+def test_every_packet_comes_through_whatever_the_windows(packets: list[bytes], window: int) -> None:
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
-    found, accounting = read(stream, block, window)
+    found, accounting, skipped = read(stream, window)
     assert set(found) == set(packets)
     assert accounting.packets == len(packets)
     assert accounting.frames == len(stream) // 259
-    assert (accounting.frames_bad, accounting.octets_skipped, accounting.crc_errors) == (0, 0, 0)
-    assert accounting.octets == len(stream)
+    assert (accounting.frames_bad, skipped, accounting.crc_errors) == (0, 0, 0)
+    assert accounting.octets_used == len(stream)
 
 
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
@@ -54,44 +63,46 @@ def test_damage_is_accounted_for_alike_in_windows_and_at_once(packets: list[byte
     for frame in (3, 17, 40):
         stream[frame * 259 + 10 : frame * 259 + 110] = rng.bytes(100)
     whole = decode(bytes(stream))
-    found, accounting = read(bytes(stream), 1000, window)
+    found, accounting, skipped = read(bytes(stream), window)
     assert set(found) == set(whole.cut.packets(whole.buffer))
     assert accounting.packets == whole.packets
     assert accounting.symbols_corrected == whole.symbols_corrected > 100
     assert accounting.frames_bad == whole.frames_bad == 3
-    assert accounting.octets_skipped == whole.octets_skipped
+    assert skipped == whole.octets_skipped
 
 
-def test_bare_packets_are_read_in_any_blocks(packets: list[bytes]) -> None:
-    found, accounting = read(b"".join(packets), 100, 1000, SPACECRAFT)
-    assert found == packets
-    assert accounting.octets_skipped == 0
+def test_bare_packets_are_read_in_any_windows(packets: list[bytes]) -> None:
+    found, _, skipped = read(b"".join(packets), 1000, SPACECRAFT)
+    assert (found, skipped) == (packets, 0)
 
 
 def test_two_spacecraft_in_one_file_are_told_apart(packets: list[bytes]) -> None:
     stream = encode_cadus(packets[:40], spacecraft_id=76) + encode_cadus(packets[20:60], spacecraft_id=33)
     reader = reader_of(stream)
     by_spacecraft: dict[int | None, list[bytes]] = {}
-    for batch in reader.batches([stream]):
+    for batch in reader.batches(windows(stream, 1 << 20)):
         by_spacecraft.setdefault(batch.spacecraft_id, []).extend(batch.octets)
     assert by_spacecraft == {76: packets[:40], 33: packets[20:60]}
-    assert reader.accounting.frames_bad == 0
+    assert reader.found.frames_bad == 0
 
 
 def test_frames_of_another_spacecraft_are_left_out_when_one_is_named(packets: list[bytes]) -> None:
     stream = encode_cadus(packets[:40], spacecraft_id=76) + encode_cadus(packets[20:60], spacecraft_id=33)
-    found, accounting = read(stream, 1 << 20, 1 << 20, 33)
+    found, accounting, _ = read(stream, 1 << 20, 33)
     assert found == packets[20:60]
     assert accounting.frames_bad > 0
 
 
 def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
-    read(stream, 1 << 20, 1 << 20)  # imports and compiles
-    reader = reader_of(stream, SPACECRAFT, window_octets=5 * len(stream))
+    read(stream, 1 << 20)  # imports and compiles
+    section = Section(None, 0, 75 * len(stream), 0, 75 * len(stream))
+    settings = LinkSettings(frame_length=223)
+    reader = FrameReader(section, settings, Found(), spacecraft_id=SPACECRAFT, record=NO_RECORD)
     peaks: list[int] = []
     tracemalloc.start()
-    for _ in reader.batches(stream for _ in range(75)):
+    for _ in reader.batches((as_octets(5 * stream), False) for _ in range(15)):
+        reader.take_fragments()
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.reset_peak()
     tracemalloc.stop()
@@ -108,7 +119,7 @@ def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], w
     ]
     stream = encoder.encode(packets, clcw=clcws)
     (whole,) = decode(stream).uplink
-    found, accounting = read(stream, 1000, window)
+    found, accounting, _ = read(stream, window)
     assert set(found) == set(packets)
     assert accounting.uplink == {(SPACECRAFT, 0): whole}
     assert whole.frames == accounting.frames and whole.changes > 50 and whole.frames_lockout > 0
@@ -119,5 +130,5 @@ def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets: list[
         DownlinkEncoder(spacecraft).encode(packets[:40], clcw=pack_clcw(Clcw(0, number)))
         for spacecraft, number in ((76, 5), (33, 200))
     )
-    _, accounting = read(stream, 1 << 20, 1 << 20)
+    _, accounting, _ = read(stream, 1 << 20)
     assert {key: seen.report_value for key, seen in accounting.uplink.items()} == {(76, 0): 5, (33, 0): 200}

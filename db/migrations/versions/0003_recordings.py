@@ -1,6 +1,6 @@
 """Replace the octets that wait for others by fragments of packets; list the pieces that wait without a position.
 
-Revision: 1.1, after 1.0
+Revision: 1.2, after 1.1
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import logging
 import sqlalchemy as sa
 from alembic import op
 
-revision = "1.1"
-down_revision = "1.0"
+revision = "1.2"
+down_revision = "1.1"
 branch_labels = None
 depends_on = None
 

@@ -1,0 +1,54 @@
+"""Any split, order and repetition of recordings, by any number of processes, gives the same archive."""
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, archive, case_of
+
+FEW = 2 * len(KINDS)
+"""Cases of a run in one process; the campaign has 500."""
+
+
+@pytest.fixture(scope="module")
+def one_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Archive]:
+    with archive(tmp_path_factory.mktemp("pieces") / "home") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def several_processes(
+    tmp_path_factory: pytest.TempPathFactory, new_postgres_database: Callable[[], str]
+) -> Iterator[Archive]:
+    with archive(tmp_path_factory.mktemp("pieces") / "home", new_postgres_database(), 3) as found:
+        yield found
+
+
+def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording() -> None:
+    cases = [case_of(number) for number in range(len(KINDS) * len(ORDERS))]
+    assert {(case.kind, case.order) for case in cases} == {
+        (kind, order) for kind in KINDS for order in ORDERS
+    }
+    for case in cases:
+        for recording in case.recordings:
+            octets = bytearray(len(recording.octets))
+            for piece in case.pieces:
+                if piece.recording is recording:
+                    octets[piece.start : piece.stop] = b"\1" * (piece.stop - piece.start)
+            assert all(octets)
+
+
+@pytest.mark.parametrize("number", [k * len(ORDERS) + k for k in range(FEW)])
+def test_any_split_order_and_repetition_gives_the_same_archive(one_process: Archive, number: int) -> None:
+    assert one_process.difference(case_of(number)) == ""
+
+
+@pytest.mark.parametrize("number", [200 + k * (len(ORDERS) + 1) for k in range(len(KINDS))])
+def test_any_number_of_processes_gives_the_same_archive(several_processes: Archive, number: int) -> None:
+    assert several_processes.difference(case_of(number)) == ""
+
+
+def test_a_lost_piece_is_a_difference(one_process: Archive) -> None:
+    case = case_of(200 * len(ORDERS), ["short frames"])
+    case.pieces.pop()
+    assert "packets" in one_process.difference(case)
