@@ -31,8 +31,8 @@ from sqlalchemy import select
 from benchmarks.downlink import telemetry
 from ground_service.errors import DatabaseBusy, GroundError
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.listing import get_ingest
 from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.store import get_ingest
 from ground_service.missions.service import add_mission
 from ground_service.passes.service import completeness, define_pass
 from ground_service.store import repository
@@ -349,7 +349,8 @@ def sums(ground: Ground, case: Case, results: Sequence[tuple[Piece, int]]) -> di
     total = Counter(dict.fromkeys((*NEW, *SUMS, *RECEPTION_SUMS), 0))
     counted: set[Piece] = set()
     for piece, ingest_id in sorted(results, key=lambda one: one[1]):
-        values = get_ingest(ground, ingest_id).accounting
+        with ground.database.reading() as connection:
+            values = get_ingest(connection, ingest_id).accounting
         assert values is not None
         total.update({name: getattr(values, name) for name in NEW})
         if piece in counted:

@@ -1,7 +1,7 @@
-"""Telemetry as it comes: from a TCP connection, or as files that appear in a folder.
+"""Telemetry as it arrives: octets of a connection on their way into the archive, and files that appear in a folder.
 
-What comes over a connection is written to a spool first, cut into segments where the sender pauses, and ingested
-segment by segment; a segment is removed when it is in the archive. Since ingesting the same octets again changes
+What comes over a connection is written to a spool first, as one recording cut into segments, and ingested segment by
+segment with its position; a segment is removed when it is in the archive. Since ingesting the same octets again changes
 nothing, whatever a crash leaves in the spool is simply ingested by the next run: exactly once, nothing lost.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import socket
 import time
@@ -18,68 +17,67 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, GroundError, InvalidInput, StoreError, storage_error
 from ground_service.store.files import make_durable_folder, replace_durably
-from tmtc.downlink import decode
-from tmtc.errors import TmtcError
-
-log = logging.getLogger(__name__)
 
 SEGMENT_OCTETS = 4 << 20
-PAUSE_S = 0.5
-"""A sender that is silent for this long has finished a unit: what came so far is ingested."""
-
-CONNECT_S = 30.0
-DOCUMENT_LIMIT_OCTETS = 1 << 20
-RETRY_S = 1.0
 SETTLED_S = 2.0
 """A file that has not changed for this long is taken to be whole."""
 
 _UNFINISHED = (".part", ".tmp", ".filepart", ".crdownload")
+_SEGMENT, _CURRENT = "segment", "current"
 
 Ingest = Callable[[Path], dict[str, Any]]
+IngestSegment = Callable[[Path, str, int], dict[str, Any]]
+"""Ingests a file as a piece of a recording at an offset."""
 Report = Callable[[Path, "dict[str, Any] | GroundError"], None]
 
 
 @dataclass(slots=True)
 class Spool:
-    """Octets on their way into the archive, in segments under `folder`.
+    """Octets on their way into the archive, in segments under `folder`, named after their recording and offset.
 
-    Data that the ingest refuses (noise) are reported to `report` and not tried again; the file archive keeps them.
+    Data that the ingest refuses are reported to `report` and not tried again; the file archive keeps them.
     """
 
     folder: Path
-    ingest: Ingest
+    ingest: IngestSegment
     report: Report
+    _recording: str = ""
+    _offset: int = 0
     _size: int = 0
-    _next: int = 0
     _stream: Any = field(default=None)
 
-    def recover(self) -> None:
-        """Ingest what an earlier run left behind."""
-        self.open()
-        self.drain()
-
     def open(self) -> int:
-        """Prepare the folder; return the octets that an earlier run left behind, for `drain`."""
+        """Prepare the folder; return the octets that an earlier run left behind, for `drain`.
+
+        The recording of that run goes on.
+        """
         try:
             make_durable_folder(self.folder)
-            current = self._current
-            if current.exists() and current.stat().st_size:
-                replace_durably(current, self._sealed(self._first_free()))
-            self._next = self._first_free()
-            return sum(path.stat().st_size for path in self.folder.glob("*.segment"))
+            self._adopt()
+            for path in sorted(self.folder.glob(f"*.{_CURRENT}")):
+                (self._recording, self._offset), self._size = _place(path), path.stat().st_size
+                if self._size:
+                    self.cut()
+                else:
+                    path.unlink()
+            return sum(path.stat().st_size for path in self.folder.glob(f"*.{_SEGMENT}"))
         except OSError as error:
             raise storage_error(error, self.folder) from None
 
-    def take(self, octets: bytes) -> None:
-        """Keep octets; a full segment is ingested."""
-        self.keep(octets)
-        if self._size >= SEGMENT_OCTETS:
-            self.seal()
+    def begin(self) -> None:
+        """Begin a new recording with the next octets."""
+        self.cut()
+        if self._recording:
+            self._current.unlink(missing_ok=True)
+        self._recording = ""
 
     def keep(self, octets: bytes, *, durably: bool = False) -> None:
         """Write octets to the current segment, and to the disk if that is required; after an error none are kept."""
+        if not self._recording:
+            self._recording, self._offset = f"{utc_now_ns():020d}", 0
         try:
             if self._stream is None:
                 self._stream = self._current.open("ab", buffering=0)
@@ -96,20 +94,6 @@ class Spool:
             raise storage_error(error, self.folder) from None
         self._size += len(octets)
 
-    def pause(self) -> None:
-        """The sender is silent: ingest what came, unless it is less than one frame or packet."""
-        if self.holds_a_unit():
-            self.seal()
-
-    def holds_a_unit(self) -> bool:
-        """Return whether the current segment holds at least one frame or packet."""
-        return self._size > 0 and _holds_a_unit(self._current.read_bytes())
-
-    def seal(self) -> None:
-        """Ingest what came so far."""
-        if self.cut() is not None:
-            self.drain()
-
     @property
     def size(self) -> int:
         """Octets of the current segment."""
@@ -122,19 +106,24 @@ class Spool:
         if self._stream is not None:
             self._stream.close()
             self._stream = None
-        sealed = self._sealed(self._next)
-        self._next += 1  # also after an error: the file may already have its new name
+        current, sealed = self._current, self._current.with_suffix(f".{_SEGMENT}")
+        size, self._size = self._size, 0
+        self._offset += size
         try:
-            replace_durably(self._current, sealed)
-        finally:
-            self._size = self._current.stat().st_size if self._current.exists() else 0
+            self._current.touch()  # keeps the place in the recording when all segments are ingested
+            replace_durably(current, sealed)
+        except OSError:
+            if current.exists():
+                self._current.unlink(missing_ok=True)
+                self._offset, self._size = self._offset - size, size
+            raise
         return sealed
 
     def drain(self) -> None:
         """Ingest the segments that have ended, in order."""
-        for path in sorted(self.folder.glob("*.segment")):
+        for path in sorted(self.folder.glob(f"*.{_SEGMENT}")):
             try:
-                self.report(path, self.ingest(path))
+                self.report(path, self.ingest(path, *_place(path)))
             except (*PASSING, StoreError, OSError):
                 raise
             except GroundError as error:
@@ -143,14 +132,23 @@ class Spool:
 
     @property
     def _current(self) -> Path:
-        return self.folder / "current"
+        return self.folder / f"{self._recording}.{self._offset:015d}.{_CURRENT}"
 
-    def _sealed(self, number: int) -> Path:
-        return self.folder / f"{number:012d}.segment"
+    def _adopt(self) -> None:
+        """Rename the segments of a version whose spools had no recordings: they are consecutive."""
+        old = [path for path in self.folder.glob(f"*.{_SEGMENT}") if path.stem.isdigit()]
+        offset = 0
+        for path in (*sorted(old), self.folder / _CURRENT):
+            if path.exists():
+                size = path.stat().st_size
+                replace_durably(path, self.folder / f"0.{offset:015d}.{_SEGMENT}")
+                offset += size
 
-    def _first_free(self) -> int:
-        numbers = [int(path.stem) for path in self.folder.glob("*.segment") if path.stem.isdigit()]
-        return max(numbers, default=-1) + 1
+
+def _place(path: Path) -> tuple[str, int]:
+    """Return the recording and the offset of a segment."""
+    recording, offset, _ = path.name.split(".")
+    return recording, int(offset)
 
 
 def spooled_octets(folder: Path) -> int:
@@ -158,102 +156,12 @@ def spooled_octets(folder: Path) -> int:
 
     The current segment is looked at first: once cut, it is one of the others.
     """
-    try:
-        current = (folder / "current").stat().st_size
-    except FileNotFoundError:
-        current = 0
-    total = current
-    for path in folder.glob("*.segment"):
-        with contextlib.suppress(FileNotFoundError):
-            total += path.stat().st_size
+    total = 0
+    for suffix in (_CURRENT, _SEGMENT):
+        for path in folder.glob(f"*.{suffix}"):
+            with contextlib.suppress(FileNotFoundError):
+                total += path.stat().st_size
     return total
-
-
-def _holds_a_unit(octets: bytes) -> bool:
-    try:
-        found = decode(octets)
-    except TmtcError:
-        return True
-    frames = found.frames
-    return found.packets > 0 or (frames is not None and len(frames) > 0)
-
-
-def follow_tcp(address: tuple[str, int], spool: Spool, *, reconnect: bool, stop: Callable[[], bool]) -> int:
-    """Take telemetry from a TCP sender until it closes (or for good, with `reconnect`); the octets taken.
-
-    Raises
-    ------
-    InvalidInput
-        If there is no connection within `CONNECT_S`.
-    """
-    spool.recover()
-    taken = 0
-    while True:
-        with _connected(address, stop, patient=reconnect) as connection:
-            for block in _received(connection, spool, stop):
-                spool.take(block)
-                taken += len(block)
-        spool.seal()
-        if not reconnect or stop():
-            return taken
-
-
-def receive_document(address: tuple[str, int]) -> bytes:
-    """Return what a TCP sender sends until it closes the connection.
-
-    Raises
-    ------
-    InvalidInput
-        If there is no connection within `CONNECT_S`, or the document is longer than `DOCUMENT_LIMIT_OCTETS`.
-    """
-    octets = b""
-    with _connected(address, lambda: False, patient=False) as connection:
-        connection.settimeout(CONNECT_S)
-        try:
-            while block := connection.recv(1 << 16):
-                octets += block
-                if len(octets) > DOCUMENT_LIMIT_OCTETS:
-                    break
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise InvalidInput(f"{address[0]}:{address[1]}", "", "a whole document", found) from None
-    if len(octets) > DOCUMENT_LIMIT_OCTETS:
-        expected = f"at most {DOCUMENT_LIMIT_OCTETS} octets"
-        raise InvalidInput(f"{address[0]}:{address[1]}", "", expected, "more")
-    return octets
-
-
-@contextlib.contextmanager
-def _connected(address: tuple[str, int], stop: Callable[[], bool], *, patient: bool) -> Iterator[Any]:
-    until = time.monotonic() + CONNECT_S
-    while True:
-        try:
-            connection = socket.create_connection(address, timeout=5.0)
-            break
-        except OSError as error:
-            if stop() or (not patient and time.monotonic() > until):
-                raise InvalidInput(
-                    f"{address[0]}:{address[1]}", "", "a sender of telemetry", error.strerror or str(error)
-                ) from None
-            time.sleep(RETRY_S)
-    with connection:
-        connection.settimeout(PAUSE_S)
-        yield connection
-
-
-def _received(connection: socket.socket, spool: Spool, stop: Callable[[], bool]) -> Iterator[bytes]:
-    while not stop():
-        try:
-            block = connection.recv(1 << 16)
-        except TimeoutError:
-            spool.pause()
-            continue
-        except OSError as error:
-            log.warning("connection lost: %s", error)
-            return
-        if not block:
-            return
-        yield block
 
 
 @dataclass(slots=True)
@@ -314,3 +222,73 @@ def _mark(path: Path) -> list[int]:
     files = [one for one in path.rglob("*") if one.is_file()] if path.is_dir() else [path]
     stats = [one.stat() for one in files]
     return [sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]
+
+
+CONNECT_S = 30.0
+DOCUMENT_LIMIT_OCTETS = 1 << 20
+PAUSE_S = 0.5
+
+
+def follow_tcp(address: tuple[str, int], spool: Spool, *, reconnect: bool, stop: Callable[[], bool]) -> int:
+    """Take telemetry from a TCP sender until it closes (or for good, with `reconnect`); the octets taken."""
+    spool.open()
+    spool.drain()
+    taken = 0
+    while True:
+        with _connected(address, stop, patient=reconnect) as connection:
+            while not stop():
+                try:
+                    block = connection.recv(1 << 16)
+                except TimeoutError:
+                    block = None
+                except OSError:
+                    break
+                if block == b"":
+                    break
+                if block:
+                    spool.keep(block)
+                    taken += len(block)
+                if not block or spool.size >= SEGMENT_OCTETS:
+                    spool.cut()
+                    spool.drain()
+        spool.cut()
+        spool.drain()
+        if not reconnect or stop():
+            return taken
+
+
+def receive_document(address: tuple[str, int]) -> bytes:
+    """Return what a TCP sender sends until it closes the connection."""
+    octets = b""
+    with _connected(address, lambda: False, patient=False) as connection:
+        connection.settimeout(CONNECT_S)
+        try:
+            while block := connection.recv(1 << 16):
+                octets += block
+                if len(octets) > DOCUMENT_LIMIT_OCTETS:
+                    break
+        except OSError as error:
+            found = error.strerror or str(error)
+            raise InvalidInput(f"{address[0]}:{address[1]}", "", "a whole document", found) from None
+    if len(octets) > DOCUMENT_LIMIT_OCTETS:
+        expected = f"at most {DOCUMENT_LIMIT_OCTETS} octets"
+        raise InvalidInput(f"{address[0]}:{address[1]}", "", expected, "more")
+    return octets
+
+
+@contextlib.contextmanager
+def _connected(address: tuple[str, int], stop: Callable[[], bool], *, patient: bool) -> Iterator[Any]:
+    until = time.monotonic() + CONNECT_S
+    while True:
+        try:
+            connection = socket.create_connection(address, timeout=5.0)
+            break
+        except OSError as error:
+            if stop() or (not patient and time.monotonic() > until):
+                raise InvalidInput(
+                    f"{address[0]}:{address[1]}", "", "a sender of telemetry", error.strerror or str(error)
+                ) from None
+            time.sleep(1.0)
+    with connection:
+        connection.settimeout(PAUSE_S)
+        yield connection

@@ -20,9 +20,9 @@ from typing import Any, TextIO
 from ground_service.clock import mission_now_ns
 from ground_service.errors import PASSING, GroundError, StorageFull, StorageReadOnly, storage_error
 from ground_service.ground import Ground
-from ground_service.ingest.live import PAUSE_S, SEGMENT_OCTETS, Spool, WatchedFolder
+from ground_service.ingest.live import SEGMENT_OCTETS, Spool, WatchedFolder
 from ground_service.ingest.model import IngestResult
-from ground_service.ingest.service import ingest_file
+from ground_service.ingest.service import Place, ingest_file
 from ground_service.links import core, service
 from ground_service.links.service import DeclaredLink
 from ground_service.links.store import ContactRow, TransmissionRow
@@ -42,8 +42,8 @@ POLL_S = 0.05
 WHOLE_S = 0.01
 """A station that pauses for this long after a whole frame has sent what it has, if the frames before were whole."""
 
-REST_S = 0.6
-"""After this long, octets that show no frame are ingested as well."""
+PAUSE_S = 0.5
+"""After this long, octets are ingested even if others are being ingested."""
 
 SPOOL_LIMIT_OCTETS = 256 << 20
 RETRY_S = 1.0
@@ -67,12 +67,14 @@ class _Progress:
 
     `heard_utc_ns` is the mission time of the newest reception, `empty_utc_ns` the one before the newest look at the
     connection that found nothing. Octets that wait unread are no silence, however late they are read. `frame_octets` is
-    the length of a frame, with its record, of the segment that was ingested last; 0 if it did not hold whole frames.
+    the length of a frame, with its record, of the segment that was ingested last; 0 if it did not end with a frame.
+    `ends_whole`: nothing waits for octets behind that segment.
     """
 
     received: int = 0
     ingested: int = 0
     frame_octets: int = 0
+    ends_whole: bool = False
     heard_utc_ns: int | None = None
     empty_utc_ns: int | None = None
     cut_utc_ns: dict[str, int] = field(default_factory=dict)
@@ -90,7 +92,7 @@ class LinkRunner:
         self._threads: list[threading.Thread] = []
         self._progress = _Progress()
         self._folder = ground.home / INCOMING / f"link-{self._name}"
-        self._spool = Spool(self._folder, self._ingest, self._report)
+        self._spool = Spool(self._folder, self._ingest_segment, self._report)
         self._down = self._connector(declared.link.downlink)
         self._up = self._connector(declared.link.uplink)
         self._lock: TextIO | None = None
@@ -233,16 +235,8 @@ class LinkRunner:
                 self._progress.empty_utc_ns = before
         octets = self._block
         if octets is None:
-            rest_s = time.monotonic() - self._last_block_s
-            pause = rest_s >= PAUSE_S or not self._down.connected
-            # Less than a frame stays in the segment for a while, to be continued by what comes next. A single frame
-            # is not recognised without its neighbours, unless those before it were whole.
-            idle = self._ingest_is_idle
-            if self._spool.size and (
-                rest_s >= REST_S
-                or (idle and self._holds_whole_frames)
-                or ((idle or pause) and self._spool.holds_a_unit())
-            ):
+            is_over = time.monotonic() - self._last_block_s >= PAUSE_S or not self._down.connected
+            if self._ingest_is_idle or is_over:
                 self._cut()
             return
         self._last_block_s = time.monotonic()
@@ -278,6 +272,8 @@ class LinkRunner:
             self._cut()
             self._finish_contact(heard, wait=True)
         if self._contact is None:
+            if self._progress.ends_whole:  # else the next octets may belong to the frame that was cut
+                self._spool.begin()
             self._contact = service.start_contact(self._ground, self.declared, now)
         self._progress.heard_utc_ns = now
         # Only a later look can find a silence; mission time may have been set back since the last one.
@@ -473,7 +469,10 @@ class LinkRunner:
         if not self._stopping.wait(RETRY_S):
             self._work.set()
 
-    def _ingest(self, path: Path) -> dict[str, Any]:
+    def _ingest_segment(self, path: Path, recording: str, offset: int) -> dict[str, Any]:
+        return self._ingest(path, Place(f"{self._name} {recording}", offset))
+
+    def _ingest(self, path: Path, place: Place | None = None) -> dict[str, Any]:
         link = self.declared.link
         made = ingest_file(
             self._ground,
@@ -481,6 +480,7 @@ class LinkRunner:
             spacecraft_id=self.declared.spacecraft_id,
             instance=link.instance,
             name=f"{self._name} {path.name}",
+            place=place,
             station=link.station or "",
         )
         return {"result": made}
@@ -501,6 +501,7 @@ class LinkRunner:
             _clock_offset_ns(made, heard),
         )
         self._progress.frame_octets = _frame_octets(made)
+        self._progress.ends_whole = made is not None and made.octets_pending == 0
         self._progress.ingested += octets
 
     # State
@@ -580,12 +581,11 @@ def ended_holder(home: Path, name: str) -> str | None:
 
 
 def _frame_octets(made: IngestResult | None) -> int:
-    """Return the octets of each frame, with its record, of a piece of whole frames; 0 for any other piece."""
-    reception = None if made is None else made.reception
-    if reception is None or reception.octets_other or not reception.frames:
+    """Return the octets of each frame, with its record, of a piece that ends with a frame; 0 for any other piece."""
+    reception = None if made is None or made.octets_pending else made.reception
+    if reception is None or not reception.frames:
         return 0
-    length, rest = divmod(reception.octets, reception.frames)
-    return 0 if rest else length
+    return (reception.octets_frames + reception.octets_records) // reception.frames
 
 
 def _clock_offset_ns(made: IngestResult | None, heard_utc_ns: int | None) -> int | None:

@@ -38,12 +38,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
     parser.add_argument(
+        "--recording",
         "--stream",
+        dest="recording",
         metavar="NAME",
-        help="name of the stream of which the files are consecutive pieces (default: joined by order and content)",
+        help="name of the recording of which the files are consecutive pieces (default: each file is a recording)",
     )
     parser.add_argument(
-        "--offset", type=int, metavar="N", help="offset of the first file in --stream, octets (default: 0)"
+        "--offset",
+        type=int,
+        metavar="N",
+        help="offset of the first file in the recording, octets (default: 0)",
     )
     parser.add_argument(
         "--station",
@@ -71,15 +76,15 @@ def run(arguments: argparse.Namespace) -> int:
     offset = arguments.offset or 0
     with ground_client(arguments) as service:
 
-        def ingest(path: Path) -> dict[str, Any]:
+        def ingest(path: Path, recording: str | None = None, offset: int = 0) -> dict[str, Any]:
             if path.is_dir():
                 return {"file": str(path), "pass_id": service.import_archive(path)}
             made = service.ingest_file(
                 path,
                 spacecraft_id=arguments.spacecraft_id,
                 instance=arguments.instance,
-                stream=arguments.stream,
-                offset=None if arguments.stream is None else offset,
+                stream=recording,
+                offset=None if recording is None else offset,
                 station=arguments.station,
                 link=arguments.link,
             )
@@ -91,9 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
             figures = made.accounting.model_dump(include=set(kept))
             return {"file": str(path), "ingest_id": made.id, **figures}
 
-        def ingest_live(path: Path) -> dict[str, Any]:
+        def ingest_live(path: Path, recording: str | None = None, offset: int = 0) -> dict[str, Any]:
             try:
-                return ingest(path)
+                return ingest(path, recording, offset)
             except (
                 Unreachable,
                 Unavailable,
@@ -115,13 +120,13 @@ def run(arguments: argparse.Namespace) -> int:
             for path in arguments.files:
                 log(f"ingesting {path} ...")
                 try:
-                    done.append(ingest(path))
+                    done.append(ingest(path, arguments.recording, offset))
                 except (InvalidInput, InvalidRequest, JobFailed) as error:
                     if len(arguments.files) == 1:
                         raise
                     log(str(error))
                     done.append({"file": str(path), "error": str(error)})
-                if arguments.stream is not None and path.is_file():
+                if arguments.recording is not None and path.is_file():
                     offset += path.stat().st_size
     if arguments.files:
         emit(arguments, {"ingested": done}, text="\n".join(_line(one) for one in done))
@@ -142,12 +147,12 @@ def _check(arguments: argparse.Namespace) -> None:
         raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
     if arguments.mission is not None and arguments.tcp is None:
         raise UsageError("--mission: expected --tcp, found none")
-    if arguments.offset is not None and (arguments.stream is None or arguments.offset < 0):
+    if arguments.offset is not None and (arguments.recording is None or arguments.offset < 0):
         raise UsageError(
-            f"--offset: expected octets from the beginning of --stream, found {arguments.offset}"
+            f"--offset: expected octets from the beginning of --recording, found {arguments.offset}"
         )
-    if arguments.stream is not None and not arguments.files:
-        raise UsageError("--stream: expected the files of the stream, found none")
+    if arguments.recording is not None and not arguments.files:
+        raise UsageError("--recording: expected the files of the recording, found none")
 
 
 def _address(option: str, text: str) -> tuple[str, int]:
@@ -183,7 +188,8 @@ def _follow(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
     try:
         follow_tcp((host, port), spool, reconnect=arguments.follow, stop=lambda: False)
     except KeyboardInterrupt:
-        spool.seal()
+        spool.cut()
+        spool.drain()
 
 
 def _watch(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
@@ -214,8 +220,13 @@ def _line(one: dict[str, Any]) -> str:
         return f"{one['file']}: {one['error']}"
     if "pass_id" in one:
         return f"{one['file']}: pass {one['pass_id']}"
-    return (
+    line = (
         f"{one['file']}: {one['packets']} packets, {one['packets_new']} new, {one['crc_errors']} damaged, "
         f"{one['frames_bad']} bad frames, {one['octets_skipped']} octets skipped"
-        + (f", {one['octets_pending']} of them wait for adjacent pieces" if one["octets_pending"] else "")
     )
+    if one["octets_pending"]:
+        line += (
+            f"; {one['octets_pending']} octets of an incomplete frame or packet at the ends "
+            "(--recording NAME FILE... names the files of one recording in order)"
+        )
+    return line

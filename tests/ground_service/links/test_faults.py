@@ -139,7 +139,7 @@ class HalfWritten:
 
 
 def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path: Path) -> None:
-    spool = Spool(tmp_path, lambda _: {}, lambda *_: None)
+    spool = Spool(tmp_path, lambda *_: {}, lambda *_: None)
     spool.open()
     spool.keep(b"first ")
     whole = spool._stream
@@ -166,7 +166,7 @@ def test_a_segment_that_could_not_be_cut_is_kept(
             replace(written, target)
         raise OSError(errno.EIO, "Input/output error")
 
-    spool = Spool(tmp_path, lambda _: {}, lambda *_: None)
+    spool = Spool(tmp_path, lambda *_: {}, lambda *_: None)
     spool.open()
     spool.keep(b"first ")
     with monkeypatch.context() as patch:
@@ -223,10 +223,10 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
     with operated(ground, "first") as first:
         ingest = first._spool.ingest
 
-        def slow(path: Path) -> dict[str, Any]:
+        def slow(*given: Any) -> dict[str, Any]:
             entered.set()
             assert go_on.wait(20)
-            return ingest(path)
+            return ingest(*given)
 
         first._spool.ingest = slow
         station.accept().sendall(stream[: 3 * CADU])
@@ -356,7 +356,7 @@ def test_a_station_that_talks_without_end_on_the_uplink_does_not_stop_the_link()
     assert Talking.received == DISCARDED_BLOCKS
 
 
-def stopping(_: Path) -> dict[str, Any]:
+def stopping(*_: Any) -> dict[str, Any]:
     raise Stopping
 
 
@@ -365,8 +365,9 @@ def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path: Path) -> None:
     spool = Spool(tmp_path, stopping, lambda _, result: seen.append(result))
     spool.open()
     spool.keep(b"octets")
+    spool.cut()
     with pytest.raises(Stopping):
-        spool.seal()
+        spool.drain()
     assert seen == [] and len(list(tmp_path.glob("*.segment"))) == 1
 
 

@@ -95,45 +95,44 @@ def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
     assert service.get_link(ground, "lab").octets <= len(stream)
 
 
-def test_octets_that_show_no_frame_are_ingested_after_a_rest_and_joined(
-    ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
+def test_parts_of_frames_are_ingested_as_they_arrive(
+    ground: Ground, station: Station, stream: bytes, expected: str
 ) -> None:
-    """A single frame may not be recognised as one, and what follows may never come."""
-    monkeypatch.setattr("ground_service.ingest.live._holds_a_unit", lambda octets: len(octets) > CADU)
+    """What follows may never come; if it does, it has a position in the same recording."""
     declare(ground, station.link().replace("silence_s = 1.0", "silence_s = 1000.0"))
     with operated(ground):
         connection = station.accept()
         start = 0
-        for stop in (5 * CADU, 6 * CADU, len(stream)):
+        for stop in (700, 5 * CADU, 6 * CADU - 9, 6 * CADU, len(stream)):
             connection.sendall(stream[start:stop])
             until(lambda stop=stop: received_of(ground) == stop, f"{stop} octets in the archive")
             start = stop
     assert hash_of(ground) == expected
-
-
-def test_a_lone_frame_after_whole_frames_is_ingested_without_a_rest(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The frames before it tell its length; a part of a frame waits for the rest of it."""
-    monkeypatch.setattr("ground_service.ingest.live._holds_a_unit", lambda octets: len(octets) > CADU)
-    monkeypatch.setattr("ground_service.links.runner.REST_S", 1000.0)
-    declare(ground, station.link().replace("silence_s = 1.0", "silence_s = 1000.0"))
-    with operated(ground) as runner:
-        connection = station.accept()
-        for start, stop in ((0, 5), (5, 6), (6, 7)):
-            connection.sendall(stream[start * CADU : stop * CADU])
-            until(lambda stop=stop: received_of(ground) == stop * CADU, f"{stop} frames in the archive")
-        connection.sendall(stream[7 * CADU : 8 * CADU - 9])
-        until(lambda: runner._spool.size == CADU - 9, "a part of a frame in the spool")
-        looks: list[float] = []
-        monkeypatch.setattr(runner, "_show_state", lambda: looks.append(0.0))
-        until(lambda: len(looks) > 9, "looks at the connection")
-        connection.sendall(stream[8 * CADU - 9 : 8 * CADU])
-        until(lambda: received_of(ground) == 8 * CADU, "8 frames in the archive")
     with ground.database.reading() as connection_:
-        octets = [one.octets for one in connection_.execute(select(repository.PIECES.c.octets))]
-    assert octets[-3:] == [CADU, CADU, CADU]
-    assert sum(octets) == 8 * CADU
+        pieces = connection_.execute(select(repository.PIECES).order_by(repository.PIECES.c.position)).all()
+    assert len({one.stream for one in pieces}) == 1
+    assert [one.position for one in pieces[1:]] == [one.position + one.octets for one in pieces[:-1]]
+
+
+def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(
+    ground: Ground, station: Station, stream: bytes, expected: str
+) -> None:
+    declare(ground, station.link())
+    with operated(ground):
+        connection = station.accept()
+        start = 0
+        for number, stop in enumerate((3 * CADU, 5 * CADU + 77, len(stream)), 1):
+            connection.sendall(stream[start:stop])
+            until(lambda n=number: contact_events(ground).count("contact ended") == n, f"contact {number}")
+            start = stop
+    assert hash_of(ground) == expected
+    with ground.database.reading() as connection_:
+        pieces = connection_.execute(select(repository.PIECES).order_by(repository.PIECES.c.ingest_id)).all()
+    streams = list(dict.fromkeys(one.stream for one in pieces))
+    assert [sum(one.octets for one in pieces if one.stream == name) for name in streams] == [
+        3 * CADU,
+        len(stream) - 3 * CADU,
+    ]
 
 
 def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
@@ -320,7 +319,8 @@ def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Stati
         runner._cut_all.set()
         runner._work.set()
         ingesting.join(60.0)
-        runner._spool.seal()
+        runner._spool.cut()
+        runner._spool.drain()
         if runner._lock is not None:
             runner._lock.close()
 
