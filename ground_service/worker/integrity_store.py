@@ -104,7 +104,7 @@ def copy_entered(connection: Connection, writing: Connection) -> None:
     fresh = ("decoded_version", "redecoding_version", "redecoded_to", "redecode_until")
     writing.execute(models.VEHICLES.update().values(dict.fromkeys(fresh)))
     counts = dict.fromkeys(("packets_stored", "packets_joined", "samples_stored"), 0)
-    writing.execute(models.PIECES.update().values(links_tried=None, **counts))
+    writing.execute(models.PIECES.update().values(waits=None, **counts))
 
 
 def rows(connection: Connection, table: Table) -> Rows:

@@ -17,7 +17,7 @@ branch_labels = None
 depends_on = None
 
 OPENER, MIDDLE = 0, 1
-log = logging.getLogger(__name__)
+log = logging.getLogger("ground_service.store.upgrade")
 
 EDGES = sa.table(
     "stream_edges",
