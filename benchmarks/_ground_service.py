@@ -18,7 +18,7 @@ import httpx
 import numpy as np
 
 from benchmarks.campaigns._deployment import Laptop
-from studies.mission_run.parts import Part
+from studies.harness.parts import Part
 
 READS = (
     "/passes", "/passes/1", "/passes/1/completeness", "/passes/1/events?limit=50", "/passes/1/detections?limit=50",

@@ -30,7 +30,7 @@ from ground_service.store.database import prepare_database
 from lunar.datafolder import find_data
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.scenario import load_scenario
-from studies.mission_run.parts import PostgresServer
+from studies.harness.parts import PostgresServer
 
 DAY_S = 86_400.0
 YEAR_DAYS = 365.25

@@ -31,7 +31,7 @@ from ground_service.jobs.service import enter_job
 from ground_service.store import repository
 from ground_service.worker.backup import backup
 from ground_service.worker.jobs import run_job
-from studies.mission_run.parts import Part, answers_http, free_port
+from studies.harness.parts import Part, answers_http, free_port
 
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 PACKETS = 400

@@ -33,7 +33,7 @@ from ground_service.store.database import prepare_database
 from ground_service.store.rollups import STATE_VALUES
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
-from studies.mission_run.parts import PostgresServer
+from studies.harness.parts import PostgresServer
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer

@@ -11,8 +11,6 @@ import argparse
 import json
 import os
 import shutil
-import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.pages import open_chromium, served
+from studies.harness.parts import Part, free_port, listens
 
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _START_S = 180.0
@@ -32,27 +31,13 @@ _SHOWN = "() => Number(document.getElementById('frame').dataset.shown ?? 0)"
 @contextmanager
 def flown(scenario: str, log: Path) -> Iterator[int]:
     """A payload flown live and paused; the port of its console."""
-    ports = [_free_port() for _ in range(3)]
-    options = [
-        word
-        for name, port in zip(("--port", "--tc-port", "--console-port"), ports, strict=True)
-        for word in (name, str(port))
-    ]
-    command = [sys.executable, "-m", "linna", "emulate", scenario, "--live", "--rate", "0", "--paused"]
-    with log.open("wb") as stream:
-        process = subprocess.Popen(
-            [*command, "--stop-at-end", *options], stdout=stream, stderr=subprocess.STDOUT
-        )
-    try:
-        due = time.monotonic() + _START_S
-        while "console on" not in log.read_text(errors="replace"):
-            if process.poll() is not None or time.monotonic() > due:
-                raise RuntimeError(f"the payload did not start:\n{log.read_text(errors='replace')}")
-            time.sleep(0.1)
+    ports = [free_port() for _ in range(4)]
+    names = ("--port", "--tc-port", "--console-port", "--mission-port")
+    words = ["--live", "--rate", "0", "--paused", "--stop-at-end"]
+    words += [word for name, port in zip(names, ports, strict=True) for word in (name, str(port))]
+    command = [sys.executable, "-m", "linna", "emulate", scenario, *words]
+    with Part(command, log, lambda: listens(ports[2]), 1):
         yield ports[2]
-    finally:
-        process.terminate()
-        process.wait(30)
 
 
 def bench(scenario: str, skip: int) -> dict[str, Any]:
@@ -111,12 +96,6 @@ def _processor_s() -> dict[str, float]:
             name = "payload" if b"emulate" in command else "service" if b"serve" in command else "browser"
             totals[name] += seconds
     return totals
-
-
-def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
 
 
 def main() -> None:

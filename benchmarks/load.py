@@ -35,7 +35,7 @@ from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
-from studies.mission_run.processes import Memory, family_cpu_s, family_memory
+from studies.harness.usage import Memory, family_cpu_s, family_memory
 
 ROUND_S = 60
 EACH_USER_S = 2.0

@@ -12,7 +12,6 @@ import argparse
 import json
 import shutil
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,6 +28,7 @@ from ground_service.passes.service import define_pass
 from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import parse_utc, ticks_from_utc_ns
+from studies.harness.parts import Part, answers_http, free_port
 from tmtc.dictionary import DICTIONARY
 
 SPACECRAFT = 76
@@ -107,22 +107,11 @@ def _housekeeping(connection: Any, vehicle: int, first: int, begin: int, count: 
 @contextmanager
 def served(home: Path) -> Iterator[str]:
     """The address of `linna serve` over a home."""
-    log = home / "serve.log"
-    command = [sys.executable, "-m", "linna", "serve", "--port", "0", "--home", str(home)]
-    with log.open("wb") as stream:
-        process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
-    try:
-        for _ in range(1200):
-            text = log.read_text(errors="replace")
-            if "startup complete" in text:
-                break
-            if process.poll() is not None:
-                raise RuntimeError(f"the service did not start:\n{text}")
-            time.sleep(0.1)
-        yield text.split("ground service on ", 1)[1].split()[0].rstrip("/")
-    finally:
-        process.terminate()
-        process.wait(30)
+    port = free_port()
+    address = f"http://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "linna", "serve", "--port", str(port), "--home", str(home)]
+    with Part(command, home / "serve.log", lambda: answers_http(f"{address}/readyz"), 1):
+        yield address
 
 
 @contextmanager

@@ -7,16 +7,10 @@ Command: `python -m benchmarks.pictures HOME [--out docs/pictures]`, with the ho
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
-import socket
-import subprocess
-import sys
-import time
-import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+
+from benchmarks.pages import served
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WIDTH_PX, HEIGHT_PX = 1200, 800
@@ -35,36 +29,6 @@ def main() -> None:
         if report is not None:
             pages["report"] = report.resolve().as_uri()
         take(pages, arguments.out)
-
-
-@contextmanager
-def served(home: Path) -> Iterator[str]:
-    """A service of a home folder on a free port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    url = f"http://127.0.0.1:{port}"
-    server = subprocess.Popen(
-        [sys.executable, "-m", "linna", "serve", "--home", str(home), "--port", str(port)], env=os.environ
-    )
-    try:
-        deadline = time.monotonic() + 120.0
-        while not _answers(f"{url}/readyz"):
-            if server.poll() is not None or time.monotonic() > deadline:
-                raise SystemExit("the service did not start")
-            time.sleep(0.5)
-        yield url
-    finally:
-        server.terminate()
-        server.wait(60)
-
-
-def _answers(url: str) -> bool:
-    try:
-        with urllib.request.urlopen(url, timeout=5) as answer:
-            return bool(answer.status == 200)
-    except OSError:
-        return False
 
 
 def take(pages: dict[str, str], out: Path) -> None:

@@ -41,7 +41,7 @@ from benchmarks.ground import mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from ground_service.store.database import known_revisions, schema_revisions
-from studies.mission_run.parts import Part, PostgresServer, bare_environment, free_port, listens
+from studies.harness.parts import Part, PostgresServer, bare_environment, free_port, listens
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("kernels", "lunar", "tmtc", "reports", "payload_emulator", "studies", "linna", "scenarios")

@@ -32,7 +32,7 @@ from benchmarks.campaigns._deployment import ManyApis
 from benchmarks.pages import open_chromium
 from ground_service.store.database import prepare_database
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from studies.mission_run.parts import Part, PostgresServer, descendants
+from studies.harness.parts import Part, PostgresServer, descendants
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 

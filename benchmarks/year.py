@@ -42,8 +42,8 @@ from ground_service.worker.jobs import run_job
 from lunar.datafolder import find_data
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.scenario import load_scenario
-from studies.mission_run.parts import Part, PostgresServer
-from studies.mission_run.processes import family_cpu_s
+from studies.harness.parts import Part, PostgresServer
+from studies.harness.usage import family_cpu_s
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import sqlite3
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -14,20 +13,20 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ground_service.evaluation.model import PassFigures
+from ground_service.client.local import local_client
+from ground_service.ground import open_ground
 from linna import cli
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
-from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.regions import Box, in_boxes, observed_boxes
 from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import compare_reports, largest_relative
-from studies.mission_run.figures import _missing, contacts_until, trend
+from studies.mission_run.figures import windows_asked
 from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
-from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
 
 SCENARIO = """
 name = "half-a-day"
@@ -55,10 +54,6 @@ DRIFT_PPM = 5.0
 TERMS = RunTerms(days=0.5, windows_per_day=1, window_s=600.0)
 
 
-def of_mission_time(incidents: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [one for one in incidents if one["kind"] != "link"]
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_path: Path) -> None:
@@ -66,30 +61,24 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
     figures = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     windows = figures["windows"]
     assert windows["requested"] == windows["flown"] == windows["processed"] == figures["reports"] == 1
-    assert windows["failed"] == 0 and figures["reports_without_frames"] == 0
-    # Losses of links have times of the wall clock: a loaded computer may have some, from which the run recovers.
-    assert of_mission_time(figures["incidents"]) == []
+    assert windows["failed"] == 0 and figures["images_lost"] == 0
     assert figures["packets_lost"] == 0 and figures["packets_received"] == figures["packets"] > 0
-    (flown,) = figures["trend"]
+    (flown,) = figures["performance"]["passes"]
     assert 38 <= flown["frames"] <= 42  # 600 s / 15 s
-    # This scenario has no rim heights in its catalogue and no filter: the report lacks what needs them, and says so.
-    assert (flown["recall"] is None) == ("recall" in flown["lacks"]) and "nees" in flown["lacks"]
-    assert [one.partition(":")[0] for one in figures["reports_lack"]].count("nees") == 1
     assert figures["frames"] == figures["frames_received"] == flown["frames"]
-    assert flown["contacts_to_processed"] == 1
+    assert figures["navigation"]["spherical"]["median_m"] == flown["median_error_m"] > 0.0
     # The clock of this scenario drifts: the time reports of the contacts tell by how much.
-    (line,) = figures["time_correlation"].values()
-    assert line["time_reports"] >= 3 and line["rejected"] == 0
-    assert line["drift_ppb"] == pytest.approx(-1e3 * DRIFT_PPM, abs=20.0)
-    assert line["residual_max_us"] < 100.0
-    # All that was posted is the set-up: catalogue, mission, ephemeris, commissioning, standing request.
+    with open_ground(tmp_path / "ground") as ground, local_client(ground, "viewer") as client:
+        (line,) = [one for one in client.list_correlations(SPACECRAFT_ID) if one.in_force]
+    assert line.points >= 3 and line.rejected == 0
+    assert line.drift_ppb == pytest.approx(-1e3 * DRIFT_PPM, abs=20.0)
+    assert line.residual_max_ns is not None and line.residual_max_ns < 100e3
+    # All that was posted is the set-up: catalogue, mission, ephemeris, standing request.
     assert figures["interventions"] == 0 and figures["interventions_list"] == []
-    for name in ("ground", "spacecraft"):
-        memory = figures["memory_mib"][name]
-        assert 50.0 < memory["first"] <= memory["peak"] and memory["last"] <= memory["peak"]
-        assert figures["cpu_s"][name] > 0.1
+    assert figures["alerts"] == len(figures["alarms"]) == 0
+    assert figures["monthly_reports"] == [str(tmp_path / "report-2029-08.html")]
+    assert "2029-08" in (tmp_path / "report-2029-08.html").read_text()
     assert json.loads((tmp_path / "report.json").read_text())["windows"] == windows
-    assert "half-a-day" in (tmp_path / "report.html").read_text()
     # The same again prints the figures of the run that has ended; other terms need another folder.
     again = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     assert again["windows"] == windows and "this run has ended" in said[-1]
@@ -141,28 +130,9 @@ def test_the_folder_of_another_version_is_refused_in_one_line(tmp_path: Path, te
         _read_progress(tmp_path / "progress.json")
 
 
-def test_a_trend_needs_three_known_values() -> None:
-    assert trend([0.0, 1.0], [1.0, None]) == {
-        "passes": 1, "first_third": 1.0, "last_third": 1.0, "slope_per_day": None,
-    }  # fmt: skip
-    found = trend([0.0, 1.0, 2.0, 3.0], [5.0, 7.0, None, 11.0])
-    assert found["slope_per_day"] == pytest.approx(2.0) and found["last_third"] == 11.0
-
-
-def test_contacts_count_from_the_end_of_a_window_to_its_processing() -> None:
-    assert contacts_until(100, 200, [90, 100, 150, 200, 210]) == 2
-
-
-def test_stations_in_succession_are_one_contact(tmp_path: Path) -> None:
-    run = MissionRun(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, lambda text: None)
-    start = parse_utc("2029-08-07T03:00:00Z")
-    for gap_s, stops in ((0.02, []), (1.0, []), (1.1, ["2029-08-07T03:00:00Z"])):
-        run._progress.contact_stops = ["2029-08-07T03:00:00Z"]
-        run._join_handover(start + round(gap_s * 1e9))
-        assert run._progress.contact_stops == stops
-    run._progress.contact_stops = []
-    run._join_handover(start)
-    assert run._progress.contact_stops == []
+@pytest.mark.parametrize(("days", "asked"), [(0.1, 0), (0.5, 2), (1.0, 2), (1.2, 4), (30.0, 60)])
+def test_what_is_asked_for_is_counted_by_the_days_of_the_request(days: float, asked: int) -> None:
+    assert windows_asked(days, 2, 4.0 / 24.0) == asked
 
 
 def test_what_a_person_does_after_the_posts_is_an_intervention(tmp_path: Path) -> None:
@@ -205,27 +175,6 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
     assert Checkpoints(tmp_path / "other", home, snapshot).restore() is None and not home.exists()
 
 
-@pytest.mark.parametrize(("faults", "starts"), [(0, 1), (2, 3), (3, None)])
-def test_a_spacecraft_whose_port_was_taken_starts_with_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faults: int, starts: int | None
-) -> None:
-    """Between the choice of a port and its use another process can take it."""
-    files = SpacecraftFiles(*(tmp_path / name for name in "scdlej"))
-    ours, theirs = socket.socketpair()
-    started = []
-
-    def start(self: SpacecraftProcess, *_: Any) -> None:
-        started.append(self)
-        if len(started) <= faults:
-            raise LinkError("spacecraft: expected it to start, found: Address already in use")
-        self._console = ours
-
-    monkeypatch.setattr(SpacecraftProcess, "_start", start)
-    with ours, theirs, pytest.raises(LinkError) if starts is None else nullcontext():
-        SpacecraftProcess(files, ("madrid",), 0.1, 0.0)._lines.close()
-    assert len(started) == (starts or 3)
-
-
 @pytest.mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"]])
 def test_impossible_options_are_refused_in_one_line(
     words: list[str], capsys: pytest.CaptureFixture[str]
@@ -262,7 +211,6 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     values, differences = compare_reports(whole, again)
     largest = largest_relative(differences)
     assert largest is not None and largest < 1e-5 and values > 50
-    assert of_mission_time(again["incidents"]) == of_mission_time(whole["incidents"])
 
 
 def flat_terrain(listed: list[tuple[float, float, bool]], tiles: list[tuple[float, float]]) -> Any:
@@ -302,24 +250,3 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     widened = Box(-13.0, 13.0, -5.0, 15.0).widened(5.0)
     places = np.array([0.0, 17.0, 19.0]), np.array([352.0, 19.0, 0.0])
     assert in_boxes(*places, [widened]).tolist() == [True, True, False]
-
-
-def figures_of(**changes: Any) -> PassFigures:
-    detector = {"precision": None, "recall": None, "loc_px": None, "per_class": []}
-    values: dict[str, Any] = {
-        "pass_id": 1, "frames": 3, "packets": 9, "packets_lost": 0, "packets_expected": 9, "detector": detector,
-        "navigation": {}, "smoothed": {}, "baselines": {}, "verdict": "", "verdict_level": "unknown",
-        "requirements": [], "error_budget": {}, "instruments": {}, "evidence_level": "", "data": [],
-    }  # fmt: skip
-    return PassFigures.model_validate(values | changes)
-
-
-def test_a_report_that_lacks_something_has_the_reason() -> None:
-    reasons = {"recall": "no crater in view", "baselines": "no start state"}
-    assert _missing(figures_of(not_available=reasons)) == reasons | {
-        "nees": "unknown",
-        "evidence level": "not stated in the mission description",
-        "navigation": "no estimate came down",
-    }
-    refused = _missing(figures_of(not_available={"error": "no reference ephemeris covers this pass"}))
-    assert set(refused.values()) == {"no reference ephemeris covers this pass"}

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from studies.mission_run.parts import (
+from studies.harness.parts import (
     Part,
     PostgresServer,
     RedisServer,

@@ -39,7 +39,7 @@ from ground_service.store import repository
 from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
-from studies.mission_run.parts import PostgresServer
+from studies.harness.parts import PostgresServer
 from tests.ground_service.archive_hash import archive_hash
 from tmtc.crc import append_crc
 from tmtc.downlink import DownlinkEncoder

@@ -50,7 +50,7 @@ from ground_service.store.models import AUDIT, AUDIT_HEAD, FILES, HOUSEKEEPING, 
 from ground_service.worker.integrity import Verification, verify
 from ground_service.worker.integrity_store import DERIVED
 from lunar.timescales import parse_utc
-from studies.mission_run.parts import PostgresServer
+from studies.harness.parts import PostgresServer
 from tests.tmtc import foreign
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus

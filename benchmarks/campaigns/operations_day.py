@@ -21,7 +21,6 @@ import math
 import os
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -43,7 +42,7 @@ from linna.cli import run
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.session.scenario import load_scenario
 from payload_emulator.session.spacecraft import SPACECRAFT_ID
-from studies.mission_run.parts import free_port, listens
+from studies.harness.parts import Part, free_port, listens
 
 NS = 1_000_000_000
 DAY_NS = 86_400 * NS
@@ -101,16 +100,9 @@ class Payload:
         words = [scenario, "--live", "--no-operator", "--paused", "--rate", "0", "--port", telemetry]
         words += ["--tc-port", telecommands, "--console-port", console, "--mission-port", self.mission]
         words += ["--operations", folder / "operations.toml"]
-        log = folder / "payload.log"
-        with log.open("ab") as stream:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "linna", "emulate", *map(str, words)], stdout=stream, stderr=stream
-            )
-        wait_until(
-            lambda: listens(console) or self.process.poll() is not None,
-            f"payload ({log.read_text()[-300:]})",
-            PATIENCE_S,
-        )
+        command = [sys.executable, "-m", "linna", "emulate", *map(str, words)]
+        self._part = Part(command, folder / "payload.log", lambda: listens(console), 1)
+        self._part.start()
         self._console = socket.create_connection(("127.0.0.1", console), timeout=PATIENCE_S)
         self._messages = self._console.makefile("r")
         self.order("watch")
@@ -140,14 +132,8 @@ class Payload:
         raise SystemExit("the payload's console ended")
 
     def stop(self) -> None:
-        with contextlib.suppress(OSError):
-            self.order("quit")
-            self._console.close()
-        try:
-            self.process.wait(30)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self._console.close()
+        self._part.end(signal.SIGTERM)
 
 
 def rehearse(

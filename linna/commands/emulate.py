@@ -205,7 +205,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from payload_emulator.session.live import LiveSession, station_names
-    from payload_emulator.session.mission import OPERATIONS, live_mission_text
+    from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
     from payload_emulator.session.starting import launch, load_scenario_payload
     from payload_emulator.session.world import build_world
 
@@ -220,7 +220,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     else:
         world, loaded = launch(scenario, data, arguments.craters)
     names = station_names(scenario, operated)
-    ports = {name: (arguments.port + k, arguments.tc_port + k) for k, name in enumerate(names)}
+    ports = default_ports(names, arguments.port, arguments.tc_port)
     operations = None if operated else OPERATIONS
     if arguments.operations is not None:
         operations = arguments.operations.read_text(encoding="utf-8")

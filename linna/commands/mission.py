@@ -190,8 +190,9 @@ def run_mission(arguments: argparse.Namespace) -> int:
     text = (
         f"{figures['days']:g} days in {figures['wall_s']:.0f} s: {windows['requested']} windows requested, "
         f"{windows['flown']} flown, {windows['processed']} processed, {windows['failed']} failed; "
-        f"{figures['packets_lost']} packets lost, {figures['reports']} reports, "
-        f"{figures['interventions']} interventions\n{folder / 'report.html'}"
+        f"{figures['packets_lost']} packets lost, {figures['reports']} reports, {figures['alerts']} alerts, "
+        f"{figures['interventions']} interventions\n"
+        + "\n".join([*figures["monthly_reports"], str(folder / "report.json")])
     )
     emit(arguments, figures, text=text)
     return 0 if windows["processed"] == windows["flown"] and not figures["packets_lost"] else 1

@@ -29,7 +29,7 @@ from payload_emulator.session.recording import StepInput
 from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario, format_scenario
 from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL, SPACECRAFT_ID
 from payload_emulator.session.station_ports import RECORD_HEADER
-from payload_emulator.session.world import World, build_world
+from payload_emulator.session.world import World, build_world, open_world
 from payload_emulator.sim.board.contact_plan import parse_outage
 from payload_emulator.sim.board.link import STATIONS, LinkSection
 from tmtc.cuc import TICKS_PER_SECOND
@@ -49,6 +49,9 @@ SEEN_SPLITS = ("train", "val")
 
 SILENCE_S = 1_800.0
 """Mission time without telemetry after which a contact has ended: at maximum speed minutes pass between two reads."""
+
+TELEMETRY_PORT, TELECOMMAND_PORT = 10015, 10025
+"""Ports of the first station of a spacecraft that is flown live."""
 
 OPERATIONS = """
 [automation]
@@ -73,8 +76,22 @@ Value = bool | int | float | str | Sequence[float] | Sequence[str] | None
 
 
 def scenario_mission_text(scenario: Scenario, data: DataFolder) -> str:
-    """Return the mission description of a scenario; the scenario is simulated as far as its windows require."""
-    return mission_text(build_world(scenario, data), data)
+    """Return the mission description of a scenario; the scenario is simulated as far as its windows require.
+
+    That of a scenario with stations has links to their default ports, and describes a spacecraft that the ground
+    commands.
+    """
+    if not scenario.link.stations:
+        return mission_text(build_world(scenario, data), data)
+    ports = default_ports(scenario.link.stations)
+    return live_mission_text(open_world(scenario, data), data, "127.0.0.1", ports, OPERATIONS)
+
+
+def default_ports(
+    stations: Sequence[str], telemetry: int = TELEMETRY_PORT, telecommand: int = TELECOMMAND_PORT
+) -> dict[str, tuple[int, int]]:
+    """Return telemetry and telecommand port of each station, from those of the first on."""
+    return {name: (telemetry + k, telecommand + k) for k, name in enumerate(stations)}
 
 
 def mission_text(world: World, data: DataFolder) -> str:

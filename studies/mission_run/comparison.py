@@ -14,12 +14,12 @@ from payload_emulator.errors import ScenarioError
 REPORT = "report.json"
 
 OF_PROCESSES = frozenset(
-    {
-        "cpu_s", "form", "incidents", "interventions_list", "kills", "memory_lives", "memory_mib",
-        "memory_series_mib", "starts", "wall_s",
-    }
-)  # fmt: skip
-"""Figures that depend on processes and the wall clock; the number of interventions is compared."""
+    {"alarms", "form", "interventions_list", "kills", "monthly_reports", "starts", "wall_s"}
+)
+"""Figures that depend on processes and the wall clock; the numbers of interventions and alarms are compared."""
+
+SKIPPED = frozenset({"pass_id", "report_id", "limit"})
+"""Numbers that a database gives, and limits of requirements, some of which are the errors of a baseline."""
 
 MISSING = "missing"
 SHOWN_LIMIT = 60
@@ -49,7 +49,7 @@ def load_report(place: Path) -> dict[str, Any]:
         raise ScenarioError(
             f"{path}: expected the closing report of a mission run, found none ({error})"
         ) from None
-    if not isinstance(figures, dict) or not {"scenario", "days", "windows", "trend"} <= figures.keys():
+    if not isinstance(figures, dict) or not {"scenario", "days", "windows", "performance"} <= figures.keys():
         raise ScenarioError(f"{path}: expected the closing report of a mission run, found another file")
     return figures
 
@@ -74,7 +74,6 @@ def comparison(first: Path, second: Path) -> dict[str, Any]:
         "figures": _side_by_side(reports, "compared"),
         "not_compared": _side_by_side(reports, "not compared"),
         "kills": [one.get("kills") for one in reports],
-        "memory_mib": [one.get("memory_mib") for one in reports],
     }
 
 
@@ -87,9 +86,6 @@ def described(found: Mapping[str, Any]) -> str:
     for name, kills in zip(("first", "second"), found["kills"], strict=True):
         if kills:
             lines += ["", f"kills of the {name} run: {json.dumps(kills)}"]
-    for name, memory in zip(("first", "second"), found["memory_mib"], strict=True):
-        lines += ["", f"memory of the {name} run, MiB:"]
-        lines += [f"  {part:<12} {json.dumps(used)}" for part, used in (memory or {}).items()]
     lines.append("")
     differences = found["differences"]
     for one in differences[:SHOWN_LIMIT]:
@@ -105,15 +101,7 @@ def described(found: Mapping[str, Any]) -> str:
 
 
 def _compared(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is compared; windows are told apart by their start, not by the number that a database gave them."""
-    kept = {name: value for name, value in report.items() if name not in OF_PROCESSES}
-    rows = kept.get("trend")
-    if isinstance(rows, list):
-        kept["trend"] = [
-            {key: value for key, value in row.items() if key != "window"} if isinstance(row, dict) else row
-            for row in rows
-        ]
-    return kept
+    return {name: value for name, value in report.items() if name not in OF_PROCESSES}
 
 
 def largest_relative(differences: Sequence[Difference]) -> float | None:
@@ -132,7 +120,8 @@ def _values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the values in a part of a report by their paths; an empty list or object is a value."""
     if isinstance(value, dict) and value:
         for key, one in value.items():
-            yield from _values(f"{name}.{key}" if name else key, one)
+            if key not in SKIPPED:
+                yield from _values(f"{name}.{key}" if name else key, one)
     elif isinstance(value, list) and value:
         for k, one in enumerate(value):
             yield from _values(f"{name}[{k}]", one)
@@ -153,7 +142,7 @@ def _side_by_side(reports: tuple[dict[str, Any], dict[str, Any]], which: str) ->
         for name, value in report.items():
             if (name in OF_PROCESSES) != (which == "not compared"):
                 continue
-            if name in ("windows", "detector", "cpu_s"):
+            if name in ("windows", "detector"):
                 plain |= {f"{name}.{key}": one for key, one in value.items() if not isinstance(one, dict)}
             elif name == "navigation":
                 plain |= {f"{key} median_m": one["median_m"] for key, one in value.items()}

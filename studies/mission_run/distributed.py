@@ -7,7 +7,6 @@ and a process for the links. Mission time comes from the file of the spacecraft,
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -29,8 +28,7 @@ from ground_service.store.database import prepare_database
 from ground_service.worker.app import worker_answers
 from ground_service.worker.scheduler import LEASE
 from lunar.datafolder import DataFolder
-from studies.mission_run.ground import FLIGHT_DYNAMICS, USER, MissionGround
-from studies.mission_run.parts import (
+from studies.harness.parts import (
     Part,
     PidFile,
     PostgresServer,
@@ -40,6 +38,7 @@ from studies.mission_run.parts import (
     free_port,
     runs,
 )
+from studies.mission_run.ground import FLIGHT_DYNAMICS, USER, MissionGround
 
 WORKERS = 2
 ANSWER_S = 1.0
@@ -72,11 +71,6 @@ class DistributedGround(MissionGround):
         except BaseException:
             self.close()
             raise
-
-    @property
-    def processes(self) -> dict[str, int]:
-        """The processes by name, of which this one operates the run."""
-        return {"run": os.getpid(), **{name: part.pid for name, part in self.parts.items()}}
 
     def note_processes(self) -> None:
         """Record the processes, so that a later run can end them if this one is killed."""

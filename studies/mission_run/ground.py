@@ -6,7 +6,6 @@ reads. Flight dynamics delivers an orbit determination a day, as a system of its
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -77,11 +76,6 @@ class MissionGround:
             precedence=day,
             actor=FLIGHT_DYNAMICS,
         )
-
-    @property
-    def processes(self) -> dict[str, int]:
-        """The processes of the service by name."""
-        return {"ground": os.getpid()}
 
     def wait_sent(self, station: str) -> None:
         """Wait until the station of a contact has every telecommand that can be sent now."""

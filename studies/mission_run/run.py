@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,13 +18,13 @@ from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
 from payload_emulator.session.spacecraft import SPACECRAFT_ID
+from studies.harness.kills import SPACECRAFT, Keeper, plan_kills
 from studies.mission_run.checkpoints import Checkpoints
+from studies.mission_run.comparison import REPORT
 from studies.mission_run.distributed import DistributedGround, Servers
 from studies.mission_run.dynamics import DAY_NS, FlightDynamics
-from studies.mission_run.figures import closing_figures
+from studies.mission_run.figures import closing_figures, months, windows_asked
 from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround, PlanTerms
-from studies.mission_run.kills import SPACECRAFT, Keeper, plan_kills
-from studies.mission_run.processes import Usage
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftKilled, SpacecraftProcess
 
 DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
@@ -34,9 +33,6 @@ DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 SETTLE_NS = (round(SILENCE_S) + 5) * NS
 """Mission time after a contact at which the ground notices its end."""
 
-HANDOVER_NS = NS
-"""Longest gap between two contacts that are one, handed over from station to station."""
-
 LAST_NS = 4 * 3600 * NS
 """No windows so long before the end of the run, so that the data of the last one are down and evaluated."""
 
@@ -44,7 +40,7 @@ CHECKPOINT_S = 60.0
 """Wall time between two checkpoints."""
 
 COUNTED = (
-    "frames", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
+    "frames", "images_lost", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
 )  # fmt: skip
 """What the spacecraft counts itself."""
 
@@ -87,13 +83,6 @@ class Progress:
     ----------
     posts
         First and last number of the entries of the audit log for the posts of each start.
-    contact_stops
-        Ends of the contacts, UTC; of stations in succession, the end at the last.
-    processed
-        Mission time at which a window was first seen as processed, by the id of the window.
-    memory_mib, memory_lives, cpu_s
-        Memory at the end of each contact with the mission day and the number of the process, and processor time, by
-        process.
     """
 
     wall_s: float = 0.0
@@ -101,6 +90,7 @@ class Progress:
     starts: int = 0
     contacts: int = 0
     frames: int = 0
+    images_lost: int = 0
     packets: int = 0
     packets_lost_on_link: int = 0
     telecommands: int = 0
@@ -110,11 +100,6 @@ class Progress:
     request_id: int | None = None
     finished: bool = False
     posts: list[tuple[int, int]] = field(default_factory=list)
-    contact_stops: list[str] = field(default_factory=list)
-    processed: dict[str, str] = field(default_factory=dict)
-    memory_mib: dict[str, list[float]] = field(default_factory=dict)
-    memory_lives: dict[str, list[tuple[float, int]]] = field(default_factory=dict)
-    cpu_s: dict[str, float] = field(default_factory=dict)
 
 
 def run_mission(
@@ -173,15 +158,14 @@ class MissionRun:
         self._progress = Progress()
         self._begun_s = self._kept_s = time.monotonic()
         self._wall_before_s = 0.0
-        self._usage = Usage()
 
     def run(self) -> dict[str, Any]:
         """Run until the days are over; after an interruption the next call continues from the last checkpoint."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._load()
         if self._progress.finished:
-            self._say(f"{self._folder}: this run has ended; its report is {self._folder / 'report.html'}")
-            return dict(json.loads((self._folder / "report.json").read_text()))
+            self._say(f"{self._folder}: this run has ended; its figures are in {self._folder / REPORT}")
+            return dict(json.loads((self._folder / REPORT).read_text()))
         dynamics = FlightDynamics.of(self._scenario, self._data)
         if not self._files.craters.exists():
             count = dynamics.save_craters(self._terms.latitude_limit_deg, self._files.craters)
@@ -242,7 +226,6 @@ class MissionRun:
                 now = parse_utc(message["utc"])
                 self._stop_for_kill(message["state"], now)
                 if message["state"] == "started":
-                    self._join_handover(now)
                     self._deliver_reference(ground, dynamics, now)
                     # The links have begun the contact; they ingest its first frame with the next ones.
                     self._wait_acknowledged(spacecraft, messages)
@@ -253,7 +236,6 @@ class MissionRun:
                     # The ground has everything before time goes on, so that a run gives the same at any speed.
                     self._wait_acknowledged(spacecraft, messages)
                     ground.wait_ingested()
-                    self._progress.contact_stops.append(message["utc"])
                     spacecraft.order(f"until {format_utc(now + SETTLE_NS)}")
             elif kind == "paused":
                 spacecraft.order("state")
@@ -265,7 +247,7 @@ class MissionRun:
                 ground.wait_settled()
                 if message["station"]:
                     ground.wait_sent(message["station"])
-                self._watch(ground, spacecraft, message)
+                self._watch(ground, message)
                 if kind == "finished":
                     if self._keeper is not None and not self._keeper.wait():
                         continue  # the spacecraft was killed: its console has ended
@@ -280,12 +262,6 @@ class MissionRun:
             elif kind == "error":
                 raise LinkError(f"spacecraft: {message['text']}")
         raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
-
-    def _join_handover(self, start_utc_ns: int) -> None:
-        """Count a contact that follows on another station at once as a part of the same contact."""
-        stops = self._progress.contact_stops
-        if stops and start_utc_ns - parse_utc(stops[-1]) <= HANDOVER_NS:
-            stops.pop()
 
     @staticmethod
     def _wait_acknowledged(spacecraft: SpacecraftProcess, messages: Iterator[dict[str, Any]]) -> None:
@@ -329,8 +305,7 @@ class MissionRun:
         before = Progress() if kept is None else _read_progress(kept)
         self._progress = replace(
             before, starts=known.starts, posts=known.posts, request_id=known.request_id,
-            reference_day=known.reference_day, memory_mib=known.memory_mib, memory_lives=known.memory_lives,
-            cpu_s=known.cpu_s,
+            reference_day=known.reference_day,
         )  # fmt: skip
 
     def _post(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
@@ -372,22 +347,11 @@ class MissionRun:
         for name in COUNTED:
             setattr(progress, name, message[name])
 
-    def _watch(self, ground: MissionGround, spacecraft: SpacecraftProcess, message: dict[str, Any]) -> None:
+    def _watch(self, ground: MissionGround, message: dict[str, Any]) -> None:
         progress = self._progress
         days = (parse_utc(message["utc"]) - self._scenario.epoch_utc_ns) / DAY_NS
-        processes = {**ground.processes, SPACECRAFT: spacecraft.process.pid}
-        for name, process in processes.items():
-            # The processes of the service are children of this one.
-            family = self._terms.distributed and process != os.getpid()
-            self._usage.note(name, process, days, family=family)
-        progress.memory_mib, progress.cpu_s = self._usage.memory_mib, self._usage.cpu_s
-        progress.memory_lives = self._usage.memory_lives
-        windows = ground.windows()
-        for window in windows:
-            if window.state == "processed":
-                progress.processed.setdefault(str(window.id), message["utc"])
         self._save()
-        counts = Counter(one.state for one in windows)
+        counts = Counter(one.state for one in ground.windows())
         states = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
         self._say(
             f"day {days:6.2f} of {self._terms.days:g}, {progress.wall_s:6.0f} s: {progress.contacts} contacts, "
@@ -395,18 +359,25 @@ class MissionRun:
         )
 
     def _close(self, ground: MissionGround) -> dict[str, Any]:
+        """Write the figures of the run, and the reports that the service makes of its months."""
         self._save()
-        figures = closing_figures(ground, self._progress, self._terms.days, self._scenario.name)
-        figures["form"] = "distributed" if self._terms.distributed else "embedded"
+        terms = self._terms
+        asked = windows_asked(terms.days, terms.windows_per_day, LAST_NS / DAY_NS)
+        figures = {
+            "scenario": self._scenario.name,
+            "days": terms.days,
+            "form": "distributed" if terms.distributed else "embedded",
+            **closing_figures(ground, self._progress, asked),
+            "monthly_reports": [],
+        }
+        for month in months(one["start"] for one in figures["performance"]["passes"]):
+            made = ground.client.add_monthly_report(SPACECRAFT_ID, month)
+            path = self._folder / f"report-{month}.html"
+            ground.client.get_monthly_report(made.id, path)
+            figures["monthly_reports"].append(str(path))
         if self._keeper is not None:
-            figures["kills"] = {"seed": self._terms.kill_seed, **self._keeper.figures()}
-            figures["incidents"] = sorted(
-                [*figures["incidents"], *self._keeper.incidents()], key=lambda one: str(one["utc"])
-            )
-        (self._folder / "report.json").write_text(json.dumps(figures, indent=2) + "\n")
-        from studies.mission_run.document import save_document
-
-        save_document(figures, self._folder / "report.html")
+            figures["kills"] = {"seed": terms.kill_seed, **self._keeper.figures()}
+        (self._folder / REPORT).write_text(json.dumps(figures, indent=2) + "\n")
         self._progress.finished = True
         return figures
 
@@ -440,8 +411,6 @@ class MissionRun:
             kept = self._checkpoints.restore()
             self._progress = Progress() if kept is None else _read_progress(kept)
             self._wall_before_s = self._progress.wall_s
-        progress = self._progress
-        self._usage = Usage(dict(progress.memory_mib), dict(progress.cpu_s), dict(progress.memory_lives))
         self._say(f"{self._folder}: continues from {self._progress.utc or 'the start'}")
 
     def _save(self) -> None:
@@ -464,11 +433,8 @@ def _next_state(messages: Iterator[dict[str, Any]]) -> dict[str, Any]:
 def _read_progress(path: Path) -> Progress:
     try:
         stated = json.loads(path.read_text())
-        lives = {
-            name: [(day, process) for day, process in one] for name, one in stated["memory_lives"].items()
-        }
         posts = [(first, last) for first, last in stated["posts"]]
-        return Progress(**{**stated, "posts": posts, "memory_lives": lives})
+        return Progress(**{**stated, "posts": posts})
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ScenarioError(
             f"{path}: expected the progress of a run of this version of the program, found another file "

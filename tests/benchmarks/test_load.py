@@ -1,7 +1,7 @@
 """Figures of the memory under load."""
 
 from benchmarks.load import memory_figures
-from studies.mission_run.processes import Memory
+from studies.harness.usage import Memory
 
 
 def test_growth_of_shared_memory_is_not_growth_of_private_memory() -> None:

@@ -19,7 +19,7 @@ import redis
 import yaml
 
 from ground_service.settings import Settings
-from studies.mission_run.parts import Part, free_port, listens
+from studies.harness.parts import Part, free_port, listens
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())

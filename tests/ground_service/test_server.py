@@ -19,7 +19,7 @@ from ground_service.errors import ServerError
 from ground_service.ground import open_ground
 from ground_service.server import _server, bind, serve
 from ground_service.settings import Settings
-from studies.mission_run.parts import listens
+from studies.harness.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
 
 

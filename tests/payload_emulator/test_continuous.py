@@ -23,7 +23,7 @@ from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc, tai_ns_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.live import LiveSession
-from payload_emulator.session.mission import OPERATIONS, live_mission_text
+from payload_emulator.session.mission import OPERATIONS, live_mission_text, scenario_mission_text
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.starting import launch
 from payload_emulator.session.station_ports import RECORD_HEADER
@@ -422,6 +422,9 @@ def test_the_mission_description_names_stations_and_links() -> None:
     assert mission.link.stations["madrid"].latitude_deg == 40.43
     assert mission.link.stations["madrid"].outages == ("2029-08-07T04:00:00.000Z/2029-08-07T23:00:00.000Z",)
     assert mission.links is not None and mission.links[0].downlink == "127.0.0.1:1"
+    written = parse_mission(scenario_mission_text(scenario(SHORT), DataFolder(None)))
+    assert written.links is not None and written.links[0].downlink == "127.0.0.1:10015"
+    assert written.approval is not None and written.uploads is not None
 
 
 @pytest.mark.parametrize(

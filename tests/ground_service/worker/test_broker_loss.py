@@ -15,7 +15,7 @@ from ground_service.settings import Settings
 from ground_service.worker.app import queued_jobs
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.scheduler import Scheduler
-from studies.mission_run.parts import RedisServer
+from studies.harness.parts import RedisServer
 from tests.serving import wait_for
 
 

@@ -1,4 +1,4 @@
-"""Kills of parts of a mission run at seeded points, and the supervision that starts ended parts again."""
+"""Kills of parts of a deployment at seeded points, and the supervision that starts ended parts again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
 from lunar.timescales import format_utc
-from studies.mission_run.parts import Part
+from studies.harness.parts import Part
 
 SPACECRAFT = "spacecraft"
 PHASES = ("started", "ended", "settled")
@@ -170,25 +170,8 @@ class Keeper:
                 for name, found in sorted(times.items())
             },
             "ended_by_themselves": dict(Counter(part for _, part in self.ended)),
+            "list": [asdict(one) for one in self.kills],
         }
-
-    def incidents(self) -> list[dict[str, Any]]:
-        """Return the kills and the ends of parts as incidents, at times of the wall clock."""
-        return [
-            *(
-                {
-                    "utc": one.wall_utc,
-                    "kind": "kill",
-                    "text": f"{one.part}, mission time {one.mission_utc} ({one.phase})",
-                    "recovery": f"works after {one.recovery_s:.1f} s",
-                }
-                for one in self.kills
-            ),
-            *(
-                {"utc": wall, "kind": "process", "text": f"{part} has ended", "recovery": "started again"}
-                for wall, part in self.ended
-            ),
-        ]
 
     def _run(self) -> None:
         try:

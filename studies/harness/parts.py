@@ -10,6 +10,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -58,10 +59,26 @@ def answers_http(url: str) -> bool:
 
 
 class Part:
-    """A process of the deployment that can be killed with all its children and started again."""
+    """A process of the deployment that can be killed with all its children and started again.
 
-    def __init__(self, command: list[str], log: Path, ready: Callable[[], bool], **options: Any) -> None:
+    Parameters
+    ----------
+    ready
+        Whether it works, asked from its start on.
+    attempts
+        Number of starts after which one that ends at once is given up; None: as many as `START_S` permits.
+    """
+
+    def __init__(
+        self,
+        command: list[str],
+        log: Path,
+        ready: Callable[[], bool],
+        attempts: int | None = None,
+        **options: Any,
+    ) -> None:
         self._command, self._log, self._ready, self._options = command, log, ready, options
+        self._attempts = attempts
         self._process: subprocess.Popen[bytes] | None = None
         self._ended = False
 
@@ -73,8 +90,9 @@ class Part:
         GroundError
             It is not ready within `START_S`.
         """
-        until = time.monotonic() + START_S
-        while time.monotonic() < until and not self._ended:
+        until, left = time.monotonic() + START_S, self._attempts or sys.maxsize
+        while time.monotonic() < until and not self._ended and left:
+            left -= 1
             with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
                     self._command, stdout=log, stderr=log, start_new_session=True, **self._options
@@ -90,6 +108,13 @@ class Part:
         raise GroundError(
             f"{' '.join(self._command[:4])}: expected it to start within {START_S:.0f} s, found: {tail}"
         )
+
+    def __enter__(self) -> Part:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end(signal.SIGTERM)
 
     @property
     def has_ended(self) -> bool:

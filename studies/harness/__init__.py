@@ -1,0 +1,1 @@
+"""Processes of a deployment on this machine: started, killed, started again, and measured."""
