@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, get_args
 
@@ -18,8 +17,9 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity, InstanceName
 from ground_service.http.times import UtcTime
-from ground_service.missions.rules import Automation, Channel, Conditions, Rule
+from ground_service.missions.rules import Automation
 from ground_service.missions.section import Array, Section
+from ground_service.toml import faults, read_table
 from lunar.errors import TimeFormatError
 from lunar.timescales import parse_utc
 from tmtc.dictionary import DICTIONARY
@@ -627,66 +627,11 @@ def mission_faults(text: str, source: str = "mission.toml") -> list[str]:
 
 def _read(text: str, source: str) -> Mission | list[InvalidInput]:
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        return [InvalidInput(source, "", "TOML", str(error))]
-    unknown = list(_unknown_keys(Mission, table, source, ""))
-    if unknown:
-        return unknown
-    try:
-        return Mission.model_validate(table)
+        return Mission.model_validate(read_table(text, source, "TOML"))
+    except InvalidInput as error:
+        return [error]
     except ValidationError as error:
-        return [_fault(source, one) for one in error.errors()]
-
-
-_INNER: dict[tuple[str, str], type[Section]] = {
-    ("Mission", "packets"): PacketSource,
-    ("Mission", "links"): StationConnection,
-    ("PacketSource", "time"): PacketTime,
-    ("Automation", "rules"): Rule,
-    ("Rule", "when"): Conditions,
-}
-"""Sections in lists and optional sections, by the section that has them."""
-
-
-_NAMED: dict[tuple[type[BaseModel], str], type[Section]] = {
-    (Link, "stations"): StationLink,
-    (Automation, "channels"): Channel,
-}
-"""Sections in tables with names as keys, by the section that has them."""
-
-
-def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> Iterator[InvalidInput]:
-    if not isinstance(table, dict):
-        return
-    for key, value in table.items():
-        place = f"{path}.{key}" if path else key
-        field = kind.model_fields.get(key)
-        inner = _INNER.get((kind.__name__, key))
-        if field is None:
-            known = list(kind.model_fields)
-            near = difflib.get_close_matches(key, known, n=1)
-            yield InvalidInput(
-                source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'"
-            )
-        elif inner is not None:
-            for number, one in enumerate(value if isinstance(value, list) else [value]):
-                yield from _unknown_keys(
-                    inner, one, source, f"{place}.{number}" if isinstance(value, list) else place
-                )
-        elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            yield from _unknown_keys(field.annotation, value, source, place)
-        elif (kind, key) in _NAMED and isinstance(value, dict):
-            for name, one in value.items():
-                yield from _unknown_keys(_NAMED[kind, key], one, source, f"{place}.{name}")
-
-
-def _fault(source: str, error: Any) -> InvalidInput:
-    place = ".".join(str(part) for part in error["loc"])
-    message = str(error["msg"])
-    expected = (message[:1].lower() + message[1:]).removeprefix("value error, ")
-    expected, _, found = expected.removeprefix("input should be ").partition(", found ")
-    return InvalidInput(source, place, expected, found or repr(error["input"])[:80])
+        return faults(Mission, error, source)
 
 
 def _not_stated(section: BaseModel, path: str = "") -> Iterator[str]:

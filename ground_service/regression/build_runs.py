@@ -102,7 +102,7 @@ def run_build(
         build.stage(work / "build")
         written = work / "out"
         written.mkdir()
-        request = RunRequest(build.words, asdict(build.limits))
+        request = RunRequest(build.words, build.limits.model_dump())
         try:
             if runner is not None:
                 report = run_by_runner(runner, request, work, written, out / PRINTED)

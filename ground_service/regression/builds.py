@@ -14,12 +14,13 @@ import json
 import shutil
 import stat
 import tempfile
-import tomllib
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, storage_error
@@ -31,8 +32,8 @@ from ground_service.sandbox.host import SandboxRefused, check_private, tail
 from ground_service.store.files import make_durable_folder, replace_durably
 from ground_service.store.stored_files import register_file
 from ground_service.text import require_line
+from ground_service.toml import parse_table, read_table
 
-SCHEMA_VERSION = 1
 CURRENT = "current"
 BUILD_FILE = "build.toml"
 BUILD_FILE_LIMIT_OCTETS = 1 << 20
@@ -42,10 +43,6 @@ FLIGHT_COMMAND = (
 CHECK_COMMAND = ("{python}", "-m", "linna", "replay", "--check-build", "{folder}/" + BUILD_FILE, "--json")
 CHECK_FAILED = 2
 CHECK_LIMIT_OCTETS = 1 << 14
-_KEYS = (
-    "schema_version", "name", "version", "description", "command", "files", "model", "parameters", "camera",
-    "limits", "provenance",
-)  # fmt: skip
 # Packages of the flight code of this installation, in addition to the shipped network.
 _FLIGHT_CODE = (
     "payload_emulator/flight",
@@ -60,20 +57,57 @@ _PLAIN, _PROGRAM = 0o644, 0o755
 _SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Limits(_Table):
     """Resource limits of a run of a build: seconds, MiB, open files, processes and threads.
 
     `cpu_s` and `memory_mib` count all processes of the run together, and `folder_mib` everything that it writes.
     """
 
-    wall_s: int = 900
-    cpu_s: int = 900
-    memory_mib: int = 6144
-    file_mib: int = 256
-    folder_mib: int = 512
-    open_files: int = 256
-    processes: int = 128
+    wall_s: PositiveInt = 900
+    cpu_s: PositiveInt = 900
+    memory_mib: PositiveInt = 6144
+    file_mib: PositiveInt = 256
+    folder_mib: PositiveInt = 512
+    open_files: PositiveInt = 256
+    processes: PositiveInt = 128
+
+
+class CameraTable(_Table):
+    """Camera for which a build is made."""
+
+    width_px: float | None = None
+    height_px: float | None = None
+    fov_deg: float | None = None
+
+
+def _without_controls(text: str) -> str:
+    if "\0" in text or "\x1b" in text:
+        raise ValueError(f"a text without control characters, found {ascii(text)[:80]}")
+    return text
+
+
+Text = Annotated[str, AfterValidator(_without_controls)]
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class BuildTable(_Table):
+    """Content of a build file."""
+
+    schema_version: Literal[1] = 1
+    name: Text
+    version: Text = ""
+    description: Text = ""
+    command: Texts = ()
+    files: Texts = ()
+    model: Text = ""
+    parameters: Text = ""
+    camera: CameraTable = CameraTable()
+    limits: Limits = Limits()
+    provenance: dict[str, Any] = {}
 
 
 CHECK_LIMITS = Limits(wall_s=120, cpu_s=60, memory_mib=2048, file_mib=1, folder_mib=16, processes=32)
@@ -162,45 +196,38 @@ def load_build(given: str | Path) -> Build:
     path = Path(given)
     if path.is_dir():
         path = path / BUILD_FILE
-    table = _read(path)
     source = str(path)
-    for key in table:
-        if key not in _KEYS:
-            raise InvalidInput(source, key, f"one of {', '.join(_KEYS)}", "an unknown key")
-    if table.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
-        raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table["schema_version"]))
-    name = _text(table, "name", source, required=True)
-    command = _texts(table, "command", source)
-    own = {key: _text(table, key, source) for key in ("model", "parameters")}
-    if command and any(own.values()):
+    table = parse_table(BuildTable, _read(path), source)
+    require_line(table.name, source, "name")
+    if table.version:
+        require_line(table.version, source, "version")
+    command = table.command
+    if command and (table.model or table.parameters):
         raise InvalidInput(source, "command", "a command, or a model and parameters", "both")
-    names = (*_texts(table, "files", source), *(value for value in own.values() if value))
-    files = tuple((item, _file_hash(path, item)) for item in sorted(set(names)))
-    camera = _numbers(table, "camera", source, ("width_px", "height_px", "fov_deg"))
+    names = {*table.files, table.model, table.parameters} - {""}
+    files = tuple((item, _file_hash(path, item)) for item in sorted(names))
+    camera = table.camera.model_dump(exclude_unset=True)
     code = "" if command else flight_code_hash()
     if command:
         if not any("{archive}" in word for word in command) or not any("{out}" in word for word in command):
             raise InvalidInput(source, "command", "the places {archive} and {out} in it", " ".join(command))
         content: dict[str, Any] = {"command": command, "files": files}
     else:
-        model = dict(files).get(own["model"]) or _hash_of(_root() / _SHIPPED_MODEL)
-        content = {"model": model, "parameters": dict(files).get(own["parameters"], ""), "flight_code": code}
-    provenance = table.get("provenance", {})
-    if not isinstance(provenance, dict):
-        raise InvalidInput(source, "provenance", "a table", repr(provenance)[:80])
+        model = dict(files).get(table.model) or _hash_of(_root() / _SHIPPED_MODEL)
+        content = {"model": model, "parameters": dict(files).get(table.parameters, ""), "flight_code": code}
     return Build(
-        name=name,
-        version=_text(table, "version", source),
+        name=table.name,
+        version=table.version,
         digest=_digest({**content, "camera": camera}),
         file=path,
         command=command,
         files=files,
-        description=_text(table, "description", source),
+        description=table.description,
         camera=tuple(sorted(camera.items())),
-        limits=_limits(table, source),
-        provenance=tuple((str(key), str(value)) for key, value in sorted(provenance.items())),
+        limits=table.limits,
+        provenance=tuple((key, str(value)) for key, value in sorted(table.provenance.items())),
         flight_code=code,
-        parameters=own["parameters"],
+        parameters=table.parameters,
     )
 
 
@@ -330,7 +357,7 @@ def check_parameters(build: Build, *, runner: Path | None = None, private: Seque
         (work / "archive").mkdir()
         (work / "out").mkdir()
         build.stage(work / "build")
-        request = RunRequest(CHECK_COMMAND, asdict(CHECK_LIMITS))
+        request = RunRequest(CHECK_COMMAND, CHECK_LIMITS.model_dump())
         printed = work / "printed.txt"
         try:
             if runner is not None:
@@ -390,13 +417,6 @@ def registered_build(ground: Ground, digest: str) -> Build:
     return build
 
 
-def build_of(ground: Ground, given: str) -> Build:
-    """A build by file, by "current", or by the identity it was registered under; registered in any case."""
-    if given == CURRENT or Path(given).exists() or Path(given).suffix == ".toml":
-        return register_build(ground, load_build(given))
-    return registered_build(ground, given)
-
-
 def flight_code_hash() -> str:
     """Return the SHA-256 of the sources of the installed flight code, which is never imported here."""
     digest = hashlib.sha256()
@@ -441,49 +461,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise storage_error(error, path) from None
     if len(octets) > BUILD_FILE_LIMIT_OCTETS:
         raise InvalidInput(str(path), "", f"at most {BUILD_FILE_LIMIT_OCTETS} octets", str(len(octets)))
-    try:
-        return tomllib.loads(octets.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InvalidInput(str(path), "", "a build file (TOML)", str(error)) from None
-
-
-def _limits(table: dict[str, Any], source: str) -> Limits:
-    names = tuple(item.name for item in fields(Limits))
-    given = _numbers(table, "limits", source, names)
-    for name, value in given.items():
-        if value <= 0 or value != int(value):
-            raise InvalidInput(source, f"limits.{name}", "a whole number above 0", repr(value))
-    return Limits(**{name: int(value) for name, value in given.items()})
-
-
-def _numbers(table: dict[str, Any], key: str, source: str, names: tuple[str, ...]) -> dict[str, float]:
-    given = table.get(key, {})
-    if not isinstance(given, dict):
-        raise InvalidInput(source, key, "a table", repr(given)[:80])
-    for name, value in given.items():
-        if name not in names:
-            raise InvalidInput(source, f"{key}.{name}", f"one of {', '.join(names)}", "an unknown key")
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InvalidInput(source, f"{key}.{name}", "a number", repr(value)[:80])
-    return {name: float(value) for name, value in given.items()}
-
-
-def _text(table: dict[str, Any], key: str, source: str, *, required: bool = False) -> str:
-    value = table.get(key, None if required else "")
-    if not isinstance(value, str) or (required and not value):
-        raise InvalidInput(source, key, "a text", repr(value)[:80])
-    if value and key in ("name", "version"):
-        return require_line(value, source, key)
-    if "\0" in value or "\x1b" in value:
-        raise InvalidInput(source, key, "a text without control characters", ascii(value)[:80])
-    return value
-
-
-def _texts(table: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
-    value = table.get(key, [])
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InvalidInput(source, key, "a list of texts", repr(value)[:80])
-    return tuple(value)
+    return read_table(octets, str(path), "a build file (TOML)")
 
 
 def _file_hash(build_file: Path, name: str) -> str:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import datetime
-import difflib
 import hashlib
-import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule, Waiver
+from ground_service.toml import parse_table, read_table
 
 SHIPPED = Path(__file__).with_name("regression_policy.toml")
 SCHEMA_VERSION = 2
@@ -107,25 +105,19 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
     InvalidInput
         The octets are not a valid policy; the message names the key.
     """
-    try:
-        table = tomllib.loads(octets.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InvalidInput(source, "", "a policy file (TOML)", str(error)) from None
+    table = read_table(octets, source, "a policy file (TOML)")
     if table.get("schema_version") != SCHEMA_VERSION:
         raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table.get("schema_version")))
     for waiver in table.get("waiver", []) if isinstance(table.get("waiver"), list) else []:
         # A day may be written as a TOML date or as text.
         if isinstance(waiver, dict) and isinstance(waiver.get("until"), str):
             waiver["until"] = _day(waiver["until"])
-    try:
-        read = PolicyTable.model_validate(table)
-    except ValidationError as error:
-        raise _invalid(error, source) from None
+    read = parse_table(PolicyTable, table, source)
     for i, item in enumerate(read.gate):
         if item.margin == 0.0 and item.figure not in EXACT_METRICS:
             raise InvalidInput(
                 source,
-                f"gate[{i}].margin",
+                f"gate.{i}.margin",
                 "a number above 0: no number of frames can show a change of exactly zero",
                 "0",
             )
@@ -153,41 +145,3 @@ def _day(text: str) -> datetime.date | str:
         return datetime.date.fromisoformat(text)
     except ValueError:
         return text
-
-
-def _invalid(error: ValidationError, source: str) -> InvalidInput:
-    """Return the first fault as one line: an unknown key with the nearest known one."""
-    # A misspelt key also causes a missing key: report the unknown key, which is the cause.
-    first = min(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
-    place = _place(first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = _keys_at(first["loc"][:-1])
-        close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        expected = f"'{close[0]}'" if close else f"one of {', '.join(known)}"
-        return InvalidInput(source, place, expected, "an unknown key")
-    found = "nothing" if first["type"] == "missing" else repr(first["input"])[:80]
-    expected = "a value" if first["type"] == "missing" else _lower(first["msg"])
-    return InvalidInput(source, place, expected, found)
-
-
-def _place(location: Sequence[int | str]) -> str:
-    text = ""
-    for part in location:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
-def _keys_at(location: Sequence[int | str]) -> list[str]:
-    """Return the keys of the table at a location."""
-    tables: dict[str, type[BaseModel]] = {
-        "confidence": ConfidenceTable,
-        "power": PowerTable,
-        "gate": GateTable,
-        "waiver": WaiverTable,
-    }
-    model = tables[str(location[0])] if location else PolicyTable
-    return [item.alias or name for name, item in model.model_fields.items()]
-
-
-def _lower(message: str) -> str:
-    return message.removeprefix("Input should be ").removeprefix("Value error, ")

@@ -88,8 +88,8 @@ def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(
 def test_every_unknown_key_has_a_line_of_its_own() -> None:
     faults = mission_faults('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
     assert faults == [
-        "m.toml, linc: expected 'link', found unknown key 'linc'",
         "m.toml, camera.widht_px: expected 'width_px', found unknown key 'widht_px'",
+        "m.toml, linc: expected 'link', found unknown key 'linc'",
     ]
 
 

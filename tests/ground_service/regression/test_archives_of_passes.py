@@ -34,7 +34,7 @@ from ground_service.regression.archives import (
     store_of,
     write_flight_view,
 )
-from ground_service.regression.builds import build_of
+from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
@@ -196,7 +196,7 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     digest = keep_archive(either, unrendered).digest
     [kept] = kept_archives(either)
     assert (kept.frames, kept.frames_stored, kept.state, kept.reason) == (4, 2, "to render", "")
-    build = build_of(either, str(make_build("good", {"synthetic pass 5": flown.packets})))
+    build = register_build(either, load_build(make_build("good", {"synthetic pass 5": flown.packets})))
     outcome = run_regression(either, [digest], build, build, load_policy())
     [kept] = kept_archives(either)
     assert kept.state == "telemetry only"
@@ -228,7 +228,7 @@ def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
     ground: Ground, unrendered: Path, make_flyable: Callable, make_build: Callable
 ) -> None:
     whole = make_flyable(frames=30, seed=41)
-    build = build_of(ground, str(make_build("good", {"synthetic pass 41": whole.packets})))
+    build = register_build(ground, load_build(make_build("good", {"synthetic pass 41": whole.packets})))
     outcome = run_regression(ground, [whole.folder, unrendered], build, build, load_policy())
     assert [one.state for one in outcome.passes] == ["judged", "not judged"]
     assert outcome.verdict == "pass"
@@ -260,7 +260,7 @@ def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
     digest = keep_archive(ground, unrendered).digest
     with pytest.raises(rendering.RenderingFailed, match=r"found (no end within -1 s|exit status 1)"):
         rendering.settle_archive(ground, digest)
-    build = build_of(ground, str(make_build("good", {})))
+    build = register_build(ground, load_build(make_build("good", {})))
     outcome = run_regression(ground, [digest], build, build, load_policy())
     assert [one.state for one in outcome.passes] == ["unusable"]
     assert outcome.verdict == "inconclusive"
@@ -358,7 +358,7 @@ def test_an_unchanged_archive_keeps_its_replays(
 ) -> None:
     digest = keep_archive(ground, unrendered).digest
     rendering.settle_archive(ground, digest)
-    build = build_of(ground, str(make_build("good", {})))
+    build = register_build(ground, load_build(make_build("good", {})))
     with ground.database.writing() as connection:
         manifest = store.get_archive(connection, digest).manifest_sha256
         assert store.keep_replay(connection, digest, build.digest, REPLAY, 0, manifest_sha256=manifest)
@@ -375,7 +375,7 @@ def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
 ) -> None:
     digest = keep_archive(either, unrendered).digest
     assert rendering.settle_archive(either, digest).state == "telemetry only"
-    build = build_of(either, str(make_build("good", {"synthetic pass 5": flown.packets})))
+    build = register_build(either, load_build(make_build("good", {"synthetic pass 5": flown.packets})))
     replayed, seen = service._replayed, []
 
     def render(_ground: Ground, _archive: PassArchive, out: Path) -> str:

@@ -12,7 +12,7 @@ from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.regression import builds
-from ground_service.regression.builds import build_of
+from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.store import list_builds
 from ground_service.sandbox.host import SandboxRefused
 from linna.cli import run as run_command
@@ -51,7 +51,7 @@ def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(
     home: Ground, write: Callable[[str], str], text: str, told: str
 ) -> None:
     with pytest.raises(InvalidInput) as error:
-        build_of(home, write(text))
+        register_build(home, load_build(write(text)))
     assert str(error.value) == told
     assert home.read(list_builds, Paging()).items == []
     assert not list((home.home / "regression" / "builds").glob("*"))
@@ -61,10 +61,10 @@ def test_right_parameters_are_registered_and_checked_once(
     home: Ground, write: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = write("flight.anchored.gravity_degree = 60")
-    first = build_of(home, file)
+    first = register_build(home, load_build(file))
     assert [one.digest for one in home.read(list_builds, Paging()).items] == [first.digest]
     monkeypatch.setattr(builds, "run_in_sandbox", None)
-    assert build_of(home, file).digest == first.digest
+    assert register_build(home, load_build(file)).digest == first.digest
 
 
 def _refused(*_: Any) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def test_a_build_that_cannot_be_checked_is_not_registered(
 ) -> None:
     monkeypatch.setattr(builds, "run_in_sandbox", run)
     with pytest.raises(BuildNotChecked, match=told):
-        build_of(home, write("flight.anchored.gravity_degree = 60"))
+        register_build(home, load_build(write("flight.anchored.gravity_degree = 60")))
     assert home.read(list_builds, Paging()).items == []
 
 

@@ -172,9 +172,9 @@ def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ('command = ["x", "{archive}", "{out}"]', "name: expected a text"),
+        ('command = ["x", "{archive}", "{out}"]', "name: expected a value, found nothing"),
         ('name = "x"\ncommand = ["x"]', "expected the places {archive} and {out}"),
-        ('name = "x"\ncomand = []', "comand: expected one of"),
+        ('name = "x"\ncomand = []', "comand: expected 'command', found unknown key 'comand'"),
         (
             'name = "x"\nmodel = "../../etc/passwd"',
             "expected a file in the folder of the build file, found one elsewhere",
@@ -183,9 +183,13 @@ def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
             'name = "x"\nmodel = "gone.onnx"',
             "gone.onnx: expected a file in the folder of the build file, found nothing",
         ),
-        ('name = "x"\n[limits]\nwall_s = -1', "limits.wall_s: expected a whole number above 0"),
+        ('name = "x"\n[limits]\nwall_s = -1', "limits.wall_s: expected greater than 0, found -1"),
         ('name = "x"\nschema_version = 9', "schema_version: expected 1, found 9"),
         ("name = ", "expected a build file (TOML)"),
+        ('name = "x\\u001b"', "name: expected a text without control characters, found"),
+        ('name = "x\\u2028"', "name: expected a line of 1 to 200 characters without control characters"),
+        ('name = "x"\nversion = "1\\n2"', "version: expected a line of 1 to 200 characters"),
+        ('name = "x"\ncommand = ["x", "{archive}", "{out}"]\nmodel = "m"', "expected a command, or a model"),
     ],
 )
 def test_a_bad_build_file_is_told_by_its_key(text: str, told: str, tmp_path: Path) -> None:

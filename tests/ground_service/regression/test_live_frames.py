@@ -11,7 +11,7 @@ from ground_service.clock import ClockFile, set_mission_clock
 from ground_service.ground import Ground, open_ground
 from ground_service.links.supervisor import LinkSupervisor
 from ground_service.regression.archives import kept_archives
-from ground_service.regression.builds import CURRENT, build_of, load_build
+from ground_service.regression.builds import CURRENT, load_build, register_build
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.pass_archives import keep_pass
 from ground_service.regression.rendering import settle_archive
@@ -83,7 +83,9 @@ def test_builds_are_judged_on_the_frames_of_a_live_pass(
         assert (kept.digest, kept.state, kept.frames) == (digest, "complete", kept.frames_stored)
         assert [one.state for one in good.passes] == ["judged"] and good.verdict == "pass"
         assert any(gate.name.startswith("detector.") for gate in good.gates)
-        blind = build_of(ground, build_with(tmp_path / "blind", "detector.score_threshold = 0.999\n"))
+        blind = register_build(
+            ground, load_build(build_with(tmp_path / "blind", "detector.score_threshold = 0.999\n"))
+        )
         bad = run_regression(ground, [digest], blind, current, load_policy())
         assert bad.verdict == "fail"
         failed = [gate.name for gate in bad.gates if gate.outcome == "fail"]

@@ -23,7 +23,7 @@ from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.archive_zip import zip_folder
 from ground_service.regression.archives import keep_archive, let_go, store_of
-from ground_service.regression.builds import build_of, registered_build
+from ground_service.regression.builds import load_build, register_build, registered_build
 from ground_service.regression.jobs import missing_replays, prepared
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -129,7 +129,7 @@ def test_upload_report_and_regression_on_hosts_without_a_common_folder(
             archives = [keep_archive(ground, one.folder).digest for one in flown.values()]
             packets = {name: one.packets for name, one in flown.items()}
             builds = [
-                build_of(ground, str(make_build(name, packets, network_ms=cost))).digest
+                register_build(ground, load_build(make_build(name, packets, network_ms=cost))).digest
                 for name, cost in (("old", 10.0), ("new", 10.1))
             ]
             arguments = prepared(ground, builds[1], builds[0], archives)
@@ -240,7 +240,7 @@ def test_a_backup_of_an_object_store_is_restored_into_another(
     """Also the way to move a service from folders into an object store."""
     ground = opened("home")
     pass_id = import_archive(ground, synthetic_pass.folder)
-    build = build_of(ground, str(make_build("one", {"a": [b"packet"]})))
+    build = register_build(ground, load_build(make_build("one", {"a": [b"packet"]})))
     for path in (tmp_path / "home" / "files").rglob("*"):
         if path.is_file():
             path.unlink()  # the backup reads the store
@@ -259,7 +259,7 @@ def test_a_build_keeps_its_programs_on_another_host(
     file = make_build("runs", {"a": [b"packet"]})
     (file.parent / "fly.py").chmod(0o755)
     first = opened("first")
-    build = build_of(first, str(file))
+    build = register_build(first, load_build(file))
     second = opened("second", f"sqlite:///{tmp_path / 'first' / 'linna.db'}")
     there = registered_build(second, build.digest)
     assert there.folder.is_relative_to(tmp_path / "second") and there.digest == build.digest

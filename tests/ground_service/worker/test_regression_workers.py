@@ -13,7 +13,7 @@ import pytest
 
 from ground_service.ground import Ground, open_ground
 from ground_service.regression.archives import keep_archive
-from ground_service.regression.builds import build_of
+from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.jobs import missing_replays, prepared
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -72,7 +72,7 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(
     with open_ground(home) as ground:
         archives = [keep_archive(ground, one.folder).digest for one in flown.values()]
         builds = [
-            build_of(ground, str(make_build(name, packets, network_ms=cost))).digest
+            register_build(ground, load_build(make_build(name, packets, network_ms=cost))).digest
             for name, cost in (("old", 10.0), ("new", 10.1))
         ]
         dispatcher = dispatcher_for(ground, Settings(home=home, broker_url=redis_url))

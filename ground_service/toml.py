@@ -1,0 +1,82 @@
+"""TOML files read as pydantic models: each fault is one line with its place, what was expected and what was found."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Sequence
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from ground_service.errors import InvalidInput
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_table(text: str | bytes, source: str, what: str) -> dict[str, Any]:
+    """Return the table in TOML text.
+
+    Raises
+    ------
+    InvalidInput
+        The text is not TOML; `what` names the expected file.
+    """
+    try:
+        return tomllib.loads(text.decode("utf-8") if isinstance(text, bytes) else text)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidInput(source, "", what, str(error)) from None
+
+
+def parse_table(kind: type[Model], table: Any, source: str) -> Model:
+    """Return a table as a model.
+
+    Raises
+    ------
+    InvalidInput
+        The first fault.
+    """
+    try:
+        return kind.model_validate(table)
+    except ValidationError as error:
+        raise faults(kind, error, source)[0] from None
+
+
+def faults(kind: type[BaseModel], error: ValidationError, source: str) -> list[InvalidInput]:
+    """Return the faults of a table: unknown keys alone if there are any, because they cause others."""
+    found = error.errors(include_url=False)
+    unknown = [one for one in found if one["type"] == "extra_forbidden"]
+    return [_fault(kind, one, source) for one in unknown or found]
+
+
+def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
+    place = ".".join(map(str, error["loc"]))
+    if error["type"] == "missing":
+        return InvalidInput(source, place, "a value", "nothing")
+    if error["type"] == "extra_forbidden":
+        key = str(error["loc"][-1])
+        known = _keys(kind, error["loc"][:-1])
+        near = difflib.get_close_matches(key, known, n=1)
+        return InvalidInput(
+            source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'"
+        )
+    message = str(error["msg"])
+    expected = (message[:1].lower() + message[1:]).removeprefix("value error, ")
+    expected, _, found = expected.removeprefix("input should be ").partition(", found ")
+    return InvalidInput(source, place, expected, found or repr(error["input"])[:80])
+
+
+def _keys(kind: type[BaseModel], place: Sequence[int | str]) -> list[str]:
+    """Return the keys of the table at a place; numbers in lists and names in tables of tables lead to no field."""
+    for part in place:
+        field = next((one for name, one in kind.model_fields.items() if part in (name, one.alias)), None)
+        if field is not None:
+            kind = _table_in(field.annotation) or kind
+    return [one.alias or name for name, one in kind.model_fields.items()]
+
+
+def _table_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the model in an annotation such as ``tuple[Model, ...] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_table_in, get_args(annotation))), None)
