@@ -598,6 +598,28 @@ _VERSIONS = {
 DICTIONARY = _VERSIONS[max(_VERSIONS)]
 
 
+def _is_structure(definition: PacketDefinition) -> bool:
+    """Return whether a packet is a housekeeping structure with a fixed number and fixed fields."""
+    first = definition.fields[0] if definition.fields else None
+    return first is not None and first.name == "structure_id" and first.minimum == first.maximum
+
+
+STRUCTURES: dict[int, PacketDefinition] = {
+    int(one.fields[0].minimum or 0): one for one in DICTIONARY.telemetry if _is_structure(one)
+}
+"""Housekeeping structures that every build sends, by number; the data pool has their fields."""
+
+DRAWN = (
+    "temperature_c",
+    "bus_voltage_v",
+    "power_w",
+    "memory_used_kib",
+    "queue_depth",
+    "storage_used_permille",
+)
+"""Parameters of these structures that reports draw over time."""
+
+
 def dictionary_version(version: int) -> Dictionary:
     """The dictionary of that version; old versions stay here so that their packets stay decodable."""
     try:

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from lunar.arrays import IntArray
-from tmtc.dictionary import DICTIONARY
-from tmtc.schema import Field, Table
+from tmtc.dictionary import DICTIONARY, STRUCTURES
+from tmtc.schema import Field, PacketDefinition, Table
 from tmtc.stream import cut_packets
 
 WARNING, ALARM = 1, 2
@@ -23,8 +23,7 @@ SEVERITIES = {WARNING: "warning", ALARM: "alarm"}
 EVENT_SEVERITIES = {"event_medium": WARNING, "event_high": ALARM}
 """Severity of the alarms of event packets; events of lower severity raise none."""
 
-HOUSEKEEPING = "housekeeping"
-WATCHED_PACKETS = (*EVENT_SEVERITIES, HOUSEKEEPING)
+WATCHED_PACKETS = (*EVENT_SEVERITIES, *(one.name for one in STRUCTURES.values()))
 WATCHED_APIDS = tuple(sorted({DICTIONARY.packet(name).apid for name in WATCHED_PACKETS}))
 
 Source = Literal["event", "parameter"]
@@ -58,8 +57,7 @@ class Condition:
 
 def limited_parameters() -> tuple[Field, ...]:
     """Return the housekeeping parameters that have limits."""
-    fields = DICTIONARY.packet(HOUSEKEEPING).fields
-    return tuple(field for field in fields if field.warning is not None or field.alarm is not None)
+    return tuple(field for packet in STRUCTURES.values() for field in _limited(packet))
 
 
 def conditions_in(octets: bytes) -> tuple[Condition, ...]:
@@ -87,7 +85,7 @@ def joined(first: Condition, second: Condition) -> Condition:
 
 
 def broken_limits(octets: bytes) -> frozenset[str]:
-    """Return the names of the parameters that are outside their limits in one housekeeping packet."""
+    """Return the names of the parameters that are outside their limits in housekeeping packets."""
     return frozenset(one.name for one in conditions_in(octets) if one.source == "parameter")
 
 
@@ -116,18 +114,23 @@ def _conditions(tables: Mapping[str, Table]) -> Iterator[Condition]:
         for code in np.unique(ids).tolist():
             ticks = table.ticks[ids == code]
             yield _condition("event", labels.get(code, f"event_{code}"), severity, ticks, None)
-    table = tables.get(HOUSEKEEPING)
-    if table is None:
-        return
-    for field in limited_parameters():
-        values = table.columns[field.name]
-        states = field.limit_states(values)
-        broken = np.flatnonzero(states)
-        if broken.size:
-            last = broken[np.argmax(table.ticks[broken])]
-            yield _condition(
-                "parameter", field.name, int(states.max()), table.ticks[broken], float(values[last])
-            )
+    for structure in STRUCTURES.values():
+        table = tables.get(structure.name)
+        if table is None:
+            continue
+        for field in _limited(structure):
+            values = table.columns[field.name]
+            states = field.limit_states(values)
+            broken = np.flatnonzero(states)
+            if broken.size:
+                last = broken[np.argmax(table.ticks[broken])]
+                yield _condition(
+                    "parameter", field.name, int(states.max()), table.ticks[broken], float(values[last])
+                )
+
+
+def _limited(packet: PacketDefinition) -> tuple[Field, ...]:
+    return tuple(one for one in packet.fields if one.warning is not None or one.alarm is not None)
 
 
 def _condition(source: Source, name: str, severity: int, ticks: IntArray, value: float | None) -> Condition:

@@ -27,7 +27,7 @@ from ground_service.store.vehicles import lock_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.timescales import format_utc
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary import STRUCTURES
 
 TELEMETRY = "telemetry"
 """Name of the cause of changes that no user has made."""
@@ -142,8 +142,8 @@ def shelve_alarm(
 def _update(connection: Connection, vehicle: int, found: tuple[Condition, ...]) -> None:
     """Apply the conditions of new packets to the alarms of a vehicle, which the caller has locked."""
     now = utc_now_ns()
-    housekeeping = telemetry.newest_packet(connection, vehicle, DICTIONARY.packet(core.HOUSEKEEPING).apid)
-    broken = frozenset[str]() if housekeeping is None else core.broken_limits(housekeeping)
+    newest = (telemetry.newest_packet(connection, vehicle, one.apid) for one in STRUCTURES.values())
+    broken = core.broken_limits(b"".join(octets for octets in newest if octets is not None))
     known = {(row.source, row.name): row for row in store.open_alarms(connection, vehicle)}
     worse: set[tuple[str, str]] = set()
     for condition in found:

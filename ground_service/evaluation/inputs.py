@@ -52,18 +52,12 @@ from reports.values import (
     HousekeepingParameter,
     InstrumentReport,
 )
-from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY
+from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
 from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
 from tmtc.stream import cut_packets
 
-_TRENDS = (
-    ("temperature_c", "°C"),
-    ("bus_voltage_v", "V"),
-    ("power_w", "W"),
-    ("memory_used_kib", "KiB"),
-    ("queue_depth", "packets"),
-    ("storage_used_permille", "‰"),
-)
+_UNITS = {"degC": "°C", "1/1000": "‰", "": "packets"}
+"""Units of the dictionary as reports write them; a count without a unit is of packets."""
 
 
 class ArchivedImages(Mapping[int, NDArray[np.uint8]]):
@@ -357,14 +351,30 @@ def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[s
 
 
 def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:
-    names = ("ticks", *(name for name, _ in _TRENDS))
-    columns = sample_store.sample_arrays(connection, span, "housekeeping", names)
-    if len(columns["ticks"]) == 0:
-        return ()
-    utc_ns = span.utc_ns(columns["ticks"].tolist())
-    return tuple(
-        HousekeepingParameter(name, unit, utc_ns, columns[name].astype(np.float64)) for name, unit in _TRENDS
-    )
+    found = []
+    for packet in STRUCTURES.values():
+        drawn = [field for field in packet.fields if field.name in DRAWN]
+        names = ("ticks", *(field.name for field in drawn))
+        if packet.name == "housekeeping":
+            columns = sample_store.sample_arrays(connection, span, packet.name, names)
+        else:
+            columns = {}
+            for field in drawn:
+                columns["ticks"], columns[field.name] = sample_store.packet_values(
+                    connection, span, packet, field.name
+                )
+        if drawn and len(columns["ticks"]):
+            utc_ns = span.utc_ns(columns["ticks"].tolist())
+            found += [
+                HousekeepingParameter(
+                    field.name,
+                    _UNITS.get(field.unit, field.unit),
+                    utc_ns,
+                    columns[field.name].astype(np.float64),
+                )
+                for field in drawn
+            ]
+    return tuple(found)
 
 
 def _onboard_build(connection: Connection, span: PassSpan) -> str:

@@ -16,10 +16,15 @@ from ground_service.store import telemetry
 from ground_service.store.vehicles import FLOWN, Vehicle, all_vehicles, find_vehicle, get_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.schema import DecodedPacket, Field
 
-LIVE_PACKETS = ("housekeeping", "navigation_state", "frame_outcome", "detections")
+LIVE_PACKETS = (
+    *(one.name for one in STRUCTURES.values()),
+    "navigation_state",
+    "frame_outcome",
+    "detections",
+)
 """Packets whose newest values are shown; the others report single occurrences."""
 
 LIMIT_STATES: tuple[Literal["within", "warning", "alarm"], ...] = ("within", "warning", "alarm")

@@ -24,23 +24,28 @@ from ground_service.store.vehicles import find_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
-from tmtc.cuc import onboard_ticks
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.export import Record, format_records, packet_records
-from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
-from tmtc.schema import Field
+from tmtc.instruments import instrument_telemetry
+from tmtc.schema import Field, PacketDefinition
 from tmtc.stream import cut_packets, whole_packets
 from tmtc.xtce.records import format_xtce_records, xtce_records
 from tmtc.xtce.series import SeriesValue
 
 OWN_PACKET = "housekeeping"
-INSTRUMENT_FIELDS = {
-    f"{one.name}.{field.name}": (one.name, field)
+PACKET_FIELDS = {
+    field.name: (one, field)
+    for one in STRUCTURES.values()
+    for field in one.fields[1:]
+    if one.name != OWN_PACKET and field.size == 1
+} | {
+    f"{one.name}.{field.name}": (one.packet, field)
     for one in instrument_telemetry()
     for field in one.sample_fields
     if field.size == 1
 }
-"""Packet and field of the parameters of optional instruments, by their names in addresses."""
+"""Packet and field of the parameters that are read from stored packets: of further housekeeping structures, and of
+optional instruments."""
 
 STATE_PACKET = "navigation_state"
 STATE_PARAMETERS = {
@@ -143,10 +148,10 @@ class DeclaredSamples:
 
 
 @dataclass(frozen=True, slots=True)
-class InstrumentSamples:
-    """Samples of one field of an optional instrument, decoded from the stored packets; they have no roll-ups."""
+class PacketSamples:
+    """Values of one field of a packet, or of its items, decoded from the stored packets; they have no roll-ups."""
 
-    packet: str
+    packet: PacketDefinition
     field: str
     version: int
     part: int = 0
@@ -154,7 +159,7 @@ class InstrumentSamples:
     @property
     def code(self) -> int:
         """Code of the kind in the roll-ups, which has none."""
-        return rollups.INSTRUMENTS_CODE
+        return rollups.PACKETS_CODE
 
     def index(self, name: str) -> int:
         """Return the place of a value in the roll-ups."""
@@ -164,14 +169,8 @@ class InstrumentSamples:
         self, connection: Connection, span: PassSpan, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
         """Return ``ticks`` and values (n,) in a span, in order of time."""
-        octets = sample_store.packet_octets(connection, span, APID_INSTRUMENTS)
-        tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(self.packet,))
-        if self.packet not in tables:
-            return {"ticks": np.zeros(0, dtype=np.int64), **{name: np.zeros(0) for name in names}}
-        items = tables[self.packet].items
-        ticks = onboard_ticks(items["sample_ticks"])
-        order = np.argsort(ticks, kind="stable")
-        return {"ticks": ticks[order], **dict.fromkeys(names, items[self.field][order])}
+        ticks, values = sample_store.packet_values(connection, span, self.packet, self.field)
+        return {"ticks": ticks, **dict.fromkeys(names, values)}
 
     def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
         """Return stretches of a value; without roll-ups a series is never long."""
@@ -225,7 +224,7 @@ def own_parameters() -> tuple[ParameterInfo, ...]:
     return (
         *(_own_info(field.name, OWN_PACKET, field) for field in fields if field.name in PARAMETERS),
         *(_state_info(name, value) for name, (_, value) in STATE_PARAMETERS.items()),
-        *(_own_info(name, packet, field) for name, (packet, field) in INSTRUMENT_FIELDS.items()),
+        *(_own_info(name, packet.name, field) for name, (packet, field) in PACKET_FIELDS.items()),
     )
 
 
@@ -279,7 +278,7 @@ def declared_parameters(definitions: PacketDefinitions) -> dict[str, DeclaredPar
         for container, layout in declared.layouts.items()
         for index, value in enumerate(layout)
     ]
-    counts = dict.fromkeys(PARAMETERS, 1)
+    counts = dict.fromkeys((*PARAMETERS, *PACKET_FIELDS), 1)
     for one in found:
         counts[one.name] = counts.get(one.name, 0) + 1
     named = (
@@ -302,9 +301,9 @@ def series_source(
         code, value = STATE_PARAMETERS[parameter]
         source = KindSamples("navigation_states", span.dictionary_version, code)
         return source, span, value, state_unit(value)
-    if parameter in INSTRUMENT_FIELDS:
-        packet, field = INSTRUMENT_FIELDS[parameter]
-        return InstrumentSamples(packet, field.name, span.dictionary_version), span, parameter, field.unit
+    if parameter in PACKET_FIELDS:
+        packet, field = PACKET_FIELDS[parameter]
+        return PacketSamples(packet, field.name, span.dictionary_version), span, parameter, field.unit
     found = declared_reading(connection, span.vehicle)
     one = None if found is None else found.parameters.get(parameter)
     if found is None or one is None:

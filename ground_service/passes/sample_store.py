@@ -17,8 +17,11 @@ from ground_service.store.codec import DETECTION_ITEM, unpack_detections
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import IntArray
 from reports.values import PassEvent
+from tmtc.cuc import onboard_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.event_texts import event_text
+from tmtc.schema import PacketDefinition
+from tmtc.stream import cut_packets
 
 _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 
@@ -42,6 +45,20 @@ def sample_arrays(
 def packet_octets(connection: Connection, span: PassSpan, apid: int) -> bytes:
     """Return the packets of one APID in a span, end to end in order of time."""
     return telemetry.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
+
+
+def packet_values(
+    connection: Connection, span: PassSpan, packet: PacketDefinition, field: str
+) -> tuple[IntArray, NDArray[Any]]:
+    """Return ticks and values (n,) of a field of stored packets, or of their items, in order of time."""
+    octets = packet_octets(connection, span, packet.apid)
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet.name,)).get(packet.name)
+    if table is None:
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    ticks = table.ticks if packet.group is None else onboard_ticks(table.items["sample_ticks"])
+    values = (table.columns if packet.group is None else table.items)[field]
+    order = np.argsort(ticks, kind="stable")
+    return ticks[order], values[order]
 
 
 def detection_samples(connection: Connection, span: PassSpan) -> DetectionSamples:

@@ -33,8 +33,8 @@ KINDS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
 PARAMETERS_CODE = 3
 """Code of the values of packets that mission descriptions define; their parts are the numbers of their containers."""
 
-INSTRUMENTS_CODE = 4
-"""Code of the samples of optional instruments, which have no roll-ups."""
+PACKETS_CODE = 4
+"""Code of values that are read from stored packets, which have no roll-ups."""
 
 LEVELS = 7
 BASE_TICKS = 64 << 16

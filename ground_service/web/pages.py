@@ -23,11 +23,11 @@ from ground_service.errors import NotAuthorised, NotFound
 from ground_service.evaluation.store import get_report
 from ground_service.ground import Ground
 from ground_service.http.common import Key
-from ground_service.passes.series import PARAMETERS, STATE_VALUES
+from ground_service.passes.series import STATE_VALUES
 from ground_service.performance.store import get_monthly_report
 from ground_service.regression.service import report_of
 from ground_service.web.basemap import basemap_jpeg
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.schema import Field, PacketDefinition
 
 _HERE = Path(__file__).parent
@@ -252,12 +252,11 @@ def _environment() -> Environment:
 @cache
 def _dictionary() -> dict[str, Any]:
     """What pages need to know of the dictionary: telecommands to enter, parameters to look at."""
-    housekeeping = DICTIONARY.packet("housekeeping")
     return {
         "version": DICTIONARY.version,
         "hash": DICTIONARY.hash,
         "telecommands": [_telecommand(definition) for definition in DICTIONARY.telecommands],
-        "parameters": [_field(field) for field in housekeeping.fields if field.name in PARAMETERS],
+        "parameters": [_field(field) for packet in STRUCTURES.values() for field in packet.fields[1:]],
         "estimators": list(DICTIONARY.labels("navigation_state", "estimator").values()),
     }
 

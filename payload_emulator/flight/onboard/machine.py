@@ -11,7 +11,6 @@ from typing import Any
 from payload_emulator.flight.onboard.commanding import CommandHistory
 from payload_emulator.flight.onboard.fdir import Monitors
 from payload_emulator.flight.onboard.housekeeping import (
-    PERFORMANCE,
     STATE,
     Housekeeping,
     StageTimer,
@@ -27,6 +26,7 @@ from payload_emulator.flight.onboard.settings import Settings
 from payload_emulator.flight.ports import Board, Load
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.telemetry.store import PacketStore
+from tmtc.dictionary import STRUCTURES
 from tmtc.large_data import LargeDataReceiver
 
 PARAMETERS_NUMBER = 4
@@ -154,9 +154,9 @@ class Machine:
 
     def start_housekeeping(self, state_interval_s: float) -> None:
         """The structures that every build sends."""
+        further = self.parameters["performance_interval_s"]
         self.housekeeping.structures = {
-            STATE: Structure(state_interval_s),
-            PERFORMANCE: Structure(self.parameters["performance_interval_s"]),
+            number: Structure(state_interval_s if number == STATE else further) for number in STRUCTURES
         }
 
     def save(self) -> None:
