@@ -28,7 +28,6 @@ import threading
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +200,7 @@ class Load:
         self._over = threading.Event()
         self._lock = threading.Lock()
         pieces = cut_pieces(mixed_downlink(2_000), 400, random.Random(3), "piece")
-        self._bodies: Iterator[bytes] = itertools.cycle(one.octets for one in pieces)
+        self._pieces = itertools.cycle(pieces)
         self._client = functools.partial(
             httpx.Client,
             base_url=f"{url}/api/v1",
@@ -238,8 +237,9 @@ class Load:
                     answer = client.get(READS[turn % len(READS)])
                 else:
                     with self._lock:
-                        body = next(self._bodies)
-                    answer = client.post("/telemetry?spacecraft_id=76", content=body)
+                        piece = next(self._pieces)
+                    path = f"/telemetry?spacecraft_id=76&stream=downlink&offset={piece.offset}"
+                    answer = client.post(path, content=piece.octets)
             except httpx.HTTPError as error:
                 with self._lock:
                     self.errors.append(f"turn {turn}: {error!r}")

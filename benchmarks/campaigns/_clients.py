@@ -45,11 +45,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Octets of a downlink, and their position if the client states it."""
+    """Octets of a downlink with their position."""
 
     name: str
     octets: bytes
-    offset: int | None
+    offset: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +140,7 @@ class Client(threading.Thread):
 
     def _upload(self, piece: Piece) -> None:
         path = f"/telemetry?spacecraft_id={self._spacecraft}"
-        if piece.offset is not None:
-            path += f"&stream=downlink&offset={piece.offset}"
+        path += f"&stream=downlink&offset={piece.offset}"
         answer = self._session.ask("POST", path, piece.octets, piece.name)
         if answer.status != 202:
             raise SystemExit(f"POST {path}: {answer.status} {answer.body[:300]!r}")
@@ -211,10 +210,10 @@ class Client(threading.Thread):
 
 
 def cut_pieces(stream: bytes, pieces: int, rng: random.Random, name: str) -> list[Piece]:
-    """Return a stream cut at random octets, in random order; every other piece states its position."""
+    """Return a stream cut at random octets, in random order; each piece states its position."""
     places = sorted(rng.sample(range(1, len(stream)), pieces - 1))
     made = [
-        Piece(f"{name} {start}", stream[start:stop], start if rng.random() < 0.5 else None)
+        Piece(f"{name} {start}", stream[start:stop], start)
         for start, stop in itertools.pairwise([0, *places, len(stream)])
     ]
     rng.shuffle(made)

@@ -57,7 +57,7 @@ def test_a_token_names_its_caller_whatever_the_service_is_open_to(
     asked = request(ground, open_without_users)
     caller = caller_of(asked, bearer(token))
     assert (caller.name, caller.role, caller.token_id) == ("ann", "operator", 1)
-    assert vars(asked.state) == {"caller": "ann", "verified_caller": "ann"}
+    assert vars(asked.state) == {"caller": "ann"}
     invented = request(ground, open_without_users)
     with pytest.raises(NotAuthorised):
         caller_of(invented, bearer(token + "x"))
