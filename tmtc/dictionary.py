@@ -133,7 +133,7 @@ _FRAME_PACKETS = (
             Field("latitude_deg", "f64", "Latitude, mean-Earth frame", "deg"),
             Field("longitude_deg", "f64", "Longitude, mean-Earth frame", "deg"),
             Field("altitude_m", "f64", "Height above the 1737.4 km sphere", "m"),
-            Field("velocity_icrf_m_s", "f32", "Velocity, on-board inertial axes; NaN if not estimated", "m/s", size=3),
+            Field("velocity_icrf_m_s", "f32", "Velocity, ICRF axes; NaN if not estimated", "m/s", size=3),
             Field("sigma_rtn_m", "f32", "Standard deviations: radial, transverse, normal", "m", size=3),
             Field("nis", "f32", "Normalised innovation squared of the last update, NaN without one"),
             Field("matched", "u8", "Detections used", saturate=True),
@@ -340,8 +340,8 @@ def _second_telemetry(events: Labels) -> tuple[PacketDefinition, ...]:
             "filter_state", APID_NAVIGATION_STATE, 129, 4, "Orbit of the navigation filter with its covariance",
             (
                 *_FRAME,
-                Field("position_icrf_m", "f64", "Position, Moon-centred, on-board inertial axes", "m", size=3),
-                Field("velocity_icrf_m_s", "f64", "Velocity, on-board inertial axes", "m/s", size=3),
+                Field("position_icrf_m", "f64", "Position, Moon-centred ICRF axes", "m", size=3),
+                Field("velocity_icrf_m_s", "f64", "Velocity, ICRF axes", "m/s", size=3),
                 Field("acceleration_rtn_m_s2", "f32", "Empirical acceleration, R, T, N", "m/s^2", size=3),
                 Field(
                     "covariance", "f32", "Covariance of the nine numbers above, lower triangle by rows", size=45

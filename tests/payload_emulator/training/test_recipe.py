@@ -115,12 +115,3 @@ def test_real_terrain_may_be_taken_without_what_is_stamped_on_it(tmp_path):
         path.write_text(f'{text}terrain = "{terrain}"\nsharpen = {value}\n')
         with pytest.raises(DatasetError, match="sharpen: expected true or false on real terrain"):
             load_recipe(path)
-
-
-def test_the_shipped_plain_terrain_keeps_as_far_from_the_test_blocks_as_the_shipped_data_set():
-    shipped = Path(__file__).parents[3] / "scenarios"
-    full, plain = (load_recipe(shipped / f"detector-{name}.toml") for name in ("dataset", "plain"))
-    real = next(source for source in full.sources if source.terrain == "real" and source.split == "train")
-    (source,) = plain.sources
-    assert not source.sharpen and source.split == "train"
-    assert (source.boxes, source.avoid, source.buffer_km) == (real.boxes, real.avoid, real.buffer_km)
