@@ -69,7 +69,10 @@ OF_THE_IMPORT = {
     "created_utc": "time at which the report was made",
     "provenance.spacecraft": "an archive has an instance of the spacecraft of its own",
     "provenance.archive": "a live pass has no archive",
-    "packets.receptions": "the archive does not name the station",
+    "packets.receptions[0].station": "the archive does not name the station",
+    "packets.receptions[0].first_utc_ns": "the archive does not state when it was received",
+    "packets.receptions[0].last_utc_ns": "the archive does not state when it was received",
+    "packets.receptions[0].octets": "records of the station have headers",
     "packets.octets": "records of the station have headers",
     "packets.octets_skipped": "records of the station have headers",
 }

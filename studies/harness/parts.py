@@ -331,3 +331,9 @@ def bare_environment(**settings: str) -> dict[str, str]:
         if not name.startswith("LINNA_") or name == "LINNA_DATA"
     }
     return {**kept, **settings}
+
+
+def environment_with_data(environment: Mapping[str, str], root: Path | None) -> dict[str, str]:
+    """Return an environment in which the data folder is `root`, and no other; None: no data."""
+    kept = {name: value for name, value in environment.items() if name != "LINNA_DATA"}
+    return kept if root is None else {**kept, "LINNA_DATA": str(root)}

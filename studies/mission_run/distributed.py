@@ -35,6 +35,7 @@ from studies.harness.parts import (
     RedisServer,
     answers_http,
     bare_environment,
+    environment_with_data,
     free_port,
     runs,
 )
@@ -117,10 +118,7 @@ class DistributedGround(MissionGround):
             "LINNA_PLAN_HOURLY": "false",
             "LINNA_ALLOW_DATABASE_OWNER": "false" if servers.database_url is None else "true",
         }
-        self._environment = bare_environment(**given)
-        self._environment.pop("LINNA_DATA", None)
-        if data.root is not None:
-            self._environment["LINNA_DATA"] = str(data.root)
+        self._environment = environment_with_data(bare_environment(**given), data.root)
         return Settings(
             home=folder / "ground", database_url=SecretStr(url), broker_url=SecretStr(broker), data=data.root
         )

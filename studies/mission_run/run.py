@@ -172,7 +172,11 @@ class MissionRun:
             self._say(f"catalogue: {count} craters with rim heights")
         self._progress.starts += 1
         spacecraft = SpacecraftProcess(
-            self._files, self._scenario.link.stations, self._terms.days, self._terms.rate
+            self._files,
+            self._scenario.link.stations,
+            self._terms.days,
+            self._terms.rate,
+            self._data.root,
         )
         try:
             ground = self._open_ground()

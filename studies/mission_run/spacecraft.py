@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from payload_emulator.errors import LinkError
-from studies.harness.parts import Part, free_port
+from studies.harness.parts import Part, environment_with_data, free_port
 
 ANSWER_S = 600.0
 """Longest wait for the spacecraft: the time to the next contact with windows in between, at maximum speed."""
@@ -45,7 +45,9 @@ class SpacecraftKilled(LinkError):
 class SpacecraftProcess:
     """The emulated spacecraft and its stations in a process; `messages` of its console in order."""
 
-    def __init__(self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float) -> None:
+    def __init__(
+        self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float, data: Path | None
+    ) -> None:
         self._log, self._console_port, self._mission_port = files.log, free_port(), free_port()
         words = ["emulate", files.scenario, "--live", "--no-operator", "--days", days, "--rate", rate]
         words += ["--hold-contacts", "--keep-unacknowledged", "--paused", "--end-with-console", "--json"]
@@ -57,7 +59,11 @@ class SpacecraftProcess:
         command = [sys.executable, "-m", "linna", *map(str, words)]
         # The console is connected at once, because its end is the end of the spacecraft.
         self._part = Part(
-            command, files.log, self._is_connected, START_ATTEMPTS, env={**os.environ, **ALLOCATOR}
+            command,
+            files.log,
+            self._is_connected,
+            START_ATTEMPTS,
+            env={**environment_with_data(os.environ, data), **ALLOCATOR},
         )
         self._console: socket.socket | None = None
         self.restart()
