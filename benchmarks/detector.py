@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from typing import Any
 
 from benchmarks._rows import Row
 from payload_emulator.flight.models import load_shipped_model
@@ -23,12 +21,3 @@ def rows() -> Iterator[Row]:
     )
     yield Row("detection, 99 %", found["p99_ms"], "ms", "median", found["median_ms"])
     yield Row("peak memory", found["peak_rss_mb"], "MB")
-
-
-def main() -> dict[str, Any]:
-    """Return the figures of the shipped network."""
-    return {"detector": bench(load_shipped_model())}
-
-
-if __name__ == "__main__":
-    print(json.dumps(main(), indent=1))

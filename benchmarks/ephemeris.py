@@ -1,8 +1,7 @@
-"""Benchmark of ephemeris files and interpolation, compared with alternatives: python benchmarks/ephemeris.py."""
+"""Benchmark of ephemeris files and interpolation, compared with alternatives: python -m benchmarks ephemeris."""
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 import warnings
@@ -122,7 +121,3 @@ def _best(action: Callable[[], Any], times: int = 3) -> float:
         action()
         seconds.append(time.perf_counter() - started)
     return min(seconds)
-
-
-if __name__ == "__main__":
-    print(json.dumps({"ephemeris": bench()}, indent=1))

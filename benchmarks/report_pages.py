@@ -1,11 +1,10 @@
-"""Time and size of reports: python benchmarks/report_pages.py.
+"""Time and size of reports: python -m benchmarks report_pages.
 
 The day is 5,760 frames at 15 s, 26 imaging arcs, three estimators, three baselines, sixteen images.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -53,7 +52,3 @@ def _measured(make: Callable[[], bytes]) -> dict[str, float]:
         "cpu_s": round(time.process_time() - cpu, 2),
         "mb": round(len(octets) / 1e6, 2),
     }
-
-
-if __name__ == "__main__":
-    print(json.dumps({"reports": bench()}, indent=1))
