@@ -10,9 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -222,73 +220,3 @@ def _mark(path: Path) -> list[int]:
     files = [one for one in path.rglob("*") if one.is_file()] if path.is_dir() else [path]
     stats = [one.stat() for one in files]
     return [sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]
-
-
-CONNECT_S = 30.0
-DOCUMENT_LIMIT_OCTETS = 1 << 20
-PAUSE_S = 0.5
-
-
-def follow_tcp(address: tuple[str, int], spool: Spool, *, reconnect: bool, stop: Callable[[], bool]) -> int:
-    """Take telemetry from a TCP sender until it closes (or for good, with `reconnect`); the octets taken."""
-    spool.open()
-    spool.drain()
-    taken = 0
-    while True:
-        with _connected(address, stop, patient=reconnect) as connection:
-            while not stop():
-                try:
-                    block = connection.recv(1 << 16)
-                except TimeoutError:
-                    block = None
-                except OSError:
-                    break
-                if block == b"":
-                    break
-                if block:
-                    spool.keep(block)
-                    taken += len(block)
-                if not block or spool.size >= SEGMENT_OCTETS:
-                    spool.cut()
-                    spool.drain()
-        spool.cut()
-        spool.drain()
-        if not reconnect or stop():
-            return taken
-
-
-def receive_document(address: tuple[str, int]) -> bytes:
-    """Return what a TCP sender sends until it closes the connection."""
-    octets = b""
-    with _connected(address, lambda: False, patient=False) as connection:
-        connection.settimeout(CONNECT_S)
-        try:
-            while block := connection.recv(1 << 16):
-                octets += block
-                if len(octets) > DOCUMENT_LIMIT_OCTETS:
-                    break
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise InvalidInput(f"{address[0]}:{address[1]}", "", "a whole document", found) from None
-    if len(octets) > DOCUMENT_LIMIT_OCTETS:
-        expected = f"at most {DOCUMENT_LIMIT_OCTETS} octets"
-        raise InvalidInput(f"{address[0]}:{address[1]}", "", expected, "more")
-    return octets
-
-
-@contextlib.contextmanager
-def _connected(address: tuple[str, int], stop: Callable[[], bool], *, patient: bool) -> Iterator[Any]:
-    until = time.monotonic() + CONNECT_S
-    while True:
-        try:
-            connection = socket.create_connection(address, timeout=5.0)
-            break
-        except OSError as error:
-            if stop() or (not patient and time.monotonic() > until):
-                raise InvalidInput(
-                    f"{address[0]}:{address[1]}", "", "a sender of telemetry", error.strerror or str(error)
-                ) from None
-            time.sleep(1.0)
-    with connection:
-        connection.settimeout(PAUSE_S)
-        yield connection

@@ -1,4 +1,4 @@
-"""`linna ingest`: ingest of downlink files, pass archives and live telemetry."""
+"""`linna ingest`: ingest of downlink files and pass archives."""
 
 from __future__ import annotations
 
@@ -14,22 +14,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "files", nargs="*", type=Path, metavar="FILE", help="downlink file or pass archive folder"
     )
-    parser.add_argument(
-        "--tcp",
-        metavar="HOST:PORT",
-        help="receive telemetry from this TCP server until it closes the connection",
-    )
-    parser.add_argument(
-        "--mission",
-        metavar="HOST:PORT",
-        help="with --tcp: receive the mission description from here at the first contact of a spacecraft",
-    )
     parser.add_argument("--watch", type=Path, metavar="DIR", help="ingest the files that appear in a folder")
-    parser.add_argument(
-        "--follow",
-        action="store_true",
-        help="until Ctrl-C: with --tcp, connect again; with --watch, continue to watch",
-    )
+    parser.add_argument("--follow", action="store_true", help="with --watch: continue to watch until Ctrl-C")
     parser.add_argument(
         "--spacecraft-id",
         type=int,
@@ -75,15 +61,15 @@ def run(arguments: argparse.Namespace) -> int:
     offset = arguments.offset or 0
     with ground_client(arguments) as service:
 
-        def ingest(path: Path, recording: str | None = None, offset: int = 0) -> dict[str, Any]:
+        def ingest(path: Path, offset: int = 0) -> dict[str, Any]:
             if path.is_dir():
                 return {"file": str(path), "pass_id": service.import_archive(path)}
             made = service.ingest_file(
                 path,
                 spacecraft_id=arguments.spacecraft_id,
                 instance=arguments.instance,
-                stream=recording,
-                offset=None if recording is None else offset,
+                stream=arguments.recording,
+                offset=None if arguments.recording is None else offset,
                 station=arguments.station,
                 link=arguments.link,
             )
@@ -95,13 +81,10 @@ def run(arguments: argparse.Namespace) -> int:
             figures = made.accounting.model_dump(include=set(kept))
             return {"file": str(path), "ingest_id": made.id, **figures}
 
-        def ingest_live(path: Path, recording: str | None = None, offset: int = 0) -> dict[str, Any]:
+        def ingest_watched(path: Path) -> dict[str, Any]:
             try:
-                return ingest(path, recording, offset)
-            except (
-                Unreachable,
-                Unavailable,
-            ) as error:  # not a fault of the data, which remain to be ingested
+                return ingest(path)
+            except (Unreachable, Unavailable) as error:  # no fault of the file, which remains to be ingested
                 raise StoreError(str(error)) from None
 
         def report(path: Path, result: Any) -> None:
@@ -109,17 +92,13 @@ def run(arguments: argparse.Namespace) -> int:
             done.append(one)
             log(_line(one))
 
-        if arguments.tcp is not None:
-            if arguments.mission is not None:
-                _first_contact(arguments, service)
-            _follow(arguments, ingest_live, report)
-        elif arguments.watch is not None:
-            _watch(arguments, ingest_live, report)
+        if arguments.watch is not None:
+            _watch(arguments, ingest_watched, report)
         else:
             for path in arguments.files:
                 log(f"ingesting {path} ...")
                 try:
-                    done.append(ingest(path, arguments.recording, offset))
+                    done.append(ingest(path, offset))
                 except (InvalidInput, InvalidRequest, JobFailed) as error:
                     if len(arguments.files) == 1:
                         raise
@@ -142,53 +121,14 @@ def _check(arguments: argparse.Namespace) -> None:
 
     if arguments.spacecraft_id is not None and not 0 <= arguments.spacecraft_id <= 1023:
         raise UsageError(f"--spacecraft-id: expected 0 to 1023, found {arguments.spacecraft_id}")
-    if sum((bool(arguments.files), arguments.tcp is not None, arguments.watch is not None)) != 1:
-        raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
-    if arguments.mission is not None and arguments.tcp is None:
-        raise UsageError("--mission: expected --tcp, found none")
+    if bool(arguments.files) == (arguments.watch is not None):
+        raise UsageError("ingest: expected either FILE... or --watch")
     if arguments.offset is not None and (arguments.recording is None or arguments.offset < 0):
         raise UsageError(
             f"--offset: expected octets from the beginning of --recording, found {arguments.offset}"
         )
     if arguments.recording is not None and not arguments.files:
         raise UsageError("--recording: expected the files of the recording, found none")
-
-
-def _address(option: str, text: str) -> tuple[str, int]:
-    from linna.errors import UsageError
-
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise UsageError(f"{option}: expected HOST:PORT, found {text!r}")
-    return host.strip("[]"), int(port)
-
-
-def _first_contact(arguments: argparse.Namespace, service: Any) -> None:
-    """Add the mission description of the sender, unless a person has entered one of its spacecraft."""
-    from ground_service.ingest.live import receive_document
-    from ground_service.missions.service import read_mission
-    from ground_service.missions.store import ARCHIVE_ACTOR
-
-    octets = receive_document(_address("--mission", arguments.mission))
-    mission, _ = read_mission(octets, arguments.mission)
-    for known in service.list_missions():
-        if known.spacecraft_id == mission.spacecraft.id and known.entered_by != ARCHIVE_ACTOR:
-            return
-    added = service.add_mission(octets)
-    log(f"mission description of {added.mission}, revision {added.revision[:16]}")
-
-
-def _follow(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
-    from ground_service.ingest.live import Spool, follow_tcp
-
-    host, port = _address("--tcp", arguments.tcp)
-    folder = settings_of(arguments).home / "incoming" / f"{host}-{port}".replace("/", "_").replace(":", "_")
-    spool = Spool(folder, ingest, report)
-    try:
-        follow_tcp((host, port), spool, reconnect=arguments.follow, stop=lambda: False)
-    except KeyboardInterrupt:
-        spool.cut()
-        spool.drain()
 
 
 def _watch(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:

@@ -6,10 +6,8 @@ software itself on a simulated board; only its detector is scripted.
 
 import json
 import os
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -75,25 +73,6 @@ class Spacecraft:
 
 
 @contextmanager
-def antenna(stream: bytes) -> Iterator[str]:
-    """A TCP port that gives a downlink to each client."""
-    listener = socket.create_server(("127.0.0.1", 0))
-
-    def send() -> None:
-        connection, _ = listener.accept()
-        with connection:
-            connection.sendall(stream)
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        yield f"127.0.0.1:{listener.getsockname()[1]}"
-    finally:
-        thread.join(20)
-        listener.close()
-
-
-@contextmanager
 def workers(settings: Settings, folder: Path, count: int) -> Iterator[None]:
     environment = {
         **os.environ,
@@ -139,8 +118,9 @@ def operate(capsys: pytest.CaptureFixture[str], service: tuple[str, str], folder
         return json.loads(printed.out)
 
     def listen(stream: bytes) -> Any:
-        with antenna(stream) as address:
-            return linna("ingest", "--tcp", address)
+        (folder / "down.cadu").write_bytes(stream)
+        (ingested,) = linna("ingest", folder / "down.cadu")["ingested"]
+        return ingested
 
     linna("plan", "ephemeris", reference_ephemeris(folder / "reference.oem"))
     found = linna("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 600)["candidates"]
