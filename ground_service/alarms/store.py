@@ -190,12 +190,8 @@ def list_alarms(connection: Connection, asked: AlarmFilter, now_utc_ns: int) -> 
         query = query.where(or_(*among))
     if asked.severity is not None:
         query = query.where(_ALARMS.c.severity == SEVERITY_CODES[asked.severity])
-    if asked.spacecraft_id is not None:
-        query = query.where(VEHICLES.c.ccsds_id == asked.spacecraft_id)
-    if asked.instance is not None:
-        query = query.where(VEHICLES.c.instance == asked.instance)
     order = (_ALARMS.c.open.is_(None), _ALARMS.c.last_ticks.desc(), _ALARMS.c.id.desc())
-    rows, total = page(connection, query, asked, *order)
+    rows, total = page(connection, query, asked, *order, others=("state", "severity"))
     return [_row(row) for row in rows], total
 
 

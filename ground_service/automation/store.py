@@ -160,7 +160,7 @@ def actions_of_event(connection: Connection, event: int) -> list[AutomationActio
 
 def list_automation_actions(connection: Connection, asked: ActionFilter) -> PageOf[AutomationAction]:
     """List the actions of rules with their causes and results, newest first."""
-    rows, total = repository.newest(connection, ACTIONS, asked, state=asked.state, pass_id=asked.pass_id)
+    rows, total = repository.newest(connection, ACTIONS, asked)
     return asked.page(map(_action, rows), total)
 
 

@@ -155,7 +155,7 @@ def list_views(
     connection: Connection, asked: TelecommandFilter, now_utc_ns: int
 ) -> tuple[list[CommandView], int]:
     """Return a page of the telecommands, newest first, and their number."""
-    rows, total = repository.newest(connection, TELECOMMANDS, asked, state=asked.state)
+    rows, total = repository.newest(connection, TELECOMMANDS, asked)
     return [_view(connection, CommandRecord.of(row), now_utc_ns) for row in rows], total
 
 

@@ -17,11 +17,29 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.exports.layers import CRS, CRS_URN, Feature, Layer
+from ground_service.errors import EvaluationError
+from ground_service.evaluation.core import PassInputs
+from ground_service.exports.czml import format_czml
+from ground_service.exports.layers import CRS, CRS_URN, Feature, Layer, layers_of
+from ground_service.exports.poses import poses_of
 from tmtc.errors import MissingLibrary
+
+MAPS = ("geojson", "gpkg", "czml")
+"""Formats with the layers of a pass."""
 
 _WKB = {"Point": 1, "LineString": 2, "Polygon": 3, "MultiLineString": 5, "MultiPolygon": 6}
 _DECIMALS = 8
+
+
+def map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:
+    """Return the layers of a pass in a format."""
+    poses = poses_of(inputs, states)
+    layers = layers_of(inputs, poses)
+    if kind == "czml":
+        return format_czml(inputs, poses, layers, inputs.title).encode()
+    if not any(one.features for one in layers):
+        raise EvaluationError(f"pass {inputs.pass_id}: expected frames with known positions, found none")
+    return format_geojson(layers, inputs.title).encode() if kind == "geojson" else geopackage_octets(layers)
 
 
 def format_geojson(layers: Sequence[Layer], name: str) -> str:

@@ -24,13 +24,10 @@ from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.navigation.trajectory import format_tum
 from ground_service.exports import messages
-from ground_service.exports.czml import format_czml
 from ground_service.exports.formats import FORMATS, Format
-from ground_service.exports.layers import layers_of
-from ground_service.exports.maps import format_geojson, geopackage_octets
+from ground_service.exports.maps import MAPS, map_octets
 from ground_service.exports.model import ExportFormatInfo, ExportRequest
 from ground_service.exports.packet_files import parquet_files
-from ground_service.exports.poses import poses_of
 from ground_service.exports.table_files import csv_files, netcdf_octets
 from ground_service.exports.tables import pass_tables
 from ground_service.ground import Ground
@@ -44,7 +41,6 @@ from tmtc.errors import MissingLibrary
 
 ORBITS = ("oem", "oem-xml", "spk")
 ATTITUDES = ("aem", "ck")
-MAPS = ("geojson", "gpkg", "czml")
 SPOOLED_OCTETS = 8 << 20
 """A zip archive up to this size stays in memory."""
 
@@ -112,7 +108,7 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
     if kind == "netcdf":
         return netcdf_octets(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
     if kind in MAPS:
-        return _map_octets(inputs, kind, request.states)
+        return map_octets(inputs, kind, request.states)
     detail = get_pass(ground, request.pass_id)
     with ground.database.reading() as connection:
         correlations = _span(connection, request.pass_id).correlations
@@ -123,16 +119,6 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
     if kind in ATTITUDES:
         return messages.attitude_octets(inputs, craft, kind)
     return messages.text_kernel(inputs, craft, kind).encode()
-
-
-def _map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:
-    poses = poses_of(inputs, states)
-    layers = layers_of(inputs, poses)
-    if kind == "czml":
-        return format_czml(inputs, poses, layers, inputs.title).encode()
-    if not any(one.features for one in layers):
-        raise EvaluationError(f"pass {inputs.pass_id}: expected frames with known positions, found none")
-    return format_geojson(layers, inputs.title).encode() if kind == "geojson" else geopackage_octets(layers)
 
 
 def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[tuple[str, bytes]]:

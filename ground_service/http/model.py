@@ -51,6 +51,14 @@ class Paging(BaseModel):
     limit: int = Field(default=100, ge=1, le=1000, description="Items in a page")
     offset: int = Field(default=0, ge=0, le=2**31 - 1, description="Items before the page")
 
+    def filters(self) -> dict[str, Any]:
+        """Return the filters that are stated."""
+        return {
+            name: value
+            for name in type(self).model_fields
+            if name not in Paging.model_fields and (value := getattr(self, name)) not in (None, [])
+        }
+
     def page(self, items: Iterable[Item], total: int) -> PageOf[Item]:
         """Return the page with these items."""
         return PageOf(items=list(items), total=total, limit=self.limit, offset=self.offset)

@@ -54,7 +54,7 @@ def get_job(connection: Connection, job_id: str) -> Job:
 
 def list_jobs(connection: Connection, asked: JobFilter) -> PageOf[Job]:
     """List the jobs, newest first; `kind` selects jobs of one kind."""
-    rows, total = repository.newest(connection, JOBS, asked, kind=asked.kind)
+    rows, total = repository.newest(connection, JOBS, asked)
     return asked.page(map(Job.of, rows), total)
 
 

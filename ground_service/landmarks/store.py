@@ -36,10 +36,6 @@ def get_landmark(connection: Connection, landmark_id: int) -> LandmarkDetail:
 def list_landmarks(connection: Connection, asked: LandmarkFilter) -> PageOf[Landmark]:
     """List the landmarks learned from flight, most passes first."""
     query = select(*(one for one in _LANDMARKS.c if one.name != "evidence"))
-    if asked.spacecraft_id is not None:
-        query = query.where(_LANDMARKS.c.spacecraft_id == asked.spacecraft_id)
-    if asked.state is not None:
-        query = query.where(_LANDMARKS.c.state == asked.state)
     order = (_LANDMARKS.c.passes.desc(), _LANDMARKS.c.sightings.desc(), _LANDMARKS.c.id)
     rows, total = repository.page(connection, query, asked, *order)
     return asked.page(map(Landmark.of, rows), total)

@@ -172,9 +172,8 @@ def event_page(
     order = [
         table.c[column] for column in ("ticks", "event_id", "frame_number", "value_1", "value_2", "packet_id")
     ]
-    rows, total = repository.page(
-        connection, query, asked, *(column.desc() if newest_first else column for column in order)
-    )
+    sorting = (column.desc() if newest_first else column for column in order)
+    rows, total = repository.page(connection, query, asked, *sorting, others=["severity"])
     return _pass_events([tuple(row.values()) for row in rows], span), total
 
 

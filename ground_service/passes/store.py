@@ -59,10 +59,6 @@ def list_passes(connection: Connection, asked: PassFilter) -> PageOf[PassSummary
     )
     if asked.search is not None:
         query = query.where(func.lower(_PASSES.c.name).contains(asked.search.lower(), autoescape=True))
-    if asked.spacecraft_id is not None:
-        query = query.where(vehicles.c.ccsds_id == asked.spacecraft_id)
-    if asked.instance is not None:
-        query = query.where(vehicles.c.instance == asked.instance)
     if asked.verdict == "none":
         query = query.where(_PASSES.c.id.not_in(select(repository.REPORTS.c.pass_id)))
     elif asked.verdict is not None:

@@ -80,11 +80,8 @@ def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyR
 
 def list_monthly_reports(connection: Connection, asked: MonthlyReportFilter) -> PageOf[MonthlyReport]:
     """List the monthly reports, newest month first."""
-    query = select(_MONTHLY)
-    if asked.spacecraft_id is not None:
-        query = query.where(_MONTHLY.c.spacecraft_id == asked.spacecraft_id)
     order = (_MONTHLY.c.month.desc(), _MONTHLY.c.created_utc_ns.desc(), _MONTHLY.c.id)
-    rows, total = repository.page(connection, query, asked, *order)
+    rows, total = repository.page(connection, select(_MONTHLY), asked, *order)
     return asked.page((_shown(StoredMonthlyReport.of(row)) for row in rows), total)
 
 

@@ -124,8 +124,7 @@ def get_record(connection: Connection, window_id: int) -> WindowRecord:
 
 def list_windows(connection: Connection, asked: WindowFilter) -> PageOf[Window]:
     """List the planned windows, newest first."""
-    query = _joined() if asked.state is None else _joined().where(WINDOWS.c.state == asked.state)
-    rows, total = page(connection, query, asked, WINDOWS.c.created_utc_ns.desc(), WINDOWS.c.id.desc())
+    rows, total = page(connection, _joined(), asked, WINDOWS.c.created_utc_ns.desc(), WINDOWS.c.id.desc())
     return asked.page(_windows(connection, rows, Window), total)
 
 

@@ -6,6 +6,7 @@ turns into the entities of its capability.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from sqlalchemy import Connection, Table, func, insert, select, update
@@ -17,13 +18,14 @@ from ground_service.store import models
 Row = dict[str, Any]
 
 
-class Span(Protocol):
-    """The rows of a list that are asked for."""
+class Asked(Protocol):
+    """The page of a list and the filters that are asked for."""
 
     @property
     def limit(self) -> int: ...
     @property
     def offset(self) -> int: ...
+    def filters(self) -> Mapping[str, Any]: ...
 
 
 FILES = models.FILES
@@ -112,22 +114,30 @@ def find(connection: Connection, table: Table, **equal: Any) -> Row | None:
     return dict(row) if row is not None else None
 
 
-def page(connection: Connection, query: Select[Any], span: Span, *order: Any) -> tuple[list[Row], int]:
-    """Return a page of the rows of a query in an order, and the number of all rows."""
+def page(
+    connection: Connection, query: Select[Any], asked: Asked, *order: Any, others: Sequence[str] = ()
+) -> tuple[list[Row], int]:
+    """Return a page of the rows of a query in an order, and the number of all rows.
+
+    A filter with the name of a column selects the rows with its value, or one of its values; `others` are filters with
+    another meaning, which the query has already.
+    """
+    columns = query.selected_columns
+    for name, value in asked.filters().items():
+        if name in columns and name not in others:
+            query = query.where(
+                columns[name].in_(value) if isinstance(value, list) else columns[name] == value
+            )
     total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
-    rows = connection.execute(query.order_by(*order).limit(span.limit).offset(span.offset)).mappings()
+    rows = connection.execute(query.order_by(*order).limit(asked.limit).offset(asked.offset)).mappings()
     return [dict(row) for row in rows], int(total)
 
 
-def newest(connection: Connection, table: Table, span: Span, **equal: Any) -> tuple[list[Row], int]:
-    """Return a page of the rows of a table, newest first, and the number of all rows.
-
-    `equal` are values of columns; None selects rows with any value.
-    """
-    stated = {name: value for name, value in equal.items() if value is not None}
+def newest(connection: Connection, table: Table, asked: Asked, **equal: Any) -> tuple[list[Row], int]:
+    """Return a page of the rows of a table with these values, newest first, and the number of all rows."""
     key = next(iter(table.primary_key.columns))
     order = [table.c.created_utc_ns, key] if "created_utc_ns" in table.c else [key]
-    return page(connection, _where(table, stated), span, *(column.desc() for column in order))
+    return page(connection, _where(table, equal), asked, *(column.desc() for column in order))
 
 
 def _insert_of(connection: Connection) -> Any:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from linna.commands._ground import add_service_options, open_service, settings_of
 from linna.output import add_json_flag, emit
+from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.settings import Settings
@@ -20,33 +21,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
     granting = actions.add_parser(
         "grant", help="grant a database role the least privileges that the service needs"
     )
-    granting.add_argument("--role", metavar="NAME", help="default: the user of $LINNA_DATABASE_URL")
-    granting.add_argument(
+    option(granting, "--role NAME", str, "default: the user of $LINNA_DATABASE_URL")
+    option(
+        granting,
         "--backup",
-        action="store_true",
-        help="grant only the right to read, for backups; --role defaults to $LINNA_BACKUP_ROLE",
+        bool,
+        "grant only the right to read, for backups; --role defaults to $LINNA_BACKUP_ROLE",
     )
-    granting.add_argument("--print", action="store_true", help="print the SQL statements and do not run them")
+    option(granting, "--print", bool, "print the SQL statements and do not run them")
     granting.set_defaults(handler=run_grant)
     downgrade = actions.add_parser("downgrade", help="delete every table and row of the database")
-    downgrade.add_argument("revision", help="base, the only revision to downgrade to")
-    downgrade.add_argument("--yes", action="store_true", help="confirm that everything is deleted")
+    option(downgrade, "revision", str, "base, the only revision to downgrade to")
+    option(downgrade, "--yes", bool, "confirm that everything is deleted")
     downgrade.set_defaults(handler=run_downgrade)
     status = actions.add_parser("status", help="show the schema revision of the database")
     status.set_defaults(handler=run_status)
     saving = actions.add_parser("backup", help="write the whole service into a new folder, while it runs")
-    saving.add_argument("--out", type=Path, required=True, metavar="DIR")
+    option(saving, "--out DIR", Path, required=True)
     saving.set_defaults(handler=run_backup)
     restoring = actions.add_parser(
         "restore", help="fill an empty service from a backup, of SQLite or PostgreSQL"
     )
-    restoring.add_argument("folder", type=Path)
+    option(restoring, "folder", Path)
     restoring.set_defaults(handler=run_restore)
     tidying = actions.add_parser("tidy", help="delete old feed messages and old finished jobs")
-    tidying.add_argument(
+    option(
+        tidying,
         "--days",
-        type=int,
-        help="delete what is older than this number of days (default: $LINNA_RETENTION_DAYS)",
+        int,
+        "delete what is older than this number of days (default: $LINNA_RETENTION_DAYS)",
     )
     tidying.set_defaults(handler=run_tidy)
     decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")

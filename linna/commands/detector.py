@@ -13,6 +13,8 @@ from linna.commands._detector_common import (
     restart_for_training,
     write_text,
 )
+from linna.output import finish
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -30,116 +32,87 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_train(verbs: Any) -> None:
-    from linna.output import add_json_flag
 
     train = verbs.add_parser("train", help="train a network; resumes the run of the same folder")
-    train.add_argument("datasets", type=Path, nargs="+", metavar="DATASET")
-    train.add_argument("--out", type=Path, required=True, metavar="RUN")
-    train.add_argument(
-        "--minutes", type=float, default=90.0, help="wall-clock budget of the learning-rate schedule"
-    )
-    train.add_argument("--steps", type=int, default=0, help="budget in optimiser steps instead")
-    train.add_argument("--seed", type=int, default=1)
-    train.add_argument("--crop", type=int, default=384, metavar="PX")
-    train.add_argument("--batch", type=int, default=8)
-    train.add_argument(
-        "--patience", type=int, default=0, help="stop after this many validations without gain (0: never)"
-    )
-    train.add_argument("--learning-rate", type=float, default=2.5e-3)
-    train.add_argument(
-        "--landmarks",
-        type=Path,
-        default=None,
-        metavar="F.csv",
-        help="uncatalogued landmarks as further labels",
-    )
-    train.add_argument(
-        "--start-from",
-        type=Path,
-        default=None,
-        metavar="FILE",
-        help="first weights: a checkpoint or an ONNX network",
-    )
-    train.add_argument(
+    option(train, "datasets DATASET", Path, nargs="+")
+    option(train, "--out RUN", Path, required=True)
+    option(train, "--minutes", float, "wall-clock budget of the learning-rate schedule", default=90.0)
+    option(train, "--steps", int, "budget in optimiser steps instead", default=0)
+    option(train, "--seed", int, default=1)
+    option(train, "--crop PX", int, default=384)
+    option(train, "--batch", int, default=8)
+    option(train, "--patience", int, "stop after this many validations without gain (0: never)", default=0)
+    option(train, "--learning-rate", float, default=2.5e-3)
+    option(train, "--landmarks F.csv", Path, "uncatalogued landmarks as further labels", default=None)
+    option(train, "--start-from FILE", Path, "first weights: a checkpoint or an ONNX network", default=None)
+    option(
+        train,
         "--normalise-first",
-        action="store_true",
-        help="the paper's order: channels of an RGB data set are normalised, then averaged",
+        bool,
+        "the paper's order: channels of an RGB data set are normalised, then averaged",
     )
-    train.add_argument(
+    option(
+        train,
         "--enlarge",
-        type=int,
+        int,
+        "factor by which the network enlarges images, for high altitudes; --crop is in pixels before enlargement",
         choices=(1, 2),
         default=1,
-        help="factor by which the network enlarges images, for high altitudes; --crop is in pixels before enlargement",
     )
-    train.add_argument(
+    option(
+        train,
         "--visible-labels",
-        action="store_true",
-        help="choose and weigh labels by their visibility in the frame instead of their depth/diameter",
+        bool,
+        "choose and weigh labels by their visibility in the frame instead of their depth/diameter",
     )
-    train.add_argument(
-        "--least-emphasis",
-        type=float,
+    option(
+        train,
+        "--least-emphasis W",
+        float,
+        "least factor of a label's weight by diameter; 1 weighs all craters below 28 px the same (default: 0.5)",
         default=0.5,
-        metavar="W",
-        help="least factor of a label's weight by diameter; 1 weighs all craters below 28 px the same (default: 0.5)",
     )
-    train.add_argument(
-        "--rims",
-        type=Path,
+    option(
+        train,
+        "--rims TABLE",
+        Path,
+        "labels on rims (binary table of `linna catalogue curate`) instead of the catalogue's circles",
         default=None,
-        metavar="TABLE",
-        help="labels on rims (binary table of `linna catalogue curate`) instead of the catalogue's circles",
     )
-    train.add_argument(
-        "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
-    )
-    add_json_flag(train)
-    train.set_defaults(handler=_train)
+    option(train, "--replicas", int, "threads that train side by side (0: one per core)", default=0)
+    finish(train, _train)
 
 
 def _add_export(verbs: Any) -> None:
-    from linna.output import add_json_flag
 
     export = verbs.add_parser("export", help="write the ONNX network of a run, checked against torch")
-    export.add_argument(
-        "run", type=Path, metavar="RUN", help="folder of a run, a checkpoint file, or an exported network"
+    option(export, "run RUN", Path, "folder of a run, a checkpoint file, or an exported network")
+    option(export, "--out M.onnx", Path, required=True)
+    option(
+        export, "--dataset DIR", Path, "whose validation split fixes the thresholds", nargs="*", default=[]
     )
-    export.add_argument("--out", type=Path, required=True, metavar="M.onnx")
-    export.add_argument(
-        "--dataset",
-        type=Path,
-        nargs="*",
-        default=[],
-        metavar="DIR",
-        help="whose validation split fixes the thresholds",
-    )
-    export.add_argument("--revision", default="", help="source revision for the model's metadata")
-    export.add_argument("--note", default="", help="a remark on the training for the model's metadata")
-    export.add_argument(
-        "--paper-classes", action="store_true", help="keep the heatmaps of the paper's three classes"
-    )
-    export.add_argument(
+    option(export, "--revision", str, "source revision for the model's metadata", default="")
+    option(export, "--note", str, "a remark on the training for the model's metadata", default="")
+    option(export, "--paper-classes", bool, "keep the heatmaps of the paper's three classes")
+    option(
+        export,
         "--classes-only",
-        action="store_true",
-        help="the paper's detector: class heatmaps and offsets, no sizes; flies as a build",
+        bool,
+        "the paper's detector: class heatmaps and offsets, no sizes; flies as a build",
     )
-    export.add_argument(
+    option(
+        export,
         "--enlarge",
-        type=int,
+        int,
+        "factor by which the network first enlarges images (0: factor of the network)",
         choices=(0, 1, 2),
         default=0,
-        help="factor by which the network first enlarges images (0: factor of the network)",
     )
-    export.add_argument(
-        "--test", action="store_true", help="score the test splits and write the figures into the model"
-    )
-    add_json_flag(export)
-    export.set_defaults(handler=_export)
+    option(export, "--test", bool, "score the test splits and write the figures into the model")
+    finish(export, _export)
 
 
 def _add_calibrate(verbs: Any) -> None:
-    from linna.output import add_json_flag
     from payload_emulator.flight.vision.calibration import PARTS
 
     calibrate = verbs.add_parser(
@@ -147,98 +120,85 @@ def _add_calibrate(verbs: Any) -> None:
         help="fit scores by size, position errors and the pull of the Sun on validation frames, and store them",
     )
     add_model(calibrate)
-    calibrate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    calibrate.add_argument("--out", type=Path, required=True, metavar="M.onnx")
-    calibrate.add_argument(
+    option(calibrate, "--dataset DIR", Path, nargs="+", required=True)
+    option(calibrate, "--out M.onnx", Path, required=True)
+    option(
+        calibrate,
         "--parts",
+        PARTS,
+        "what is stored (default: score and sigma)",
         nargs="*",
-        choices=PARTS,
         default=["score", "sigma"],
-        help="what is stored (default: score and sigma)",
     )
-    calibrate.add_argument(
-        "--precision",
-        type=float,
+    option(
+        calibrate,
+        "--precision P",
+        float,
+        "share of the detections used on board that are catalogued craters of 3 to 30 km (default: 0.85)",
         default=0.85,
-        metavar="P",
-        help="share of the detections used on board that are catalogued craters of 3 to 30 km (default: 0.85)",
     )
-    add_json_flag(calibrate)
-    calibrate.set_defaults(handler=_calibrate)
+    finish(calibrate, _calibrate)
 
 
 def _add_evaluate(verbs: Any) -> None:
     from linna.commands import _detector_pictures
-    from linna.output import add_json_flag
 
     evaluate = verbs.add_parser("evaluate", help="precision, recall and localisation on a data set")
     add_model(evaluate)
     tested = evaluate.add_mutually_exclusive_group(required=True)
-    tested.add_argument("--dataset", type=Path, nargs="+", metavar="DIR")
+    option(tested, "--dataset DIR", Path, nargs="+")
     _detector_pictures.add_evaluation(evaluate, tested)
-    evaluate.add_argument("--split", choices=("train", "val", "test"), default="test")
-    evaluate.add_argument("--source", default="", help="only the frames of this source")
-    evaluate.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
-    evaluate.add_argument(
+    option(evaluate, "--split", ("train", "val", "test"), default="test")
+    option(evaluate, "--source", str, "only the frames of this source", default="")
+    option(evaluate, "--threshold", float, "instead of the model's own", default=None)
+    option(
+        evaluate,
         "--paper-classes",
-        action="store_true",
-        help="the paper's design: the class from its own heatmap instead of diameter and altitude",
+        bool,
+        "the paper's design: the class from its own heatmap instead of diameter and altitude",
     )
-    evaluate.add_argument(
-        "--rims",
-        type=Path,
+    option(
+        evaluate,
+        "--rims TABLE",
+        Path,
+        "rims from `linna catalogue curate`: distances from these in addition to the catalogue positions",
         default=None,
-        metavar="TABLE",
-        help="rims from `linna catalogue curate`: distances from these in addition to the catalogue positions",
     )
-    evaluate.add_argument(
-        "--rims-shift",
-        type=float,
-        nargs=2,
+    option(
+        evaluate,
+        "--rims-shift EAST_M NORTH_M",
+        float,
+        "offset of the terrain in the images from the table (default: 0 0)",
         default=(0.0, 0.0),
-        metavar=("EAST_M", "NORTH_M"),
-        help="offset of the terrain in the images from the table (default: 0 0)",
     )
-    evaluate.add_argument("--report", type=Path, default=None, metavar="F.html", help="write one HTML report")
-    evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")
-    add_json_flag(evaluate)
-    evaluate.set_defaults(handler=_evaluate)
+    option(evaluate, "--report F.html", Path, "write one HTML report", default=None)
+    option(evaluate, "--run", Path, "training run whose curves the report shows", default=None)
+    finish(evaluate, _evaluate)
 
 
 def _add_compare(verbs: Any) -> None:
-    from linna.output import add_json_flag
 
     compare = verbs.add_parser("compare", help="two networks on the same frames, with paired intervals")
-    compare.add_argument("model", type=Path, metavar="M.onnx", help="ONNX file or name of a shipped network")
-    compare.add_argument("reference", type=Path, metavar="REFERENCE.onnx")
-    compare.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    compare.add_argument("--split", choices=("train", "val", "test"), default="val")
-    compare.add_argument("--source", default="", help="only the frames of this source")
-    compare.add_argument(
-        "--picture",
-        type=Path,
-        default=None,
-        metavar="F.png",
-        help="draw both networks' detections on some frames",
-    )
-    add_json_flag(compare)
-    compare.set_defaults(handler=_compare)
+    option(compare, "model M.onnx", Path, "ONNX file or name of a shipped network")
+    option(compare, "reference REFERENCE.onnx", Path)
+    option(compare, "--dataset DIR", Path, nargs="+", required=True)
+    option(compare, "--split", ("train", "val", "test"), default="val")
+    option(compare, "--source", str, "only the frames of this source", default="")
+    option(compare, "--picture F.png", Path, "draw both networks' detections on some frames", default=None)
+    finish(compare, _compare)
 
 
 def _add_bench_and_info(verbs: Any) -> None:
-    from linna.output import add_json_flag
 
     bench = verbs.add_parser("bench", help="latency and memory on this machine")
     add_model(bench)
-    bench.add_argument("--threads", type=int, default=1)
-    bench.add_argument("--frames", type=int, default=100)
-    add_json_flag(bench)
-    bench.set_defaults(handler=_bench)
+    option(bench, "--threads", int, default=1)
+    option(bench, "--frames", int, default=100)
+    finish(bench, _bench)
 
     info = verbs.add_parser("info", help="what a model says of itself")
     add_model(info)
-    add_json_flag(info)
-    info.set_defaults(handler=_info)
+    finish(info, _info)
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -279,8 +239,7 @@ def _train(arguments: argparse.Namespace) -> int:
         rims=rims,
         report=log,
     )
-    emit(arguments, figures)
-    return 0
+    return emit(arguments, figures)
 
 
 def _export(arguments: argparse.Namespace) -> int:
@@ -306,8 +265,7 @@ def _export(arguments: argparse.Namespace) -> int:
         enlarge=arguments.enlarge,
         test=arguments.test,
     )
-    emit(arguments, figures)
-    return 0
+    return emit(arguments, figures)
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
@@ -327,8 +285,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     )
     sha256 = write_whole(arguments.out, octets)
     document = {"model": str(arguments.out), "sha256": sha256, **document}
-    emit(arguments, document, format_calibration_figures(document))
-    return 0
+    return emit(arguments, document, format_calibration_figures(document))
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -360,8 +317,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
         report = detector_report(detector, scored, figures, arguments.run)
         write_text(arguments.report, render_html(report))
-    emit(arguments, figures, format_figures(figures))
-    return 0
+    return emit(arguments, figures, format_figures(figures))
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -378,16 +334,14 @@ def _compare(arguments: argparse.Namespace) -> int:
     )
     if arguments.picture is not None:
         draw_comparison(pair, arguments.picture)
-    emit(arguments, document, format_comparison(document))
-    return 0
+    return emit(arguments, document, format_comparison(document))
 
 
 def _bench(arguments: argparse.Namespace) -> int:
     from linna.output import emit
     from payload_emulator.training.model.bench import bench
 
-    emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
-    return 0
+    return emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
 
 
 def _info(arguments: argparse.Namespace) -> int:
@@ -401,5 +355,4 @@ def _info(arguments: argparse.Namespace) -> int:
     metadata = {
         key: json.loads(text) if text[:1] in ("{", "[") else text for key, text in detector.metadata.items()
     }
-    emit(arguments, {"sha256": detector.sha256, "model_bytes": len(octets), **metadata})
-    return 0
+    return emit(arguments, {"sha256": detector.sha256, "model_bytes": len(octets), **metadata})

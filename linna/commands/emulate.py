@@ -6,56 +6,59 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.output import add_json_flag, emit, log, progress
+from linna.output import emit, finish, log, progress
+from linna.parser import option
 
 if TYPE_CHECKING:
     from payload_emulator.session.scenario import Scenario
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    option(
+        parser,
         "scenario",
+        str,
+        "scenario file, or the name of a shipped one (default with --images: scenario.toml of that folder)",
         nargs="?",
-        help="scenario file, or the name of a shipped one (default with --images: scenario.toml of that folder)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the pass archive to write")
-    parser.add_argument(
+    option(parser, "--out DIR", Path, "folder of the pass archive to write")
+    option(
+        parser,
         "--mode",
+        ("paper", "spherical", "anchored"),
+        "estimator to run (may be repeated); default: those of the scenario",
         action="append",
-        choices=("paper", "spherical", "anchored"),
-        help="estimator to run (may be repeated); default: those of the scenario",
     )
-    parser.add_argument("--seed", type=int, help="another seed than the scenario's")
-    parser.add_argument(
-        "--anchoring-catalogue",
-        type=Path,
-        metavar="F",
-        help="table of `linna catalogue curate`, uploaded in place of the terrain's craters",
+    option(parser, "--seed", int, "another seed than the scenario's")
+    option(
+        parser,
+        "--anchoring-catalogue F",
+        Path,
+        "table of `linna catalogue curate`, uploaded in place of the terrain's craters",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--frames",
-        choices=("none", "some", "all"),
+        ("none", "some", "all"),
+        "images kept in the archive (default: eight of them)",
         default="some",
-        help="images kept in the archive (default: eight of them)",
     )
-    parser.add_argument(
-        "--images",
-        type=Path,
-        metavar="DIR",
-        help="frames that others took instead of rendered ones: frames.csv (file, utc), images, an OEM, an AEM",
+    option(
+        parser,
+        "--images DIR",
+        Path,
+        "frames that others took instead of rendered ones: frames.csv (file, utc), images, an OEM, an AEM",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--evidence",
-        choices=("photographs", "other-renderer"),
+        ("photographs", "other-renderer"),
+        "what the images of --images are (default: not stated)",
         default="",
-        help="what the images of --images are (default: not stated)",
     )
     _add_live(parser)
-    parser.add_argument(
-        "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
-    )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
+    option(parser, "--campaign FILE", str, "fly the fault campaign of a file, or a shipped one by name")
+    finish(parser, run)
 
 
 def _add_live(parser: argparse.ArgumentParser) -> None:
@@ -156,8 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
         external=external,
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
-    emit(arguments, summary, text=describe(summary, arguments.out))
-    return 0
+    return emit(arguments, summary, text=describe(summary, arguments.out))
 
 
 def _campaign(arguments: argparse.Namespace, scenario: Scenario) -> int:
@@ -254,8 +256,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     account = asdict(session.account)
     figures = {"ports": session.ports, "utc": format_time(session.utc_ns), **account}
     counted = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in account.items())
-    emit(arguments, figures, text=f"stopped at {figures['utc']}; {counted}")
-    return 0
+    return emit(arguments, figures, text=f"stopped at {figures['utc']}; {counted}")
 
 
 def format_time(utc_ns: int) -> str:

@@ -8,44 +8,40 @@ from typing import Any
 
 from linna.commands._ground import add_operator_options, ground_client, settings_of
 from linna.output import emit, finish, log
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "files", nargs="*", type=Path, metavar="FILE", help="downlink file or pass archive folder"
+    option(parser, "files FILE", Path, "downlink file or pass archive folder", nargs="*")
+    option(parser, "--watch DIR", Path, "ingest the files that appear in a folder")
+    option(parser, "--follow", bool, "with --watch: continue to watch until Ctrl-C")
+    option(
+        parser,
+        "--spacecraft-id N",
+        int,
+        "spacecraft of the files, 0 to 1023; required for packets without frames",
     )
-    parser.add_argument("--watch", type=Path, metavar="DIR", help="ingest the files that appear in a folder")
-    parser.add_argument("--follow", action="store_true", help="with --watch: continue to watch until Ctrl-C")
-    parser.add_argument(
-        "--spacecraft-id",
-        type=int,
-        metavar="N",
-        help="spacecraft of the files, 0 to 1023; required for packets without frames",
-    )
-    parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
-    parser.add_argument(
-        "--recording",
-        "--stream",
+    option(parser, "--instance", str, "instance of the spacecraft (default: flight)", default="flight")
+    option(
+        parser,
+        "--recording --stream NAME",
+        str,
+        "name of the recording of which the files are consecutive pieces (default: each file is a recording)",
         dest="recording",
-        metavar="NAME",
-        help="name of the recording of which the files are consecutive pieces (default: each file is a recording)",
     )
-    parser.add_argument(
-        "--offset",
-        type=int,
-        metavar="N",
-        help="offset of the first file in the recording, octets (default: 0)",
-    )
-    parser.add_argument(
-        "--station",
+    option(parser, "--offset N", int, "offset of the first file in the recording, octets (default: 0)")
+    option(
+        parser,
+        "--station NAME",
+        str,
+        "station that received the files, as in the mission description",
         default="",
-        metavar="NAME",
-        help="station that received the files, as in the mission description",
     )
-    parser.add_argument(
-        "--link",
-        metavar="SETTINGS",
-        help="link settings, used without evidence, such as frame_length=1115,coding=rs,randomiser=legacy,"
+    option(
+        parser,
+        "--link SETTINGS",
+        str,
+        "link settings, used without evidence, such as frame_length=1115,coding=rs,randomiser=legacy,"
         "checksum=true (default: mission description, last good settings, or the evidence of the file)",
     )
     add_operator_options(parser)

@@ -9,61 +9,53 @@ from typing import Any
 
 from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
+from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     writing = actions.add_parser("write", help="write the mission description of a scenario")
-    writing.add_argument("scenario", metavar="SCENARIO", help="scenario file or name")
-    writing.add_argument("--out", type=Path, default=Path("mission.toml"), metavar="FILE")
+    option(writing, "scenario SCENARIO", str, "scenario file or name")
+    option(writing, "--out FILE", Path, default=Path("mission.toml"))
     writing.set_defaults(handler=write)
     checking = actions.add_parser("check", help="check a mission description; print one line for each fault")
-    checking.add_argument("file", type=Path, metavar="FILE")
+    option(checking, "file FILE", Path)
     checking.set_defaults(handler=check)
     adding = actions.add_parser("add", help="add a mission description as a revision")
-    adding.add_argument("file", type=Path, metavar="FILE")
+    option(adding, "file FILE", Path)
     adding.set_defaults(handler=add)
     listing = actions.add_parser("list", help="list the revisions, newest first")
-    listing.add_argument("--limit", type=int, default=50, help="largest number of revisions (default: 50)")
+    option(listing, "--limit", int, "largest number of revisions (default: 50)", default=50)
     listing.set_defaults(handler=list_missions)
     showing = actions.add_parser("show", help="show a revision")
-    showing.add_argument("revision", metavar="REVISION", help="the hash or its first eight digits")
+    option(showing, "revision REVISION", str, "the hash or its first eight digits")
     showing.set_defaults(handler=show)
     running = actions.add_parser("run", help="run payload, stations, ground service and automation for days")
-    running.add_argument("scenario", metavar="SCENARIO", help="scenario file or name")
-    running.add_argument("--days", type=float, required=True, metavar="D", help="simulated days")
-    running.add_argument(
-        "--speed", default="max", metavar="X|max", help="simulated seconds per second (default: max)"
-    )
-    running.add_argument(
-        "--observe-hours-a-day", type=float, default=0.4, metavar="H", help="observation a day (default: 0.4)"
-    )
-    running.add_argument(
-        "--window-min", type=float, default=12.0, metavar="M", help="window (default: 12 min)"
-    )
-    running.add_argument(
-        "--folder", type=Path, metavar="DIR", help="folder of the run (default: run-SCENARIO)"
-    )
-    running.add_argument(
+    option(running, "scenario SCENARIO", str, "scenario file or name")
+    option(running, "--days D", float, "simulated days", required=True)
+    option(running, "--speed X|max", str, "simulated seconds per second (default: max)", default="max")
+    option(running, "--observe-hours-a-day H", float, "observation a day (default: 0.4)", default=0.4)
+    option(running, "--window-min M", float, "window (default: 12 min)", default=12.0)
+    option(running, "--folder DIR", Path, "folder of the run (default: run-SCENARIO)")
+    option(
+        running,
         "--distributed",
-        action="store_true",
-        help="separate processes on PostgreSQL and Redis instead of one process on SQLite",
+        bool,
+        "separate processes on PostgreSQL and Redis instead of one process on SQLite",
     )
-    running.add_argument(
-        "--database",
-        metavar="URL",
-        help="database of the distributed form (default: a PostgreSQL server of the run)",
+    option(
+        running,
+        "--database URL",
+        str,
+        "database of the distributed form (default: a PostgreSQL server of the run)",
     )
-    running.add_argument(
-        "--broker", metavar="URL", help="broker of the distributed form (default: a Redis server of the run)"
+    option(
+        running, "--broker URL", str, "broker of the distributed form (default: a Redis server of the run)"
     )
-    running.add_argument(
-        "--kill",
-        type=int,
-        metavar="SEED",
-        help="kill processes of the distributed form at random points of this seed",
+    option(
+        running, "--kill SEED", int, "kill processes of the distributed form at random points of this seed"
     )
-    running.add_argument("--kills", type=int, metavar="N", help="number of kills (default: 4 a day)")
+    option(running, "--kills N", int, "number of kills (default: 4 a day)")
     running.set_defaults(handler=run_mission)
     comparing = actions.add_parser(
         "compare",
