@@ -38,7 +38,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
     "link": ("link", "link settings of a recorded downlink; links to ground stations and their contacts"),
     "mission": ("mission", "write, check, add, list and show mission descriptions"),
-    "ingest": ("ingest", "ingest downlink files, pass archives or live telemetry"),
+    "ingest": ("ingest", "ingest downlink files or pass archives"),
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
     "performance": ("performance", "recall, drift and error over many passes, and monthly reports"),

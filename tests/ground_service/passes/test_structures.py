@@ -1,4 +1,4 @@
-"""Housekeeping structures without a table of their own: live values, series, limits and a drawing from their packets."""
+"""Housekeeping structures without a table of their own: live values, series, limits and drawing from packets."""
 
 import pytest
 
