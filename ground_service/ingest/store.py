@@ -21,7 +21,6 @@ from ground_service.store.codec import pack_detections, pack_filter_states, pack
 from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
 from ground_service.store.rollups import add_to_rollups, forget_rollups
 from lunar.arrays import IntArray
-from tmtc.dictionary import DICTIONARY
 
 RANGE_GAP_TICKS = 600 << 16
 """Stored packets are looked up by ranges of on-board time; a silence of ten minutes splits a range, so that a batch
@@ -308,25 +307,6 @@ def add_ingest(
     )
 
 
-def add_finished(
-    connection: Connection, sha256: str, result: IngestResult, received_utc_ns: int, now_utc_ns: int
-) -> int:
-    """Add an ingest that is done; return its id."""
-    return int(
-        repository.add(
-            connection,
-            _INGESTS,
-            vehicle_id=result.vehicle_id,
-            file_sha256=sha256,
-            state="done",
-            dictionary_version=DICTIONARY.version,
-            received_utc_ns=received_utc_ns,
-            finished_utc_ns=now_utc_ns,
-            **_accounting(result),
-        )
-    )
-
-
 def get_ingest(connection: Connection, ingest_id: int) -> Ingest:
     """Return an ingest.
 
@@ -369,11 +349,6 @@ def finish_ingest(connection: Connection, result: IngestResult, now_utc_ns: int)
         finished_utc_ns=now_utc_ns,
         **_accounting(result),
     )
-
-
-def change_result(connection: Connection, result: IngestResult) -> None:
-    """Replace the result of an ingest whose file was read again."""
-    repository.change(connection, _INGESTS, result.ingest_id, **_accounting(result))
 
 
 def _accounting(result: IngestResult) -> dict[str, Any]:

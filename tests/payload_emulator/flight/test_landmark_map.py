@@ -95,10 +95,6 @@ def fly(
     return made
 
 
-def nearest_m(landmark: Landmark, craters: np.ndarray) -> float:
-    return float(np.linalg.norm(craters - landmark.position_mcmf_m, axis=1).min())
-
-
 def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() -> None:
     craters = ground(25, 1)
     mapper = Mapper()
