@@ -39,6 +39,16 @@ FRAMES = 2000
 SHORT = 400
 """Number of frames of the streams of a whole recording, and of the others."""
 
+WITHOUT_CHECKSUM = f"""
+schema_version = 1
+name = "packets without error control"
+[spacecraft]
+id = {SPACECRAFT}
+[link]
+packet_checksum = "none"
+""".encode()
+"""Mission description that states for `ingest` what `tm check` is told by an option."""
+
 WEAK = 1.5e-2
 """Bit error rate at which hardly a codeword of Reed-Solomon (255, 223) can be repaired."""
 
@@ -335,12 +345,15 @@ def ingested(stream: Stream) -> Found:
     from ground_service.errors import GroundError
     from ground_service.ground import open_ground
     from ground_service.ingest.service import ingest_file
+    from ground_service.missions.service import add_mission
     from ground_service.store import repository
     from ground_service.store.vehicles import vehicle_id
 
     bare = SPACECRAFT if not stream.error_control else None
     with tempfile.TemporaryDirectory() as folder:
         ground = open_ground(Path(folder, "home"))
+        if not stream.error_control:
+            add_mission(ground, WITHOUT_CHECKSUM)
         accounted = 0
         for number, octets in enumerate(stream.files):
             path = Path(folder, f"{number}.bin")

@@ -195,7 +195,9 @@ class Reading:
             fragments += reader.take_fragments()
             end = reader.end
         if not self.piece.stream and not self.found.frames and not self.found.packets:
-            self._refuse("no valid frame or packet")
+            self._refuse(
+                "no valid frame or packet" + _without_checksum(run.read(0, min(run.octets, WINDOW_OCTETS)))
+            )
         self._settle(held, fragments, is_last=True)
 
     # The run and its sections
@@ -515,3 +517,14 @@ class Reading:
                 for one, settings in framed
             ),
         )
+
+
+def _without_checksum(octets: OctetArray) -> str:
+    """Return the remedy for octets that are space packets without a checksum; empty if they are none."""
+    cut = cut_packets(octets, error_control=False)
+    if not len(cut) or 2 * int(cut.lengths.sum()) < octets.size:
+        return ""
+    return (
+        f"; the first {octets.size} octets look like {len(cut)} packets without checksum: state "
+        'link.packet_checksum = "none" in the mission description'
+    )

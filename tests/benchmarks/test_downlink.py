@@ -8,7 +8,7 @@ SLOW = {"clean", "weak-100", "weak-400", "weak-middle", "noise-3000000"}
 """Streams of 2,000 frames or 3 MB: `weak-220` and `noise-79000` test the same."""
 
 
-@pytest.mark.parametrize("name", [name for name in STREAMS if name not in SLOW | {"no-error-control"}])
+@pytest.mark.parametrize("name", [name for name in STREAMS if name not in SLOW])
 def test_every_packet_that_can_be_found_is_found_by_check_and_by_ingest(name: str) -> None:
     stream = STREAMS[name]()
     size = sum(len(octets) for octets in stream.files)

@@ -20,6 +20,7 @@ from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import archive_hash
 from tmtc.crc import append_crc
 from tmtc.downlink import encode_cadus
+from tmtc.packets import pack_packet
 
 SPACECRAFT = 76
 
@@ -159,7 +160,16 @@ def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: P
     with ground.database.reading() as connection:
         record = repository.newest(connection, repository.INGESTS, Paging())[0][0]
     assert record["state"] == "failed"
-    assert "noise.bin" in record["error"]
+    assert "noise.bin" in record["error"] and "look like" not in record["error"]
+
+
+def test_packets_without_checksum_are_refused_with_the_remedy(ground: Ground, tmp_path: Path) -> None:
+    packets = [pack_packet(0x200, bytes(range(60)), sequence_count=k) for k in range(30)]
+    with pytest.raises(
+        InvalidInput,
+        match=r'the first 1980 octets look like 30 packets without checksum: state link\.packet_checksum = "none"',
+    ):
+        ingest(ground, b"".join(packets), tmp_path, "foreign.bin")
 
 
 def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path) -> None:
