@@ -1,4 +1,4 @@
-"""What sees what: sub-satellite point, Sun and shadow, the terminator, the Earth and its stations behind the limb.
+"""What sees what: sub-satellite point, Sun and shadow, the Earth and its stations behind the limb.
 
 Bodies are spheres: the Moon of `MOON_RADIUS_M`, the Sun and the Earth of their mean radii.  Positions are
 Moon-centred in ICRF axes unless a name says otherwise; directions to the Sun are geometric (its light is 500
@@ -89,24 +89,6 @@ def sunlit_fraction(
         to_earth = np.asarray(earth_icrf_m, dtype=np.float64) - position
         fraction = np.minimum(fraction, 1.0 - _disc_overlap(to_sun, SUN_RADIUS_M, to_earth, EARTH_RADIUS_M))
     return np.asarray(fraction)
-
-
-def terminator(sun_mcmf_m: ArrayLike, count: int = 361) -> tuple[FloatArray, FloatArray]:
-    """Return latitudes and longitudes (count,) in rad of the places where the Sun's centre is on the horizon."""
-    sun = np.asarray(sun_mcmf_m, dtype=np.float64)
-    distance = float(np.linalg.norm(sun))
-    toward = sun / distance
-    # Any two unit vectors square to the Sun's direction span the plane of the terminator.
-    seed = np.eye(3)[int(np.argmin(np.abs(toward)))]
-    across = np.cross(toward, seed)
-    across /= np.linalg.norm(across)
-    other = np.cross(toward, across)
-    angle = np.linspace(0.0, 2.0 * math.pi, count)[:, None]
-    # The Sun is not at infinity: the circle lies R / distance of a radius towards it, 20 m.
-    sine = MOON_RADIUS_M / distance
-    circle = math.sqrt(1.0 - sine**2) * (np.cos(angle) * across + np.sin(angle) * other) + sine * toward
-    latitude_rad, longitude_rad, _ = spherical_from_mcmf(circle * MOON_RADIUS_M)
-    return latitude_rad, longitude_rad
 
 
 def limb_clearance_m(position_icrf_m: ArrayLike, target_icrf_m: ArrayLike) -> FloatArray:

@@ -1,7 +1,4 @@
-"""Names of the codes that packets carry.
-
-`_1` marks the enumerations as version 1 of the dictionary has them, `EVENTS_2` the events of versions 2 to 6.
-"""
+"""Names of the codes that packets carry."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ RESET_TRIGGERS: Labels = (
 )
 SIZE_CLASSES: Labels = ((-1, "none"), (0, "5-10 km"), (1, "10-15 km"), (2, "15-30 km"), (3, "3-5 km"))
 CLOCK_STATES: Labels = ((0, "free_running"), (1, "synchronised"), (2, "suspect"))
-EVENTS_1: Labels = (
+EVENTS: Labels = (
     (1, "boot"), (2, "mode_changed"), (3, "observation_started"), (4, "observation_stopped"),
     (5, "activity_released"), (6, "table_loaded"), (7, "table_refused"), (8, "telecommand_rejected"),
     (9, "parameter_changed"),
@@ -36,43 +33,31 @@ EVENTS_1: Labels = (
     (55, "storage_full"), (56, "storage_corrupt"), (57, "state_recovered"), (58, "state_lost"),
     (64, "power_low"), (65, "temperature_high"), (66, "temperature_low"), (67, "memory_high"),
     (68, "queue_overflow"),
-)  # fmt: skip
-FAILURES_1: Labels = (
-    (1, "unknown_packet"), (2, "bad_checksum"), (3, "bad_length"), (4, "value_out_of_range"),
-    (5, "wrong_mode"), (6, "duplicate"), (7, "expired"), (8, "out_of_sequence"), (9, "unknown_function"),
-    (10, "unknown_parameter"), (11, "storage_full"), (12, "schedule_full"), (13, "busy"),
-    (14, "table_corrupt"), (15, "execution_error"), (16, "unknown_apid"), (17, "no_such_activity"),
-)  # fmt: skip
-FUNCTIONS_1: Labels = (
-    (1, "set_mode"), (2, "start_observation"), (3, "stop_observation"), (4, "manual_step"),
-    (5, "reset_estimators"), (6, "clear_store"), (7, "reboot"), (8, "check_tables"),
-    (9, "synchronise_clock"), (10, "abort_uplink"),
-)  # fmt: skip
-TABLES_1: Labels = (
-    (1, "anchor_ephemeris"), (2, "catalogue"), (3, "gravity"), (4, "parameters"), (5, "model"),
-    (6, "thumbnail"), (7, "landmark_map"),
-)  # fmt: skip
-
-EVENTS_2: Labels = (
-    *EVENTS_1,
     (10, "activity_expired"), (11, "activity_failed"), (12, "thumbnail_stored"), (13, "report_definition_changed"),
     (23, "image_streak"), (24, "camera_recovered"),
     (59, "memory_repaired"), (60, "safe_mode_entered"), (61, "table_hash_mismatch"), (62, "memory_unrepairable"),
     (69, "store_overwritten"), (70, "event_reporting_changed"),
+    (39, "attitude_degraded"), (40, "attitude_restored"),
 )  # fmt: skip
-EVENTS: Labels = (*EVENTS_2, (39, "attitude_degraded"), (40, "attitude_restored"))
-FAILURES: Labels = (*FAILURES_1, (18, "unknown_structure"), (19, "structures_full"))
+FAILURES: Labels = (
+    (1, "unknown_packet"), (2, "bad_checksum"), (3, "bad_length"), (4, "value_out_of_range"),
+    (5, "wrong_mode"), (6, "duplicate"), (7, "expired"), (8, "out_of_sequence"), (9, "unknown_function"),
+    (10, "unknown_parameter"), (11, "storage_full"), (12, "schedule_full"), (13, "busy"),
+    (14, "table_corrupt"), (15, "execution_error"), (16, "unknown_apid"), (17, "no_such_activity"),
+    (18, "unknown_structure"), (19, "structures_full"),
+)  # fmt: skip
 FUNCTIONS: Labels = (
-    *FUNCTIONS_1,
-    (11, "widen_estimate"),
-    (12, "resynchronise_commands"),
-    (13, "downlink_thumbnail"),
-    (14, "downlink_map"),
-)
-# What the two arguments of a function may mean.
-ARGUMENTS_1 = ("mode, duration in s, table number", "cadence in s")
-ARGUMENTS = ("mode, duration in s, table number, m", "cadence in s, m/s")
-TABLES: Labels = (*TABLES_1, (8, "orientation"), (9, "initial_state"), (10, "burns"))
+    (1, "set_mode"), (2, "start_observation"), (3, "stop_observation"), (4, "manual_step"),
+    (5, "reset_estimators"), (6, "clear_store"), (7, "reboot"), (8, "check_tables"),
+    (9, "synchronise_clock"), (10, "abort_uplink"),
+    (11, "widen_estimate"), (12, "resynchronise_commands"), (13, "downlink_thumbnail"), (14, "downlink_map"),
+)  # fmt: skip
+TABLES: Labels = (
+    (1, "anchor_ephemeris"), (2, "catalogue"), (3, "gravity"), (4, "parameters"), (5, "model"),
+    (6, "thumbnail"), (7, "landmark_map"),
+    (8, "orientation"), (9, "initial_state"), (10, "burns"),
+)  # fmt: skip
+
 STORE_CLASSES: Labels = (
     (0, "critical"),
     (1, "housekeeping"),

@@ -28,7 +28,6 @@ from lunar.visibility import (
     subsatellite,
     sun_elevation_azimuth,
     sunlit_fraction,
-    terminator,
 )
 
 START = parse_utc("2029-08-07T00:00:00")
@@ -105,14 +104,6 @@ def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, 
     covered = (x - apart) ** 2 + y**2 <= near_radius**2
     # 126,000 grid points inside the disc; its edge blurs a percent of them.
     assert share == pytest.approx(np.count_nonzero(disc & covered) / np.count_nonzero(disc), abs=0.01)
-
-
-def test_the_terminator_is_where_the_sun_is_on_the_horizon():
-    tdb_s = tdb_s_from_utc_ns(START)
-    sun_mcmf_m = IauOrientation().mcmf_from_icrf(tdb_s) @ sun_position_icrf_m(tdb_s)
-    elevation, _ = sun_elevation_azimuth(*terminator(sun_mcmf_m), sun_mcmf_m)
-    # 1e-9 rad is 2 mm on the ground.
-    assert np.max(np.abs(elevation)) < 1e-9
 
 
 def test_azimuth_runs_clockwise_from_north():

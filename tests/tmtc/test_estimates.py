@@ -1,4 +1,4 @@
-"""Estimates of the filter in packets of version 2 (lower triangle) and version 3 (upper triangle)."""
+"""Estimates of the filter in packets of old payloads (lower triangle) and of today (upper triangle)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tmtc.dictionary import DICTIONARY, dictionary_version
+from tmtc.dictionary import DICTIONARY
 from tmtc.estimates import filter_estimates
-from tmtc.schema import Dictionary
 from tmtc.stream import cut_packets
 
 RNG = np.random.default_rng(3)
@@ -18,7 +17,7 @@ _ROOTS = RNG.standard_normal((2, 9, 9)) * np.repeat([40.0, 0.05, 1e-6], 3)[:, No
 COVARIANCES = _ROOTS @ np.swapaxes(_ROOTS, 1, 2)
 
 
-def packet(dictionary: Dictionary, name: str, row: int, ticks: int) -> bytes:
+def packet(name: str, row: int, ticks: int) -> bytes:
     covariance = COVARIANCES[row]
     # Element by element, so that the order of the triangle is that of the interface and not of a library.
     if name == "filter_state":
@@ -34,17 +33,16 @@ def packet(dictionary: Dictionary, name: str, row: int, ticks: int) -> bytes:
         "acceleration_rtn_m_s2": STATES[row, 6:],
         **extra,
     }
-    return dictionary.pack(name, values, ticks=ticks + 9, sequence_count=row)
+    return DICTIONARY.pack(name, values, ticks=ticks + 9, sequence_count=row)
 
 
-def estimates_of(octets: bytes, dictionary: Dictionary = DICTIONARY) -> Any:
-    return filter_estimates(dictionary.unpack_many(octets, cut_packets(octets)))
+def estimates_of(octets: bytes) -> Any:
+    return filter_estimates(DICTIONARY.unpack_many(octets, cut_packets(octets)))
 
 
 @pytest.mark.parametrize("name, degrees", [("filter_state", -1), ("filter_estimate", 22)])
 def test_state_and_covariance_come_back_within_single_precision(name: str, degrees: int) -> None:
-    version = 2 if name == "filter_state" else 3
-    octets = b"".join(packet(dictionary_version(version), name, row, 100 + row) for row in (0, 1))
+    octets = b"".join(packet(name, row, 100 + row) for row in (0, 1))
     found = estimates_of(octets)
     assert found.image_ticks.tolist() == [100, 101] and found.packet_ticks.tolist() == [109, 110]
     assert found.frame_number.tolist() == [5, 6] and found.packet_index.tolist() == [0, 1]
@@ -56,19 +54,10 @@ def test_state_and_covariance_come_back_within_single_precision(name: str, degre
 
 def test_a_stream_may_hold_packets_of_both_versions_and_other_ones() -> None:
     other = DICTIONARY.pack("connection_report", {}, ticks=1, sequence_count=1)
-    octets = (
-        packet(DICTIONARY, "filter_estimate", 0, 7)
-        + other
-        + packet(dictionary_version(2), "filter_state", 1, 8)
-    )
+    octets = packet("filter_estimate", 0, 7) + other + packet("filter_state", 1, 8)
     found = estimates_of(octets)
     assert dict(zip(found.image_ticks.tolist(), found.packet_index.tolist(), strict=True)) == {7: 0, 8: 2}
     assert len(estimates_of(other)) == 0 and estimates_of(other).covariance.shape == (0, 9, 9)
-
-
-def test_version_2_does_not_know_the_packet_of_version_3() -> None:
-    octets = packet(DICTIONARY, "filter_estimate", 0, 7)
-    assert len(estimates_of(octets, dictionary_version(2))) == 0
 
 
 def test_single_precision_keeps_the_normalised_error_and_half_precision_does_not() -> None:

@@ -12,9 +12,9 @@ CCSDS 660.1-G-2; MIL-STD-1750A section 4.1 for its floating point formats.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from operator import methodcaller
+from operator import eq, ge, gt, le, lt, methodcaller, ne
 from typing import Any
 
 import numpy as np
@@ -56,10 +56,6 @@ from tmtc.xtce.definition import (
     Spline,
     StringEncoding,
 )
-
-IntArray = IntArray
-BoolArray = BoolArray
-OctetArray = OctetArray
 
 DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED = 0, 1, 2, 3, 4, 5
 VERDICTS = ("decoded", "no_container", "ambiguous", "too_short", "malformed", "damaged")
@@ -163,16 +159,16 @@ class Decoder:
         pending = [(self.root, packets)]
         while pending:
             container, rows = pending.pop()
-            rows = _perform(run, self._compiled(container), rows)
+            if rows.parent is None:  # a container that inherits begins where its root does
+                rows.columns[_START] = ValueColumn(rows.at, rows.at)
+            rows = _advance(run, self._compiled(container), rows)
             if not len(rows):
                 continue
             matches = [
                 np.ones(len(rows), dtype=np.bool_) if one.condition is None else _holds(one.condition, rows)
                 for one in container.children
             ]
-            number = np.zeros(len(rows), dtype=np.int64)
-            for match in matches:
-                number += match
+            number = np.sum(matches, axis=0, dtype=np.int64) if matches else np.zeros(len(rows), np.int64)
             run.verdict[rows.packet[number > 1]] = AMBIGUOUS
             for child, match in zip(container.children, matches, strict=True):
                 mine = match & (number == 1)
@@ -251,17 +247,14 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
         item = entry.item
         kind = item.type if isinstance(item, Parameter) and isinstance(item.type, ScalarType) else None
         bits = None if kind is None else kind.bits
-        numeric = (
-            bits is not None
-            and kind is not None
-            and isinstance(kind.encoding, (IntegerEncoding, FloatEncoding))
-        )
-        if numeric and not entry.from_start and entry.condition is None and cursor + entry.offset >= 0:
-            assert isinstance(item, Parameter) and isinstance(item.type, ScalarType) and bits is not None
-            if fields and _refers_to_open(item.type, fields):
+        encoding = None if kind is None else kind.encoding
+        plain = not entry.from_start and entry.condition is None and cursor + entry.offset >= 0
+        if plain and bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding)):
+            assert kind is not None
+            if fields and encoding.calibration.contexts:  # they may ask for fields of the same stretch
                 close()
             if cursor + entry.offset >= 0:
-                fields.append((item.name, item.type, cursor + entry.offset))
+                fields.append((item.name, kind, cursor + entry.offset))
                 cursor += entry.offset + bits
                 extent = max(extent, cursor)
                 continue
@@ -281,13 +274,6 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
             steps.append(_Optional(entry.condition, tuple(own)))
     close()
     return steps
-
-
-def _refers_to_open(data_type: ScalarType, fields: list[tuple[str, ScalarType, int]]) -> bool:
-    """Whether the calibrators of a type depend on fields that are read in the same stretch."""
-    encoding = data_type.encoding
-    assert isinstance(encoding, (IntegerEncoding, FloatEncoding))
-    return bool(encoding.calibration.contexts)
 
 
 class _Rows:
@@ -386,13 +372,6 @@ class _Run:
         columns = rows.all_columns()
         unread = self.end(rows) - rows.at
         return XtceTable(name, rows.packet, columns, unread)
-
-
-def _perform(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
-    """Rows behind the steps; packets that do not fit are left out."""
-    if rows.parent is None:  # a container that inherits begins where its root does
-        rows.columns[_START] = ValueColumn(rows.at, rows.at)
-    return _advance(run, steps, rows)
 
 
 def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
@@ -495,20 +474,7 @@ def _read(run: _Run, data_type: DataType, rows: _Rows, name: str | None = None) 
         return _read_array(run, data_type, rows)
     encoding = data_type.encoding
     if isinstance(encoding, (IntegerEncoding, FloatEncoding)):
-        enough = run.room(rows, encoding.bits)
-        mine = run.keep(rows, enough, TOO_SHORT)
-        (raw,) = _raw_fields(run, mine.at, [(encoding, 0)], encoding.bits)
-        values, covered = _calibrated(data_type, raw, mine, name)
-        column, at = ValueColumn(raw, values), mine.at + encoding.bits
-        good = None if enough.all() else enough
-        if covered is not None and not covered.all():
-            run.verdict[mine.packet[~covered]] = MALFORMED
-            index = np.flatnonzero(covered)
-            column, at = column.take(index), at[index]
-            whole = enough.copy()
-            whole[np.flatnonzero(enough)] = covered
-            good = whole
-        return column, at, good
+        return _read_records(run, data_type, [(data_type, 0)], rows, name)
     if isinstance(encoding, BinaryEncoding):
         bits, sized = _sizes(run, encoding.size, rows, 0)
         return _read_octets(run, rows, bits, sized, None)
@@ -564,9 +530,9 @@ def _fixed_fields(data_type: DataType, offset: int = 0) -> list[tuple[ScalarType
 
 
 def _read_records(
-    run: _Run, data_type: DataType, fields: list[tuple[ScalarType, int]], rows: _Rows
+    run: _Run, data_type: DataType, fields: list[tuple[ScalarType, int]], rows: _Rows, name: str | None = None
 ) -> _Found:
-    """Values or aggregates of fixed width."""
+    """Values (of the parameter `name`, if they are one) or aggregates of fixed width."""
     last, place = fields[-1]
     assert last.bits is not None
     bits = place + last.bits
@@ -576,7 +542,7 @@ def _read_records(
     columns: list[Column] = []
     covered = np.ones(len(mine), dtype=np.bool_)
     for (one, _), raw in zip(fields, raws, strict=True):
-        values, good = _calibrated(one, raw, mine, None)
+        values, good = _calibrated(one, raw, mine, name)
         columns.append(ValueColumn(raw, values))
         if good is not None:
             covered &= good
@@ -997,18 +963,15 @@ def _integers(records: OctetArray, bit: int, encoding: IntegerEncoding) -> Recor
 def _floats(records: OctetArray, bit: int, encoding: FloatEncoding) -> RecordArray:
     bits = encoding.bits
     order = "<" if encoding.little else ">"
-    if encoding.form == "IEEE754":
-        if not bit & 7:
-            with np.errstate(invalid="ignore"):
-                return _window(records, bit >> 3, bits >> 3, "f", order).astype(np.float64)
-        value = _unsigned(records, bit, bits)
-        if encoding.little:
-            value = value.byteswap() >> np.uint64(64 - bits)
+    if encoding.form == "IEEE754" and not bit & 7:
         with np.errstate(invalid="ignore"):
-            return value.astype(f"=u{bits >> 3}").view(f"=f{bits >> 3}").astype(np.float64)
+            return _window(records, bit >> 3, bits >> 3, "f", order).astype(np.float64)
     value = _unsigned(records, bit, bits)
     if encoding.little:
         value = value.byteswap() >> np.uint64(64 - bits)
+    if encoding.form == "IEEE754":
+        with np.errstate(invalid="ignore"):
+            return value.astype(f"=u{bits >> 3}").view(f"=f{bits >> 3}").astype(np.float64)
     number = value.view(np.int64)
     if bits == 32:  # mantissa (24 bits), exponent (8)
         mantissa, exponent, point = number >> 8, number & 0xFF, 23
@@ -1103,6 +1066,8 @@ def _splined(spline: Spline, x: RecordArray) -> tuple[RecordArray, BoolArray | N
 
 # conditions
 
+_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {"==": eq, "!=": ne, "<": lt, "<=": le, ">": gt, ">=": ge}
+
 
 def _resolved(reference: Reference, rows: _Rows) -> tuple[RecordArray, BoolArray]:
     """Values (n,) of an earlier parameter, and which packets have it; zeros where there is none."""
@@ -1141,21 +1106,4 @@ def _holds(condition: Condition, rows: _Rows) -> BoolArray:
     if isinstance(right, Reference):
         right, also = _resolved(right, rows)
         present = present & also
-    return present & _compare(left, condition.operator, right)
-
-
-def _compare(left: RecordArray, operator: str, right: Any) -> BoolArray:
-    result: Any
-    if operator == "==":
-        result = left == right
-    elif operator == "!=":
-        result = left != right
-    elif operator == "<":
-        result = left < right
-    elif operator == "<=":
-        result = left <= right
-    elif operator == ">":
-        result = left > right
-    else:
-        result = left >= right
-    return np.asarray(result, dtype=np.bool_)
+    return present & np.asarray(_OPERATORS[condition.operator](left, right), dtype=np.bool_)

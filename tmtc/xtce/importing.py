@@ -15,7 +15,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
+from graphlib import CycleError, TopologicalSorter
 
 from tmtc.errors import DefinitionError
 from tmtc.packets import PACKET_MAX_LENGTH
@@ -224,9 +225,8 @@ class _Importer:
                 _, found = self.find("containers", base.attribute("containerRef"), system, base)
                 bases[key] = id(found)
                 followers[id(found)].append(key)
-        _check_chains(bases, {key: node for key, (_, node) in owner.items()})
         made: dict[int, Container] = {}
-        for key in _children_first(followers, bases):
+        for key in self.children_first():
             made[key] = self.container(key, tuple(made[follower] for follower in followers[key]))
         roots = [key for key in owner if key not in bases and key not in self.included]
         if not roots:
@@ -239,6 +239,19 @@ class _Importer:
             parameters={parameter.name: parameter for parameter in self.parameters.values()},
             containers={container.name: container for container in made.values()},
         )
+
+    def children_first(self) -> list[int]:
+        """The containers, those that inherit before their bases, none of them over too many steps."""
+        expected, depths = "a base that ends in a container without one", dict[int, int]()
+        try:
+            order = list(TopologicalSorter(self.followers).static_order())
+        except CycleError as error:
+            raise self.owner[error.args[1][0]][1].error(expected, "itself") from None
+        for key in reversed(order):
+            depths[key] = depths[self.bases[key]] + 1 if key in self.bases else 0
+            steps = f"more than {MAX_INHERITANCE} steps"
+            _expect(self.owner[key][1], depths[key] <= MAX_INHERITANCE, expected, steps)
+        return order
 
     def container(self, key: int, children: tuple[Container, ...]) -> Container:
         """The container of an element, with those that continue it."""
@@ -740,38 +753,6 @@ class _Importer:
         )
 
 
-def _check_chains(bases: Mapping[int, int], nodes: Mapping[int, Node]) -> None:
-    """Refuse a container that inherits from itself, or over too many steps."""
-    depths: dict[int, int] = {}
-    for key in nodes:
-        chain: list[int] = []
-        at = key
-        while at in bases and at not in depths:
-            if len(chain) > MAX_INHERITANCE:
-                raise nodes[key].error(
-                    "a base that ends in a container without one", "itself or too many steps"
-                )
-            chain.append(at)
-            at = bases[at]
-        depth = depths.get(at, 0)
-        for link in reversed(chain):
-            depth += 1
-            depths[link] = depth
-        if depth > MAX_INHERITANCE:
-            found = f"more than {MAX_INHERITANCE} steps"
-            raise nodes[key].error("a base that ends in a container without one", found)
-
-
-def _children_first(followers: Mapping[int, list[int]], bases: Mapping[int, int]) -> list[int]:
-    order = []
-    pending = [key for key in followers if key not in bases]
-    while pending:
-        key = pending.pop()
-        order.append(key)
-        pending.extend(followers[key])
-    return order[::-1]
-
-
 def _column_names(elements: list[tuple[str, str]]) -> dict[tuple[str, str], str]:
     """Names for (path of the system, name): the name alone where there is one of it."""
     counts: dict[str, int] = {}
@@ -788,7 +769,7 @@ def _check_order(root: Container, document: str) -> None:
         names = set(known)
         place = f"{document}, container {container.path}"
         if container.condition is not None:
-            _check_known(_of_condition(container.condition), names, place)
+            _check_known(_references(container.condition), names, place)
         _check_entries(container.entries, names, place)
         after = frozenset(names)
         pending.extend((child, after) for child in container.children)
@@ -797,7 +778,7 @@ def _check_order(root: Container, document: str) -> None:
 def _check_entries(entries: tuple[Entry, ...], names: set[str], place: str) -> None:
     for entry in entries:
         if entry.condition is not None:
-            _check_known(_of_condition(entry.condition), names, place)
+            _check_known(_references(entry.condition), names, place)
             twice = sorted(_names_of(entry.item) & names)
             if twice:
                 raise DefinitionError(
@@ -807,7 +788,7 @@ def _check_entries(entries: tuple[Entry, ...], names: set[str], place: str) -> N
         if isinstance(entry.item, Container):
             _check_entries(entry.item.entries, names, place)
         else:
-            _check_known(_of_type(entry.item.type) - {entry.item.name}, names, place)
+            _check_known(_references(entry.item.type) - {entry.item.name}, names, place)
             names.add(entry.item.name)
 
 
@@ -825,31 +806,15 @@ def _check_known(wanted: set[str], names: set[str], place: str) -> None:
         )
 
 
-def _of_condition(condition: Condition) -> set[str]:
-    if isinstance(condition, (AllOf, AnyOf)):
-        return set().union(*(_of_condition(one) for one in condition.conditions))
-    names = {condition.left.parameter}
-    if isinstance(condition, Comparison) and isinstance(condition.right, Reference):
-        names.add(condition.right.parameter)
-    return names
-
-
-def _of_size(size: Size | None) -> set[str]:
-    if size is None:
-        return set()
-    names: set[str] = set().union(*(_of_condition(condition) for condition, _ in size.lookup))
-    return names | ({size.reference.parameter} if size.reference is not None else set())
-
-
-def _of_type(data_type: DataType) -> set[str]:
-    if isinstance(data_type, AggregateType):
-        return set().union(*(_of_type(member) for _, member in data_type.members))
-    if isinstance(data_type, ArrayType):
-        return _of_type(data_type.element) | _of_size(data_type.first) | _of_size(data_type.last)
-    encoding = data_type.encoding
-    if isinstance(encoding, (StringEncoding, BinaryEncoding)):
-        return _of_size(encoding.size)
-    return set().union(*(_of_condition(condition) for condition, _ in encoding.calibration.contexts))
+def _references(item: object) -> set[str]:
+    """Names of the parameters that a type or a condition refers to."""
+    if isinstance(item, Reference):
+        return {item.parameter}
+    if isinstance(item, ScalarType):
+        return _references(item.encoding)
+    if is_dataclass(item):
+        item = tuple(getattr(item, one.name) for one in fields(item))
+    return set().union(*map(_references, item)) if isinstance(item, tuple) else set()
 
 
 def _operator(node: Node, text: str) -> Operator:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from ground_service.passes.span import pass_span
 from ground_service.passes.store import get_pass
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
-from tmtc.dictionary import DICTIONARY, dictionary_version
+from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.stream import cut_packets
 
@@ -66,15 +67,14 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
             "acceleration_rtn_m_s2": np.zeros(3),
             "covariance": covariance[triangle],
         }
-        dictionary = dictionary_version(version)
         if version == 2:
             packets.append(
-                dictionary.pack("filter_state", values, ticks=ticks + 5, sequence_count=1_000 + 2 * k)
+                DICTIONARY.pack("filter_state", values, ticks=ticks + 5, sequence_count=1_000 + 2 * k)
             )
         else:
             values["innovation_degrees"] = 24
             packets.append(
-                dictionary.pack("filter_estimate", values, ticks=ticks + 5, sequence_count=1_000 + 2 * k)
+                DICTIONARY.pack("filter_estimate", values, ticks=ticks + 5, sequence_count=1_000 + 2 * k)
             )
         state_values = {
             **frame, "estimator": 2, "outcome": "fixed", "latitude_deg": np.degrees(latitude),
@@ -82,7 +82,7 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
             "velocity_icrf_m_s": state[3:], "sigma_rtn_m": SIGMA_M, "nis": 12.0, "matched": 12,
         }  # fmt: skip
         packets.append(
-            dictionary.pack("navigation_state", state_values, ticks=ticks + 6, sequence_count=1_001 + 2 * k)
+            DICTIONARY.pack("navigation_state", state_values, ticks=ticks + 6, sequence_count=1_001 + 2 * k)
         )
     return packets
 
@@ -147,7 +147,7 @@ def test_what_version_2_decoded_is_decoded_again_to_the_same_states(tmp_path: Pa
     with open_ground(tmp_path / "home") as ground:
         with ground.database.writing() as connection:
             vehicle = vehicle_id(connection, SPACECRAFT, "flight")
-            batch = batch_of_cut(octets, cut_packets(octets), dictionary_version(2), SPACECRAFT)
+            batch = batch_of_cut(octets, cut_packets(octets), replace(DICTIONARY, version=2), SPACECRAFT)
             store_batch(connection, vehicle, batch)
             repository.change(connection, repository.VEHICLES, vehicle, decoded_version=2)
         pass_id = with_pass(ground, made)

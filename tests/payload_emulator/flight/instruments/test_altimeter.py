@@ -10,9 +10,8 @@ import pytest
 
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import matrix_from_rotation_vector, mcmf_from_spherical
-from payload_emulator.flight.instruments import AttitudeEstimate, Knowledge, flight_instruments
+from payload_emulator.flight.instruments import AttitudeEstimate, Knowledge
 from payload_emulator.flight.instruments.altimeter import (
-    INSTRUMENT,
     AltimeterParameters,
     attitude_at,
     range_model,
@@ -24,7 +23,6 @@ from payload_emulator.flight.navigation.filter import OFFSET, POSITION, SIZE, VE
 from payload_emulator.flight.navigation.scalar import ScalarMeasurement
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
 from tests.payload_emulator.flight.test_anchored_navigator import Orbit
-from tmtc.dictionary import dictionary_version
 from tmtc.tables import CatalogueTable
 
 SECOND = 65_536
@@ -207,9 +205,3 @@ def test_ranges_correct_the_height_of_an_orbit_as_far_as_the_surface_is_known(or
 
     assert claimed(state) < 0.3 * claimed(coasted)
     assert error < claimed(state)
-
-
-def test_the_packet_is_part_of_version_4_of_the_dictionary() -> None:
-    assert flight_instruments()["altimeter"] is INSTRUMENT
-    dictionary = dictionary_version(4)
-    assert dictionary.hash == "e2effe09f738463d6fdc2210d277aabcf0ebfad57ea9c0f83d4b5a7cd923399f"
