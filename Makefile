@@ -64,7 +64,7 @@ pictures: $(VENV)/.dev
 
 # Table of the pages by width, colours, font and data, written by the test of all pages.
 page-table: $(VENV)/.dev
-	LINNA_PAGE_TABLE=docs/reference/pages.md $(BIN)/python -m pytest -q tests/ground_service/web/test_matrix.py
+	LINNA_PAGE_TABLE=docs/reference/pages.md $(BIN)/python -m pytest -q -m campaign tests/ground_service/web/test_matrix.py
 
 # Software bill of materials of the runtime, CycloneDX.
 sbom: $(VENV)/.dev

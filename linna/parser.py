@@ -83,7 +83,12 @@ class _Subcommands(argparse._SubParsersAction):  # type: ignore[type-arg]  # gen
 
 
 def option(
-    parser: argparse._ActionsContainer, name: str, kind: Any = str, help: str = "", **words: Any
+    parser: argparse._ActionsContainer,
+    name: str,
+    kind: Any = str,
+    help: str = "",
+    default: Any = None,
+    **words: Any,
 ) -> argparse.Action:
     """Add an argument to a parser.
 
@@ -93,6 +98,8 @@ def option(
         As in the usage line, such as ``--step S``; the attribute comes first if the argument has no dash.
     kind
         Type of the value, `bool` for a switch, or the choices.
+    default
+        Value without the argument; the help states it.
     """
     flags = [word for word in name.split() if word.startswith("-")] or name.split()[:1]
     shown = tuple(name.split()[len(flags) :])
@@ -103,7 +110,9 @@ def option(
         words["action"] = "store_true"
     else:
         words["type" if callable(kind) else "choices"] = kind
-    return parser.add_argument(*flags, help=help, **words)
+    if default not in (None, "", [], False) and default == default and "default" not in help:
+        help = f"{help} (default: {f'{default:g}' if isinstance(default, float) else default})".strip()
+    return parser.add_argument(*flags, help=help, default=default, **words)
 
 
 def uses_colors() -> bool:

@@ -4,12 +4,9 @@ import http.server
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
 import threading
-import time
-import urllib.request
 from pathlib import Path
 
 import pytest
@@ -168,44 +165,6 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
             assert done.returncode in allowed, f"{line}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
             ran += 1
     assert ran > 0
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_the_tour_runs_as_written(tmp_path: Path) -> None:
-    (tour,) = [
-        m["text"]
-        for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text())
-        if m["kind"] == "tour"
-    ]
-    commands = tour.splitlines()
-    shell = {"cwd": tmp_path, "env": environment(tmp_path / "data"), "text": True}
-    demo = subprocess.run(commands[0], shell=True, capture_output=True, check=False, **shell)
-    assert demo.returncode == 0, demo.stderr[-2000:]
-    printed = [line.strip().removeprefix("linna ") for line in demo.stdout.splitlines()]
-    for command in commands[1:]:
-        assert command.removeprefix("linna ") in printed, command
-    server = subprocess.Popen(
-        shlex.split(commands[1]), cwd=tmp_path, env=shell["env"], start_new_session=True
-    )
-    try:
-        deadline = time.monotonic() + 120.0
-        while True:
-            try:
-                with urllib.request.urlopen("http://127.0.0.1:8042/passes", timeout=5) as answer:
-                    assert answer.status == 200
-                break
-            except OSError:
-                assert server.poll() is None and time.monotonic() < deadline
-                time.sleep(0.5)
-        for command in commands[2:]:
-            done = subprocess.run(command, shell=True, capture_output=True, check=False, **shell)
-            assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
-    finally:
-        os.killpg(server.pid, signal.SIGTERM)
-        server.wait(60)
-    assert (tmp_path / "linna-demo" / "window.cltu").stat().st_size > 0
-    assert (tmp_path / "linna-demo" / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_reference_pages_name_every_setting() -> None:

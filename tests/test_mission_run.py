@@ -51,14 +51,24 @@ drift_ppm = 5.0
 """
 DRIFT_PPM = 5.0
 
+Figures = dict[str, Any]
 TERMS = RunTerms(days=0.5, windows_per_day=1, window_s=600.0)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figures]:
+    """Folder and figures of a run without a stop."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, lambda line: None)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_path: Path) -> None:
+def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
+    whole: tuple[Path, Figures],
+) -> None:
+    folder, figures = whole
     said: list[str] = []
-    figures = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
     windows = figures["windows"]
     assert windows["requested"] == windows["flown"] == windows["processed"] == figures["reports"] == 1
     assert windows["failed"] == 0 and figures["images_lost"] == 0
@@ -68,7 +78,7 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
     assert figures["frames"] == figures["frames_received"] == flown["frames"]
     assert figures["navigation"]["spherical"]["median_m"] == flown["median_error_m"] > 0.0
     # The clock of this scenario drifts: the time reports of the contacts tell by how much.
-    with open_ground(tmp_path / "ground") as ground, local_client(ground, "viewer") as client:
+    with open_ground(folder / "ground") as ground, local_client(ground, "viewer") as client:
         (line,) = [one for one in client.list_correlations(SPACECRAFT_ID) if one.in_force]
     assert line.points >= 3 and line.rejected == 0
     assert line.drift_ppb == pytest.approx(-1e3 * DRIFT_PPM, abs=20.0)
@@ -76,15 +86,15 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(tmp_
     # All that was posted is the set-up: catalogue, mission, ephemeris, standing request.
     assert figures["interventions"] == 0 and figures["interventions_list"] == []
     assert figures["alerts"] == len(figures["alarms"]) == 0
-    assert figures["monthly_reports"] == [str(tmp_path / "report-2029-08.html")]
-    assert "2029-08" in (tmp_path / "report-2029-08.html").read_text()
-    assert json.loads((tmp_path / "report.json").read_text())["windows"] == windows
+    assert figures["monthly_reports"] == [str(folder / "report-2029-08.html")]
+    assert "2029-08" in (folder / "report-2029-08.html").read_text()
+    assert json.loads((folder / "report.json").read_text())["windows"] == windows
     # The same again prints the figures of the run that has ended; other terms need another folder.
-    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), tmp_path, TERMS, said.append)
+    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, said.append)
     assert again["windows"] == windows and "this run has ended" in said[-1]
     with pytest.raises(ScenarioError, match="expected a new folder, or the same scenario and options"):
         run_mission(
-            parse_scenario(SCENARIO), DataFolder(None), tmp_path, replace(TERMS, days=0.75), said.append
+            parse_scenario(SCENARIO), DataFolder(None), folder, replace(TERMS, days=0.75), said.append
         )
 
 
@@ -186,13 +196,9 @@ def test_impossible_options_are_refused_in_one_line(
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_stopped_run_continues_and_ends_with_the_same_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, Figures], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 0.0)
-    terms = replace(TERMS, windows_per_day=2)
-    whole = run_mission(
-        parse_scenario(SCENARIO), DataFolder(None), tmp_path / "whole", terms, lambda line: None
-    )
     lines: list[str] = []
 
     def stop(line: str) -> None:
@@ -202,13 +208,13 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
 
     folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
-        run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, terms, stop)
+        run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, stop)
     assert (folder / "checkpoint" / "archive.db").exists()
-    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, terms, lines.append)
+    again = run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, lines.append)
     assert any("continues from 2029-08-07T" in line for line in lines)
     assert again["starts"] == 2 and again["interventions"] == 0
     # A report uses the time correlation of that moment, which further time reports of the contact change a little.
-    values, differences = compare_reports(whole, again)
+    values, differences = compare_reports(whole[1], again)
     largest = largest_relative(differences)
     assert largest is not None and largest < 1e-5 and values > 50
 

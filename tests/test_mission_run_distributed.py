@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 import sys
 import threading
 import time
@@ -19,7 +20,7 @@ from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
 from studies.harness.kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
-from studies.harness.parts import Part, PidFile, PostgresServer, runs
+from studies.harness.parts import Part, PidFile, PostgresServer, kill_family, runs
 from studies.harness.usage import family_cpu_s, family_memory
 from studies.mission_run.comparison import compare_reports, largest_relative
 from studies.mission_run.run import RunTerms, run_mission
@@ -74,7 +75,7 @@ def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.Monkey
     monkeypatch.setattr(links, "unsent", lambda *given: unsent(*given) or int(not was_restarted.is_set()))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(900)
 def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     needs_servers()
@@ -103,6 +104,54 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
     # Nothing is left of the deployment.
     assert not any(runs(pid) for pid, _ in json.loads((folder / "processes.json").read_text()).values())
     assert not Path((folder / "postgres-folder").read_text()).exists()
+
+
+@pytest.mark.timeout(60)
+def test_a_kill_waits_for_the_process_that_it_kills_and_for_no_later_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run starts the spacecraft again as soon as it notices the kill."""
+    part = sleeper(tmp_path)
+    part.start()
+    first = part.pid
+
+    def kill_and_start(pid: int) -> None:
+        kill_family(pid)
+        part.start()
+
+    monkeypatch.setattr("studies.harness.parts.kill_family", kill_and_start)
+    part.kill()
+    monkeypatch.undo()
+    assert not runs(first) and runs(part.pid)
+    part.end()
+
+
+def test_a_spacecraft_is_started_again_after_the_kill_has_ended() -> None:
+    done: list[str] = []
+    killing, started = threading.Event(), threading.Event()
+
+    class SlowPart:
+        def start(self) -> None:
+            done.append("start")
+
+        def kill(self) -> None:
+            killing.set()
+            started.wait(0.5)  # a restart that does not wait comes now
+            done.append("killed")
+
+    left, right = socket.socketpair()
+    spacecraft = SpacecraftProcess.__new__(SpacecraftProcess)
+    spacecraft.__dict__ |= {"_part": SlowPart(), "_lock": threading.Lock(), "_console": left}
+    with left, right, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SpacecraftProcess, "_disconnect", lambda _: None)
+        killer = threading.Thread(target=spacecraft.kill)
+        killer.start()
+        killing.wait(10.0)
+        spacecraft.restart()
+        started.set()
+        killer.join()
+        spacecraft._lines.close()
+    assert done == ["killed", "start"] and not spacecraft.was_killed
 
 
 def test_kills_are_planned_by_their_seed_for_every_part_in_every_phase() -> None:

@@ -187,7 +187,8 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, 
     def command(line: str, *more: str) -> list[str | Path]:
         return [installed / "linna", *shlex.split(line)[1:], *more]
 
-    in_folder(tmp_path, *command(tour[0], "--scenario", "short.toml"))
+    printed = in_folder(tmp_path, *command(tour[0], "--scenario", "short.toml")).splitlines()
+    assert set(tour[1:]) <= {re.sub(r"^ +\S*linna ", "linna ", line) for line in printed}
     port = free_port()
     environment = OUTSIDE | {"XDG_DATA_HOME": str(tmp_path)}
     server = subprocess.Popen(

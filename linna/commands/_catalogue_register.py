@@ -31,13 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         Path,
         "product to write (default: registration.json in the data folder, which terrain is then opened with)",
     )
-    option(
-        parser,
-        "--region W,E,S,N",
-        str,
-        "degrees, longitude east (default: 0,360,-80,80)",
-        default="0,360,-80,80",
-    )
+    option(parser, "--region W,E,S,N", str, "degrees, longitude east", "0,360,-80,80")
     finish(parser, run)
 
 

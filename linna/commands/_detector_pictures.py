@@ -18,9 +18,9 @@ def configure(verbs: Any) -> None:
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF, JPEG or NPY")
     option(detect, "images IMAGE", Path, nargs="+")
     add_model(detect)
-    option(detect, "--altitude-km", float, "above the ground; gives size classes", default=None)
-    option(detect, "--fov-deg", float, default=120.0)
-    option(detect, "--threshold", float, default=None)
+    option(detect, "--altitude-km", float, "above the ground; gives size classes", None)
+    option(detect, "--fov-deg", float, "", 120.0)
+    option(detect, "--threshold", float, "", None)
     _add_search(detect)
     finish(detect, _detect)
 
@@ -32,20 +32,14 @@ def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
     _add_search(of_set)
     option(of_set, "--pixel-m", float, "ground covered by a pixel; gives classes in km", default=math.nan)
     option(of_set, "--altitude-km", float, "above the ground, with --fov-deg, instead", default=math.nan)
-    option(of_set, "--fov-deg", float, default=120.0)
-    option(
-        of_set,
-        "--range-px LOW HIGH",
-        float,
-        "diameters that are scored (default: 8 150)",
-        default=(8.0, 150.0),
-    )
+    option(of_set, "--fov-deg", float, "", 120.0)
+    option(of_set, "--range-px LOW HIGH", float, "diameters that are scored (default: 8 150)", (8.0, 150.0))
     option(
         of_set,
         "--level",
         ("2", "3s", "3", "4", "5"),
         "evidence level of the images (default: 5, photographs)",
-        default="5",
+        "5",
     )
 
 
@@ -114,7 +108,7 @@ def _add_search(parser: Any) -> None:
         "--sun-azimuth-deg",
         float,
         "of the Sun in the image, clockwise from its top; without it, the azimuth is found from the image",
-        default=None,
+        None,
     )
     option(
         parser,

@@ -21,10 +21,10 @@ def configure_visibility(commands: Any) -> None:
         "--station NAME=LAT,LON[,HEIGHT_M[,MIN_ELEVATION]]",
         str,
         "ground station in degrees and metres, WGS 84; may be given several times",
+        [],
         action="append",
-        default=[],
     )
-    option(visibility, "--step S", float, "seconds between looks (default 60)", default=60.0)
+    option(visibility, "--step S", float, "seconds between looks", 60.0)
     finish(visibility, run_visibility)
 
 

@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     stats = commands.add_parser("stats", help="size classes of a crater catalogue")
     option(stats, "catalogue FILE", str, CATALOGUE_HELP, nargs="?")
-    option(stats, "--seed", int, "seed of a synthetic catalogue (default: 1)", default=1)
+    option(stats, "--seed", int, "seed of a synthetic catalogue", 1)
     option(stats, "--plot FILE", Path, "histogram of diameters (png, svg or pdf)")
     finish(stats, run_stats)
     _configure_curate(
@@ -68,16 +68,10 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
         "table to write: *.csv as text, without uncertainties; any other name as the table that is uploaded",
         required=True,
     )
-    option(
-        curate,
-        "--region W,E,S,N",
-        str,
-        "degrees, longitude east (default: 0,360,-80,80)",
-        default="0,360,-80,80",
-    )
-    option(curate, "--min-diameter KM", float, "default: 3 km", default=3.0)
-    option(curate, "--max-diameter KM", float, "default: 30 km", default=30.0)
-    option(curate, "--depth-ratio R", float, "least depth over diameter (default: 0.03)", default=0.03)
+    option(curate, "--region W,E,S,N", str, "degrees, longitude east", "0,360,-80,80")
+    option(curate, "--min-diameter KM", float, "default: 3 km", 3.0)
+    option(curate, "--max-diameter KM", float, "default: 30 km", 30.0)
+    option(curate, "--depth-ratio R", float, "least depth over diameter", 0.03)
     finish(curate, run_curate)
 
 

@@ -50,8 +50,8 @@ def _argument(text: str) -> tuple[str, object]:
 
 def _configure_uplink(parser: LinnaParser) -> None:
     option(parser, "--spacecraft-id N", int, required=True)
-    option(parser, "--instance", str, "instance of the spacecraft (default: flight)", default="flight")
-    option(parser, "--format", ("cltu", "packets"), default="cltu")
+    option(parser, "--instance", str, "instance of the spacecraft", "flight")
+    option(parser, "--format", ("cltu", "packets"), "", "cltu")
     option(parser, "--out FILE", Path, "file for the octets")
     option(parser, "--tcp HOST:PORT", str, "TCP address to send the octets to")
     add_operator_options(parser)

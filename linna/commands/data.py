@@ -16,11 +16,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     listing = verbs.add_parser("list", help="list the products: available files, size, licence, address")
     fetch = verbs.add_parser("fetch", help="download products into the data folder; resumes what broke off")
     option(fetch, "names PRODUCT", str, "default: the small ones all need", nargs="*")
-    option(fetch, "--only TEXT", str, "only files with this in their name (tiles)", default="")
-    option(fetch, "--mirror URL", str, "take files from URL/<path in the data folder> instead", default="")
+    option(fetch, "--only TEXT", str, "only files with this in their name (tiles)", "")
+    option(fetch, "--mirror URL", str, "take files from URL/<path in the data folder> instead", "")
     verify = verbs.add_parser("verify", help="read every file again and compare checksums")
     for verb, handler in ((listing, _list), (fetch, _fetch), (verify, _verify)):
-        option(verb, "--to DIR", Path, "data folder; default $LINNA_DATA or the user's", default=None)
+        option(verb, "--to DIR", Path, "data folder; default $LINNA_DATA or the user's", None)
         finish(verb, handler)
 
 

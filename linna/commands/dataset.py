@@ -19,10 +19,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(build, "recipe SCENARIO", Path, "TOML with a [dataset] table, or the name of a shipped scenario")
     option(build, "--out DIR", Path, required=True)
     option(build, "--frames N", int, required=True)
-    option(build, "--workers W", int, "processes; the frames do not depend on it", default=1)
-    option(build, "--seed", int, "instead of the recipe's", default=None)
-    option(build, "--bits", int, "of the PNG files", choices=(8, 16), default=None)
-    option(build, "--renderer NAME", str, "fast (default), raymarch or cycles", default=None)
+    option(build, "--workers W", int, "processes; the frames do not depend on it", 1)
+    option(build, "--seed", int, "instead of the recipe's", None)
+    option(build, "--bits", int, "of the PNG files", None, choices=(8, 16))
+    option(build, "--renderer NAME", str, "fast (default), raymarch or cycles", None)
     finish(build, _build)
     for name, handler, text in (
         ("check", _check, "find missing and damaged files"),
@@ -34,9 +34,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     sheet = verbs.add_parser("sheet", help="a picture of frames with their labels, as the paper's Fig. 5")
     option(sheet, "folder DIR", Path)
     option(sheet, "--out F.png", Path, required=True)
-    option(sheet, "--split", ("train", "val", "test"), "default: all", default="")
-    option(sheet, "--columns", int, default=4)
-    option(sheet, "--rows", int, default=2)
+    option(sheet, "--split", ("train", "val", "test"), "default: all", "")
+    option(sheet, "--columns", int, "", 4)
+    option(sheet, "--rows", int, "", 2)
     finish(sheet, _sheet)
 
 

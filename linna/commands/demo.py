@@ -18,10 +18,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--out DIR",
         Path,
-        "folder for the pass archive, the ground database and the report (default: linna-demo)",
-        default=Path("linna-demo"),
+        "folder for the pass archive, the ground database and the report",
+        Path("linna-demo"),
     )
-    option(parser, "--scenario", str, "scenario file or name (default: selenita)", default="selenita")
+    option(parser, "--scenario", str, "scenario file or name", "selenita")
     option(parser, "--seed", int, "another seed than the scenario's")
     finish(parser, run)
 

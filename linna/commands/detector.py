@@ -36,15 +36,15 @@ def _add_train(verbs: Any) -> None:
     train = verbs.add_parser("train", help="train a network; resumes the run of the same folder")
     option(train, "datasets DATASET", Path, nargs="+")
     option(train, "--out RUN", Path, required=True)
-    option(train, "--minutes", float, "wall-clock budget of the learning-rate schedule", default=90.0)
-    option(train, "--steps", int, "budget in optimiser steps instead", default=0)
-    option(train, "--seed", int, default=1)
-    option(train, "--crop PX", int, default=384)
-    option(train, "--batch", int, default=8)
-    option(train, "--patience", int, "stop after this many validations without gain (0: never)", default=0)
-    option(train, "--learning-rate", float, default=2.5e-3)
-    option(train, "--landmarks F.csv", Path, "uncatalogued landmarks as further labels", default=None)
-    option(train, "--start-from FILE", Path, "first weights: a checkpoint or an ONNX network", default=None)
+    option(train, "--minutes", float, "wall-clock budget of the learning-rate schedule", 90.0)
+    option(train, "--steps", int, "budget in optimiser steps instead", 0)
+    option(train, "--seed", int, "", 1)
+    option(train, "--crop PX", int, "", 384)
+    option(train, "--batch", int, "", 8)
+    option(train, "--patience", int, "stop after this many validations without gain (0: never)", 0)
+    option(train, "--learning-rate", float, "", 2.5e-3)
+    option(train, "--landmarks F.csv", Path, "uncatalogued landmarks as further labels", None)
+    option(train, "--start-from FILE", Path, "first weights: a checkpoint or an ONNX network", None)
     option(
         train,
         "--normalise-first",
@@ -56,8 +56,8 @@ def _add_train(verbs: Any) -> None:
         "--enlarge",
         int,
         "factor by which the network enlarges images, for high altitudes; --crop is in pixels before enlargement",
+        1,
         choices=(1, 2),
-        default=1,
     )
     option(
         train,
@@ -69,17 +69,17 @@ def _add_train(verbs: Any) -> None:
         train,
         "--least-emphasis W",
         float,
-        "least factor of a label's weight by diameter; 1 weighs all craters below 28 px the same (default: 0.5)",
-        default=0.5,
+        "least factor of a label's weight by diameter; 1 weighs all craters below 28 px the same",
+        0.5,
     )
     option(
         train,
         "--rims TABLE",
         Path,
         "labels on rims (binary table of `linna catalogue curate`) instead of the catalogue's circles",
-        default=None,
+        None,
     )
-    option(train, "--replicas", int, "threads that train side by side (0: one per core)", default=0)
+    option(train, "--replicas", int, "threads that train side by side (0: one per core)", 0)
     finish(train, _train)
 
 
@@ -88,11 +88,9 @@ def _add_export(verbs: Any) -> None:
     export = verbs.add_parser("export", help="write the ONNX network of a run, checked against torch")
     option(export, "run RUN", Path, "folder of a run, a checkpoint file, or an exported network")
     option(export, "--out M.onnx", Path, required=True)
-    option(
-        export, "--dataset DIR", Path, "whose validation split fixes the thresholds", nargs="*", default=[]
-    )
-    option(export, "--revision", str, "source revision for the model's metadata", default="")
-    option(export, "--note", str, "a remark on the training for the model's metadata", default="")
+    option(export, "--dataset DIR", Path, "whose validation split fixes the thresholds", [], nargs="*")
+    option(export, "--revision", str, "source revision for the model's metadata", "")
+    option(export, "--note", str, "a remark on the training for the model's metadata", "")
     option(export, "--paper-classes", bool, "keep the heatmaps of the paper's three classes")
     option(
         export,
@@ -105,8 +103,8 @@ def _add_export(verbs: Any) -> None:
         "--enlarge",
         int,
         "factor by which the network first enlarges images (0: factor of the network)",
+        0,
         choices=(0, 1, 2),
-        default=0,
     )
     option(export, "--test", bool, "score the test splits and write the figures into the model")
     finish(export, _export)
@@ -127,15 +125,15 @@ def _add_calibrate(verbs: Any) -> None:
         "--parts",
         PARTS,
         "what is stored (default: score and sigma)",
+        ["score", "sigma"],
         nargs="*",
-        default=["score", "sigma"],
     )
     option(
         calibrate,
         "--precision P",
         float,
-        "share of the detections used on board that are catalogued craters of 3 to 30 km (default: 0.85)",
-        default=0.85,
+        "share of the detections used on board that are catalogued craters of 3 to 30 km",
+        0.85,
     )
     finish(calibrate, _calibrate)
 
@@ -148,9 +146,9 @@ def _add_evaluate(verbs: Any) -> None:
     tested = evaluate.add_mutually_exclusive_group(required=True)
     option(tested, "--dataset DIR", Path, nargs="+")
     _detector_pictures.add_evaluation(evaluate, tested)
-    option(evaluate, "--split", ("train", "val", "test"), default="test")
-    option(evaluate, "--source", str, "only the frames of this source", default="")
-    option(evaluate, "--threshold", float, "instead of the model's own", default=None)
+    option(evaluate, "--split", ("train", "val", "test"), "", "test")
+    option(evaluate, "--source", str, "only the frames of this source", "")
+    option(evaluate, "--threshold", float, "instead of the model's own", None)
     option(
         evaluate,
         "--paper-classes",
@@ -162,17 +160,17 @@ def _add_evaluate(verbs: Any) -> None:
         "--rims TABLE",
         Path,
         "rims from `linna catalogue curate`: distances from these in addition to the catalogue positions",
-        default=None,
+        None,
     )
     option(
         evaluate,
         "--rims-shift EAST_M NORTH_M",
         float,
         "offset of the terrain in the images from the table (default: 0 0)",
-        default=(0.0, 0.0),
+        (0.0, 0.0),
     )
-    option(evaluate, "--report F.html", Path, "write one HTML report", default=None)
-    option(evaluate, "--run", Path, "training run whose curves the report shows", default=None)
+    option(evaluate, "--report F.html", Path, "write one HTML report", None)
+    option(evaluate, "--run", Path, "training run whose curves the report shows", None)
     finish(evaluate, _evaluate)
 
 
@@ -182,9 +180,9 @@ def _add_compare(verbs: Any) -> None:
     option(compare, "model M.onnx", Path, "ONNX file or name of a shipped network")
     option(compare, "reference REFERENCE.onnx", Path)
     option(compare, "--dataset DIR", Path, nargs="+", required=True)
-    option(compare, "--split", ("train", "val", "test"), default="val")
-    option(compare, "--source", str, "only the frames of this source", default="")
-    option(compare, "--picture F.png", Path, "draw both networks' detections on some frames", default=None)
+    option(compare, "--split", ("train", "val", "test"), "", "val")
+    option(compare, "--source", str, "only the frames of this source", "")
+    option(compare, "--picture F.png", Path, "draw both networks' detections on some frames", None)
     finish(compare, _compare)
 
 
@@ -192,8 +190,8 @@ def _add_bench_and_info(verbs: Any) -> None:
 
     bench = verbs.add_parser("bench", help="latency and memory on this machine")
     add_model(bench)
-    option(bench, "--threads", int, default=1)
-    option(bench, "--frames", int, default=100)
+    option(bench, "--threads", int, "", 1)
+    option(bench, "--frames", int, "", 100)
     finish(bench, _bench)
 
     info = verbs.add_parser("info", help="what a model says of itself")

@@ -41,7 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--frames",
         ("none", "some", "all"),
         "images kept in the archive (default: eight of them)",
-        default="some",
+        "some",
     )
     option(
         parser,
@@ -54,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--evidence",
         ("photographs", "other-renderer"),
         "what the images of --images are (default: not stated)",
-        default="",
+        "",
     )
     _add_live(parser)
     option(parser, "--campaign FILE", str, "fly the fault campaign of a file, or a shipped one by name")

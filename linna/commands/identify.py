@@ -34,19 +34,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
             nargs="?",
         )
         option(command, "--frames", int, f"default: {frames}", default=frames)
-        option(command, "--seed", int, "default: 1", default=1)
-        option(command, "--recall", float, "default: 0.5", default=0.5)
-        option(command, "--precision", float, "default: 0.8", default=0.8)
-        option(command, "--sigma-px", float, "per axis (default: 1.4)", default=1.4)
-        option(command, "--log-diameter-sigma", float, "default: 0.05", default=0.05)
+        option(command, "--seed", int, "", 1)
+        option(command, "--recall", float, "", 0.5)
+        option(command, "--precision", float, "", 0.8)
+        option(command, "--sigma-px", float, "per axis", 1.4)
+        option(command, "--log-diameter-sigma", float, "", 0.05)
         add_json_flag(command)
-    option(
-        lost,
-        "--attitude-deg",
-        float,
-        "error of nadir and heading, 1 sigma per axis (default: 0.5)",
-        default=0.5,
-    )
+    option(lost, "--attitude-deg", float, "error of nadir and heading, 1 sigma per axis", 0.5)
     option(lost, "--sets", int, "sets of four frames (default: a third of the frames)")
     rendered = lost.add_argument_group("rendered", "frames along a scenario and the detector that flies")
     option(
@@ -55,7 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         str,
         "render frames of a scenario in sets of four; its terrain's craters are the map, FILE is not used",
     )
-    option(rendered, "--min-diameter-km", float, "smallest craters of the map (default: 3)", default=3.0)
+    option(rendered, "--min-diameter-km", float, "smallest craters of the map", 3.0)
     option(rendered, "--detections F.npz", Path, "keep the detections here, or take those kept here")
     option(
         rendered,

@@ -21,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         int,
         "spacecraft of the files, 0 to 1023; required for packets without frames",
     )
-    option(parser, "--instance", str, "instance of the spacecraft (default: flight)", default="flight")
+    option(parser, "--instance", str, "instance of the spacecraft", "flight")
     option(
         parser,
         "--recording --stream NAME",
@@ -31,11 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--offset N", int, "offset of the first file in the recording, octets (default: 0)")
     option(
-        parser,
-        "--station NAME",
-        str,
-        "station that received the files, as in the mission description",
-        default="",
+        parser, "--station NAME", str, "station that received the files, as in the mission description", ""
     )
     option(
         parser,

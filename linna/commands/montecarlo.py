@@ -11,18 +11,17 @@ from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    option(parser, "--runs N", int, "runs (default: 50)", default=50)
-    option(parser, "--seed", int, "seed of the first run (default: 1)", default=1)
-    option(parser, "--hours H", float, "length of a run (default: 3)", default=3.0)
+    option(parser, "--runs N", int, "runs", 50)
+    option(parser, "--seed", int, "seed of the first run", 1)
+    option(parser, "--hours H", float, "length of a run", 3.0)
     option(
         parser,
         "--track",
         ("test", "tuning", "inclined", "limb"),
-        "orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits "
-        "(default: test)",
-        default="test",
+        "orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits",
+        "test",
     )
-    option(parser, "--noise-factor F", float, "factor on the filter's process noise", default=1.0)
+    option(parser, "--noise-factor F", float, "factor on the filter's process noise", 1.0)
     option(
         parser,
         "--attitude-noise-deg A",

@@ -19,16 +19,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "and judge them by the truth. With --out, an interrupted survey resumes with the next seed.",
     )
     option(survey, "--region W,E,S,N", str, "degrees, such as 285,300,-60,60", required=True)
-    option(survey, "--seeds N", int, "sessions (default: 3)", default=3)
+    option(survey, "--seeds N", int, "sessions", 3)
     option(survey, "--seed S", int, "first seed (default: the scenario's)")
-    option(survey, "--windows N", int, "windows of a session (default: 6)", default=6)
-    option(survey, "--direction", ("ascending", "descending", "any"), default="ascending")
+    option(survey, "--windows N", int, "windows of a session", 6)
+    option(survey, "--direction", ("ascending", "descending", "any"), "", "ascending")
     option(
         survey,
         "--scenario FILE",
         str,
         "errors, attitude, camera and network (default: the shipped unseen-strip)",
-        default="unseen-strip",
+        "unseen-strip",
     )
     option(survey, "--out DIR", Path, "folder that keeps the session of each seed")
     finish(survey, run_survey)

@@ -24,8 +24,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
     option(propagate, "scenario", str, "scenario file, or the name of a shipped one")
-    option(propagate, "--days D", _positive, "span in days (default 30)", default=30.0)
-    option(propagate, "--step S", _positive, "seconds between states (default 30)", default=30.0)
+    option(propagate, "--days D", _positive, "span in days", 30.0)
+    option(propagate, "--step S", _positive, "seconds between states", 30.0)
     option(propagate, "--out F.oem", Path, "ephemeris to write", required=True)
     option(propagate, "--gravity FILE", str, "coefficient file, or 'builtin'")
     option(propagate, "--degree N", int, "degree of the gravity field")
@@ -37,8 +37,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--count-within-deg LAT",
         _positive,
         "count the states whose sub-satellite latitude is within this of the equator; may be repeated",
+        [],
         action="append",
-        default=[],
     )
     finish(propagate, run_propagate)
     configure_compare(commands)

@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     _archives(run)
     option(run, "--build BUILD", str, "candidate: build file, 'current' or identity", required=True)
-    option(run, "--baseline BUILD", str, "baseline (default: current)", default="current")
+    option(run, "--baseline BUILD", str, "baseline", "current")
     option(run, "--policy FILE", Path, "policy of the gates (default: the shipped one)")
     option(run, "--junit FILE", Path, "write JUnit XML")
     option(run, "--report FILE", Path, "write the report as HTML")
@@ -41,13 +41,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "baseline", help="replay archives with one build and show its metrics with confidence intervals"
     )
     _archives(baseline)
-    option(baseline, "--build BUILD", str, "build (default: current)", default="current")
+    option(baseline, "--build BUILD", str, "build", "current")
     _finish(baseline, _baseline)
     suite = commands.add_parser("suite", help="write the pass archives of the regression suite")
     option(suite, "scenario", str, "scenario files (default: the shipped suite)", nargs="*")
     option(suite, "--out DIR", Path, "folder for the archives", required=True)
     option(suite, "--frames N", int, "frames of each pass (default: the scenario's)")
-    option(suite, "--seeds K", int, "passes of each scenario (default: 1)", default=1)
+    option(suite, "--seeds K", int, "passes of each scenario", 1)
     finish(suite, _suite)
     archive = commands.add_parser(
         "archive", help="list, add, render, pin, pack or remove the archives kept for replays"
@@ -61,13 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs="?",
     )
     option(archive, "--out FILE", Path, "zip to write (pack)")
-    option(
-        archive,
-        "--unused-days",
-        float,
-        "prune: remove archives that were not used for this time (default: 90)",
-        default=90.0,
-    )
+    option(archive, "--unused-days", float, "prune: remove archives that were not used for this time", 90.0)
     _finish(archive, _archive)
     build = commands.add_parser("build", help="register a build, or list those registered")
     option(build, "action", ("register", "list"))
@@ -85,7 +79,7 @@ def _archives(parser: argparse.ArgumentParser) -> None:
         "--archive ARCHIVE",
         str,
         "pass archives: folders, zips, folders of archives, or identities of kept archives",
-        default=[],
+        [],
         nargs="+",
         action="extend",
     )
@@ -94,8 +88,8 @@ def _archives(parser: argparse.ArgumentParser) -> None:
         "--pass ID",
         int,
         "passes whose archives are replayed",
+        [],
         dest="passes",
-        default=[],
         nargs="+",
         action="extend",
     )

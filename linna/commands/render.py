@@ -23,16 +23,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "frames spread over the scenario's observation windows."
     )
     option(parser, "scenario SCENARIO", Path, "scenario file, or the name of a shipped one")
-    option(
-        parser,
-        "--epoch UTC",
-        str,
-        "when, as 2029-08-07T12:00:00Z; may be repeated",
-        action="append",
-        default=[],
-    )
+    option(parser, "--epoch UTC", str, "when, as 2029-08-07T12:00:00Z; may be repeated", [], action="append")
     option(parser, "--out F.png", Path, "RGB picture to write", required=True)
-    option(parser, "--renderer", RENDERERS, "default: fast", default="fast")
+    option(parser, "--renderer", RENDERERS, "", "fast")
     option(parser, "--sheet", bool, "a contact sheet of several frames")
     option(parser, "--views N", int, f"frames of a sheet (default: {SHEET_VIEWS})", default=SHEET_VIEWS)
     option(parser, "--draw-labels", bool, "draw the labels: cyan, lime, yellow by class (paper, Fig. 5)")
@@ -40,8 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--label-rule",
         ("exact", "paper"),
-        "exact rims, or the paper's local equirectangular map (default: exact)",
-        default="exact",
+        "exact rims, or the paper's local equirectangular map",
+        "exact",
     )
     option(parser, "--terrain", TERRAINS, "instead of the scenario's")
     option(parser, "--photometry", LAWS, "instead of the scenario's; matt is the paper's Principled BSDF")

@@ -14,11 +14,7 @@ from linna.parser import option
 def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "archive", Path, "pass archive: a folder or a zip file", nargs="?")
     option(
-        parser,
-        "--build",
-        str,
-        "build file (TOML), or 'current': this flight code and its network",
-        default="current",
+        parser, "--build", str, "build file (TOML), or 'current': this flight code and its network", "current"
     )
     option(parser, "--out DIR", Path, "output folder for downlink and summary")
     option(

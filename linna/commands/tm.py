@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet"
     )
     option(decode, "file FILE", Path)
-    option(decode, "--format", ("json", "csv", "parquet"), default="json")
+    option(decode, "--format", ("json", "csv", "parquet"), "", "json")
     option(decode, "--out F", Path, "write there (default: standard output)")
     _add_definition_options(decode)
     option(decode, "--raw", bool, "values as transmitted, neither calibrated nor named (with --xtce)")

@@ -16,7 +16,7 @@ from linna.parser import option
 def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "report REPORT.json", Path, "report of a pass, as linna report wrote it")
     option(parser, "--out DIR", Path, "folder for the TUM files", required=True)
-    option(parser, "--frames N", int, "frames that a relative error spans (default: 4)", default=4)
+    option(parser, "--frames N", int, "frames that a relative error spans", 4)
     finish(parser, run)
 
 

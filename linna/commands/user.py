@@ -39,7 +39,7 @@ def _revoke(service: Client, token_id: int) -> Token:
 def _configure_ensure(parser: LinnaParser) -> None:
     option(parser, "name", str)
     option(parser, "--role", ("viewer", "operator", "admin"), required=True)
-    option(parser, "--token-variable NAME", str, "default: LINNA_ADMIN_TOKEN", default="LINNA_ADMIN_TOKEN")
+    option(parser, "--token-variable NAME", str, "", "LINNA_ADMIN_TOKEN")
     add_service_options(parser)
     finish(parser, _ensure)
 

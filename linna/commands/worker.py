@@ -10,7 +10,7 @@ from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    option(parser, "--concurrency N", int, "simultaneous jobs (default: 1)", default=1)
+    option(parser, "--concurrency N", int, "simultaneous jobs", 1)
     option(parser, "--check", bool, "exit 0 if the worker of this machine responds, otherwise 1")
     add_service_options(parser)
     parser.set_defaults(handler=run)

@@ -153,11 +153,12 @@ class Part:
 
     def kill(self) -> None:
         """Kill it and all its children (SIGKILL), and wait for their end."""
-        assert self._process is not None
-        if self._process.poll() is not None:
+        killed = self._process  # it may be started again meanwhile
+        assert killed is not None
+        if killed.poll() is not None:
             return  # its number may be somebody else's by now
-        kill_family(self._process.pid)
-        self._process.wait()
+        kill_family(killed.pid)
+        killed.wait()
 
 
 def kill_family(pid: int) -> None:

@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,15 +67,17 @@ class SpacecraftProcess:
             env={**environment_with_data(os.environ, data), **ALLOCATOR},
         )
         self._console: socket.socket | None = None
+        self._lock = threading.Lock()  # a killed process has ended before the next one starts
         self.restart()
 
     def restart(self) -> None:
         """Start the process, after its end from its last exact state."""
-        self._disconnect()
-        self.was_killed = False
-        self._part.start()
-        assert self._console is not None
-        self._lines = self._console.makefile("r")
+        with self._lock:
+            self._disconnect()
+            self.was_killed = False
+            self._part.start()
+            assert self._console is not None
+            self._lines = self._console.makefile("r")
 
     def _is_connected(self) -> bool:
         with contextlib.suppress(OSError):
@@ -102,8 +105,9 @@ class SpacecraftProcess:
 
     def kill(self) -> None:
         """Kill the process (SIGKILL)."""
-        self.was_killed = True
-        self._part.kill()
+        with self._lock:
+            self.was_killed = True
+            self._part.kill()
 
     def check_killed(self) -> None:
         """Raise `SpacecraftKilled` if `kill` was called since the last start."""

@@ -60,6 +60,7 @@ def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_
     assert result.wrong_share <= 0.005
 
 
+@pytest.mark.campaign
 def test_the_filter_knows_its_errors_and_a_filter_that_does_not_is_found_out(navigation_case: Any) -> None:
     # Two imaging arcs with half an hour of coast between them.
     imaging = np.arange(300) % 210 < 90
@@ -150,7 +151,7 @@ def test_runs_over_any_node_fly_over_other_ground_at_the_same_latitudes(navigati
     np.testing.assert_allclose(first.altitude_m, other.altitude_m, atol=20.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.campaign) for one in (2, 3))])
 def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(
     navigation_case: Any, seed: int
 ) -> None:

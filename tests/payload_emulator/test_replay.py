@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from ground_service.ground import open_ground
@@ -15,7 +16,9 @@ from ground_service.regression.archives import check_archive, keep_archive
 from ground_service.regression.rendering import settle_archive, with_detections
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ParameterError, RecordError
+from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.payload import FlightParameters
+from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.emulator import emulate, file_entries
 from payload_emulator.session.parameter_file import (
     BuildParameters,
@@ -36,6 +39,7 @@ from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.suite import SUITE, suite_scenarios
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
+from tmtc.stream import cut_packets
 
 FRAMES = 5
 SCENARIO = """
@@ -219,6 +223,19 @@ def test_a_build_changes_the_parameters_that_it_names_only(archive: Path, tmp_pa
     plain = replay_archive(archive, FlightBuild(), tmp_path / "plain")
     strict = replay_archive(archive, build, tmp_path / "strict")
     assert strict["detections"] < plain["detections"]
+
+
+def test_a_build_flies_its_own_network(archive: Path) -> None:
+    network = onnx.load_model_from_string(load_shipped_model())
+    uncalibrated = [one for one in network.metadata_props if "calibration" not in one.key]
+    del network.metadata_props[:]
+    network.metadata_props.extend(uncalibrated)
+    own = network.SerializeToString()
+    record = load_record(archive)
+    octets = b"".join(replay(record, stored_images(archive, record), FlightBuild(model=own)).packets)
+    reported = DICTIONARY.unpack_many(octets, cut_packets(octets))["housekeeping"].columns["model_hash"]
+    flown, shipped = (OnnxDetector(one).model_hash for one in (own, load_shipped_model()))
+    assert set(reported.tolist()) == {flown} != {shipped}
 
 
 def test_a_build_file_of_a_program_is_not_flown_here(tmp_path: Path) -> None:

@@ -6,10 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ground_service.client.local import local_client
-from ground_service.clock import ClockFile, set_mission_clock
-from ground_service.ground import Ground, open_ground
-from ground_service.links.supervisor import LinkSupervisor
+from ground_service.ground import open_ground
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.builds import CURRENT, load_build, register_build
 from ground_service.regression.gates.policy import load_policy
@@ -18,43 +15,12 @@ from ground_service.regression.rendering import settle_archive
 from ground_service.regression.service import run_regression
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
-from studies.mission_run import run as mission_run
-from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import RunTerms, run_mission
 from tests.test_mission_run import SCENARIO
 
 DATA = DataFolder(None)
 TERMS = RunTerms(days=0.3, windows_per_day=1, window_s=180.0)
 WORLD = SCENARIO.replace('images = "reduced"', "").replace("degree = 8", 'degree = 8\norientation = "iau"')
-
-
-@pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.campaign)])
-def flown(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, str | None]:
-    """Folder and database of a mission that has flown one window."""
-    folder, url = tmp_path_factory.mktemp("mission"), None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("migrated_postgres")()
-
-    def opened(home: Path, data: DataFolder, clock_file: Path) -> EmbeddedGround:
-        set_mission_clock(ClockFile(clock_file).read)
-        ground = open_ground(home, data, database_url=url)
-        found = EmbeddedGround(ground, local_client(ground, "mission-run"))
-        found.links = LinkSupervisor(ground)
-        found.links.start()
-        return found
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mission_run.EmbeddedGround, "open", opened)
-        figures = run_mission(parse_scenario(WORLD), DATA, folder, TERMS, lambda text: None)
-    assert figures["windows"]["processed"] == 1 and figures["packets_lost"] == 0
-    return folder, url
-
-
-def reopened(flown: tuple[Path, str | None]) -> Ground:
-    folder, url = flown
-    return open_ground(folder / "ground", DATA, database_url=url)
 
 
 def build_with(folder: Path, parameters: str) -> str:
@@ -66,12 +32,12 @@ def build_with(folder: Path, parameters: str) -> str:
     return str(folder / "build.toml")
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(600)
-def test_builds_are_judged_on_the_frames_of_a_live_pass(
-    flown: tuple[Path, str | None], tmp_path: Path
-) -> None:
-    with reopened(flown) as ground:
+def test_builds_are_judged_on_the_frames_of_a_live_pass(tmp_path: Path) -> None:
+    figures = run_mission(parse_scenario(WORLD), DATA, tmp_path / "mission", TERMS, print)
+    assert figures["windows"]["processed"] == 1 and figures["packets_lost"] == 0
+    with open_ground(tmp_path / "mission" / "ground", DATA) as ground:
         [kept] = kept_archives(ground)
         assert (kept.state, kept.reason, kept.frames_stored) == ("to render", "", 0)
         assert kept.frames >= 10

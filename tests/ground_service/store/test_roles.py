@@ -65,6 +65,17 @@ def roles(new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
     engine.dispose()
 
 
+def assert_refused(url: str, statement: str) -> None:
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    try:
+        with pytest.raises(DBAPIError) as error, engine.connect() as connection:
+            connection.execute(text(statement))
+    finally:
+        engine.dispose()
+    # insufficient_privilege, and nothing else, such as a name that is not there.
+    assert getattr(error.value.orig, "sqlstate", None) == "42501"
+
+
 @pytest.mark.parametrize(
     "statement",
     [
@@ -92,14 +103,7 @@ def roles(new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
     ],
 )
 def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> None:
-    engine = create_engine(roles.service, isolation_level="AUTOCOMMIT")
-    try:
-        with pytest.raises(DBAPIError) as error, engine.connect() as connection:
-            connection.execute(text(statement))
-    finally:
-        engine.dispose()
-    # insufficient_privilege, and nothing else, such as a name that is not there.
-    assert getattr(error.value.orig, "sqlstate", None) == "42501"
+    assert_refused(roles.service, statement)
 
 
 @pytest.mark.parametrize(
@@ -117,13 +121,7 @@ def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> Non
     ],
 )
 def test_the_role_of_the_backup_cannot_write(roles: Roles, statement: str) -> None:
-    engine = create_engine(roles.backup, isolation_level="AUTOCOMMIT")
-    try:
-        with pytest.raises(DBAPIError) as error, engine.connect() as connection:
-            connection.execute(text(statement))
-    finally:
-        engine.dispose()
-    assert getattr(error.value.orig, "sqlstate", None) == "42501"
+    assert_refused(roles.backup, statement)
 
 
 def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(

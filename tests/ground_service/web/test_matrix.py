@@ -1,4 +1,4 @@
-"""Every page at three widths, light and dark, with two fonts, with and without data: layout, barriers, keyboard.
+"""Every page with and without data: layout, barriers, keyboard; the campaign takes every width, scheme and font.
 
 LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `make page-table`.
 LINNA_PAGE_PICTURES=FOLDER keeps a picture of each page, light and dark, at each width.
@@ -6,12 +6,13 @@ LINNA_PAGE_PICTURES=FOLDER keeps a picture of each page, light and dark, at each
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -37,11 +38,17 @@ from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, Servic
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
 
-WIDTHS = (1280, 820, 390)
-SCHEMES = ("light", "dark")
+Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
 
+EVERY_LOOK: Looks = tuple(itertools.product(("light", "dark"), FONTS, (1280, 820, 390)))
+FEW_LOOKS: Looks = (("light", "DejaVu", 820), ("light", "Arial", 1280), ("dark", "Arial", 390))
+"""Each scheme, font and width once; the last width is that of the keyboard."""
+
+LOOKS = pytest.mark.parametrize(
+    "looks", [FEW_LOOKS, pytest.param(EVERY_LOOK, marks=pytest.mark.campaign)], ids=["few", "every"]
+)
 AXE_WIDTHS = (1280, 390)
 LONG_LOG = """() => {
   const feed = document.getElementById("feed");
@@ -200,25 +207,23 @@ class Faults:
         self.keyboard: list[str] = []
         self.unmarked: list[str] = []
 
-    def find(self, page: Page, name: str) -> None:
-        """Look at an opened page in all forms."""
+    def find(self, page: Page, name: str, looks: Looks) -> None:
+        """Look at an opened page in some forms: scheme, font and width."""
         page.evaluate(LONG_LOG)
-        for scheme in SCHEMES:
+        for scheme, font, width in looks:
             page.emulate_media(color_scheme=scheme)
-            for font, family in FONTS.items():
-                page.evaluate(
-                    "(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", family
-                )
-                for width in WIDTHS:
-                    page.set_viewport_size({"width": width, "height": 844})
-                    page.evaluate(FRAMES_DRAWN)
-                    if (wide := page.evaluate(WIDTH)) > width:
-                        self.layout.append(f"{scheme}, {font}, {width} px: {wide} px wide")
-                    if font == "DejaVu" and (folder := os.environ.get("LINNA_PAGE_PICTURES")):
-                        page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png", full_page=True)
-                    if font == "Arial" and width in AXE_WIDTHS:
-                        self.barriers += [f"{scheme}, {width} px: {one}" for one in barriers(page)]
-        for width in (1280, 390):
+            page.evaluate(
+                "(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", FONTS[font]
+            )
+            page.set_viewport_size({"width": width, "height": 844})
+            page.evaluate(FRAMES_DRAWN)
+            if (wide := page.evaluate(WIDTH)) > width:
+                self.layout.append(f"{scheme}, {font}, {width} px: {wide} px wide")
+            if font == "DejaVu" and (folder := os.environ.get("LINNA_PAGE_PICTURES")):
+                page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png", full_page=True)
+            if font == "Arial" and width in AXE_WIDTHS:
+                self.barriers += [f"{scheme}, {width} px: {one}" for one in barriers(page)]
+        for width in (1280, 390) if looks == EVERY_LOOK else (390,):
             page.set_viewport_size({"width": width, "height": 844})
             self.tab_through(page, width)
 
@@ -307,37 +312,42 @@ def test_the_fonts_of_the_matrix_are_installed() -> None:
     assert [family for family in FONTS.values() if family not in listed] == []
 
 
+@LOOKS
 @pytest.mark.parametrize("path", PATHS)
 def test_a_page_with_data_has_no_fault(
-    administrator: BrowserContext, worked: Worked, rows: list[str], path: str
+    administrator: BrowserContext, worked: Worked, rows: list[str], path: str, looks: Looks
 ) -> None:
     page = new_page(administrator)
     found = Faults(page)
     settled(page, worked.paths.get(path, path))
     answered(page)
-    found.find(page, file_name(path, "with"))
+    found.find(page, file_name(path, "with"), looks)
     page.close()
     record(rows, path, "with", found)
 
 
+@LOOKS
 @pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
-def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[str], path: str) -> None:
+def test_a_page_without_data_has_no_fault(
+    newcomer: BrowserContext, rows: list[str], path: str, looks: Looks
+) -> None:
     page = new_page(newcomer)
     found = Faults(page)
     settled(page, path)
     answered(page)
-    found.find(page, file_name(path, "without"))
+    found.find(page, file_name(path, "without"), looks)
     page.close()
     record(rows, path, "without", found)
 
 
-def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[str]) -> None:
+@LOOKS
+def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[str], looks: Looks) -> None:
     context = browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844})
     page = new_page(context)
     page.goto("/")
     expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
     answered(page)
     found = Faults(page)
-    found.find(page, file_name(SIGN_IN, "with"))
+    found.find(page, file_name(SIGN_IN, "with"), looks)
     context.close()
     record(rows, SIGN_IN, "with", found)
