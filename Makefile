@@ -26,12 +26,14 @@ SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain e
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
 
+# Compiled modules are kept, whatever the environment says: many tests start processes.
+# Three processes on two cores: browsers and servers are waited for.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 # Long campaigns; each has a short twin in `make test` (docs/mutation.md).
 campaigns: $(VENV)/.dev
-	$(BIN)/python -m pytest -m campaign -n 2 --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -m campaign -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
