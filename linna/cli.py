@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from linna import __version__
-from linna.parser import BadUsage, LinnaParser, colored, uses_colors
+from linna.parser import BadUsage, LinnaParser
 
 # Threads of numerical libraries that spin while they wait make two busy cores ten times slower: wait passively.
 _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SLP_VECTORIZE": "1"}
@@ -25,15 +25,14 @@ GROUPS: dict[str, tuple[str, str]] = {
     "montecarlo": ("montecarlo", "Monte Carlo runs of anchored navigation: errors compared with covariances"),
     "replay": ("replay", "replay an archived pass with a payload build"),
     "regress": ("regress", "compare a payload build with a baseline over archived passes"),
-    "orbit": ("orbit", "propagate, compare and interpolate ephemerides"),
+    "orbit": ("orbit", "propagate, compare and convert ephemerides"),
     "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
     "data": ("data", "list, fetch and verify the public data products"),
-    "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
-    "camera": ("camera", "camera studies (field of view)"),
+    "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
     "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
     "identify": ("identify", "rates of crater identification and of wrong identifications"),
     "render": ("render", "render one frame of a scenario"),
-    "dataset": ("dataset", "build, check and summarise detector data sets"),
+    "dataset": ("dataset", "build and check detector data sets"),
     "detector": ("detector", "train, export, evaluate and run the crater detector"),
     "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
     "link": ("link", "link settings of a recorded downlink; links to ground stations and their contacts"),
@@ -86,7 +85,7 @@ def _run(arguments: Sequence[str]) -> int:
 
         complete(GROUPS)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(colored(_overview()) if uses_colors() else _overview())
+        print(_overview())
         return 0 if arguments else 2
     if arguments[0] == "--version":
         print(f"linna {__version__}")
@@ -132,7 +131,7 @@ def _guarded(
 
 def _refused(message: str, arguments: Sequence[str], command: str = "linna") -> int:
     """Print an error as one line on stderr, with --json also as one JSON object on stdout; return the status 2."""
-    line = _one_line(message)
+    line = " ".join(message.split())
     print(f"{command}: error: {line}", file=sys.stderr)
     if "--json" in arguments:
         print(json.dumps({"error": line, "status": 2}))
@@ -156,10 +155,6 @@ def _known_errors() -> tuple[type[Exception], ...]:
 def _os_message(error: OSError) -> str:
     where = f" ({error.filename})" if error.filename else ""
     return f"{error.strerror or error}{where}"
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
 
 
 def _nearest(name: str) -> str:

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from linna.parser import option
@@ -41,6 +42,16 @@ def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | 
 def as_json(figures: Mapping[str, Any]) -> str:
     """`figures` as one JSON object; NaN and infinity are null."""
     return json.dumps(_plain(figures), allow_nan=False)
+
+
+def save(path: Path, octets: bytes) -> None:
+    """Write a file whole or not at all."""
+    unfinished = path.with_name(f"{path.name}.part")
+    try:
+        unfinished.write_bytes(octets)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def checked(is_good: bool, expected: str) -> int:

@@ -1,17 +1,11 @@
-"""Parser of the command line: descriptions for every command, required options marked, colours on a terminal."""
+"""Parser of the command line: descriptions for every command, required options marked."""
 
 from __future__ import annotations
 
 import argparse
-import os
-import re
-import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-_HEADING = re.compile(r"^(\w[\w ]*:)", re.MULTILINE)
-_OPTION = re.compile(r"(?<![\w-])(--?[a-zA-Z][\w-]*)")
-_BOLD, _CYAN, _RESET = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 REQUIRED = "(required)"
 
 
@@ -63,10 +57,9 @@ class LinnaParser(argparse.ArgumentParser):
         return super().parse_known_args(*arguments, **options)
 
     def format_help(self) -> str:
-        """Return the help text, in colours if stdout is a terminal."""
+        """Return the help text."""
         self.filled()
-        text = super().format_help()
-        return colored(text) if uses_colors() else text
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         raise BadUsage(self.prog, message, self.format_usage())
@@ -113,17 +106,6 @@ def option(
     if default not in (None, "", [], False) and default == default and "default" not in help:
         help = f"{help} (default: {f'{default:g}' if isinstance(default, float) else default})".strip()
     return parser.add_argument(*flags, help=help, default=default, **words)
-
-
-def uses_colors() -> bool:
-    """True if stdout is a terminal that shows colours and the user has not switched them off."""
-    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-
-
-def colored(text: str) -> str:
-    """Return help text with bold headings and coloured options."""
-    with_options = _OPTION.sub(lambda m: f"{_CYAN}{m.group(1)}{_RESET}", text)
-    return _HEADING.sub(lambda m: f"{_BOLD}{m.group(1)}{_RESET}", with_options)
 
 
 def all_commands(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:

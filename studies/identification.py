@@ -20,8 +20,6 @@ from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
-from payload_emulator.flight.navigation import filter as kalman
-from payload_emulator.flight.navigation.identification import IdentificationParameters, identify
 from payload_emulator.flight.navigation.lost_in_space import (
     NADIR_NORTH_UP,
     LostFrame,
@@ -39,19 +37,12 @@ from tmtc.tables import CatalogueTable
 # An estimate this far from the truth is another place, not an inaccurate one: ten times the error of a good fix.
 WRONG_PLACE_M = 3_000.0
 KINDS = ("true", "all_false", "mirrored", "rotated")
-# Chi-square of 3 degrees of freedom at 1e-5: a correction beyond it is wrong, not unlucky.
-_WRONG_NEES = 25.9
 _FRAME_INTERVAL_S = 15.0
 CAMERA = PinholeCamera()
-_IDENTIFICATION = IdentificationParameters()
 ALTITUDES_M = (14e3, 50e3)
 LEAST_DETECTIONS = 6
 """True detections that a frame of a search without a prior must have."""
 
-PRIOR_M = (30.0, 1_400.0)
-"""Smallest and greatest standard deviation of a prediction, log-uniform between them."""
-
-_TRACKING_ATTITUDE_RAD = math.radians(0.01)
 _COMBINED = 4
 
 STUDY_DETECTOR = SimulatedDetector(
@@ -71,10 +62,9 @@ class StudyWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyFrame:
-    """A frame: true pose (MCMF stands in for ICRF), measured attitude, detections and the crater of each (-1: none)."""
+    """A frame: true pose (MCMF stands in for ICRF), detections and the crater of each (-1: none)."""
 
     pose: Pose
-    measured_camera_from_mcmf: FloatArray
     found: Detections
     crater: IntArray
     altitude_m: float
@@ -100,31 +90,6 @@ class LostScore:
     @property
     def correct_share(self) -> float:
         return self.correct / max(self.frames, 1)
-
-
-@dataclass(frozen=True, slots=True)
-class TrackingScore:
-    """Outcome of tracking identification over frames of one kind.
-
-    Attributes
-    ----------
-    fixed, pairs, wrong_pairs
-        Frames with a believed set; its pairs, and those of them that are wrong.
-    majority_wrong, wrong_fixes
-        Frames where half of the pairs or more are wrong; of these, those whose fix contradicts the truth (1 in 1e5).
-    findable, findable_fixed
-        Frames with at least four detections of catalogued craters, and those of them that were fixed.
-    """
-
-    kind: str
-    frames: int
-    fixed: int
-    pairs: int
-    wrong_pairs: int
-    majority_wrong: int
-    wrong_fixes: int
-    findable: int
-    findable_fixed: int
 
 
 def study_world(craters: CraterCatalogue, seed: int, name: str) -> StudyWorld:
@@ -191,7 +156,7 @@ def draw_frame(
     found = Detections(
         uv[:, 0], uv[:, 1], size, rng.uniform(0.3, 1.0, total), np.full(total, model.stated_sigma_px)
     )
-    return StudyFrame(pose, measured, found, crater.astype(np.int64), radius - MOON_RADIUS_M)
+    return StudyFrame(pose, found, crater.astype(np.int64), radius - MOON_RADIUS_M)
 
 
 def study_lost(
@@ -243,38 +208,6 @@ def _error_m(places: Sequence[Place], frames: Sequence[StudyFrame]) -> float | N
     true = [frame.pose.position_icrf_m for frame in frames]
     errors = [min(float(np.linalg.norm(one.position_mcmf_m - at)) for at in true) for one in places]
     return max(errors, default=None)
-
-
-def study_tracking(
-    world: StudyWorld,
-    frames: int,
-    seed: int,
-    *,
-    kind: str = "true",
-    model: SimulatedDetector = STUDY_DETECTOR,
-) -> TrackingScore:
-    """Return the score of identification around predictions whose error is drawn from a known sigma (log-uniform)."""
-    rng = np.random.default_rng((seed, 4, KINDS.index(kind)))
-    errors = kalman.CommonErrors(attitude_noise_rad=_TRACKING_ATTITUDE_RAD)
-    counts = dict.fromkeys(TrackingScore.__slots__[2:], 0)
-    for frame in _frames(world, frames, rng, kind, model, _TRACKING_ATTITUDE_RAD, 0):
-        sigma_m = math.exp(rng.uniform(*np.log(PRIOR_M)))
-        prior = _prior(frame, sigma_m, errors, rng)
-        findable = frame.true_detections >= 4
-        counts["findable"] += findable
-        pairs = _tracked(frame, prior, world.board, errors)
-        if pairs is None:
-            continue
-        detection, crater = pairs
-        wrong = int(np.count_nonzero(frame.crater[detection] != world.board.ids[crater]))
-        counts["fixed"] += 1
-        counts["findable_fixed"] += findable
-        counts["pairs"] += detection.size
-        counts["wrong_pairs"] += wrong
-        if 2 * wrong >= detection.size:
-            counts["majority_wrong"] += 1
-            counts["wrong_fixes"] += _contradicts_truth(frame, prior, world.board, detection, crater, errors)
-    return TrackingScore(kind, frames, **counts)
 
 
 def _frames(
@@ -350,67 +283,3 @@ def _lost_score(kind: str, rows: Sequence[tuple[float | None, float]]) -> LostSc
         float(np.median(spent)),
         float(np.max(spent)),
     )
-
-
-def _prior(
-    frame: StudyFrame, sigma_m: float, errors: kalman.CommonErrors, rng: np.random.Generator
-) -> kalman.FilterState:
-    position = frame.pose.position_icrf_m + sigma_m * rng.standard_normal(3)
-    return kalman.initial_filter_state(0, position, np.zeros(3), sigma_m, 1.0, (1e-6, 1e-6, 1e-6), errors)
-
-
-def _tracked(
-    frame: StudyFrame,
-    prior: kalman.FilterState,
-    board: LandmarkMap,
-    errors: kalman.CommonErrors,
-) -> tuple[IntArray, IntArray] | None:
-    """Return believed pairs of detections and craters (indices into the map), None without any."""
-    pose = kalman.pose_of(prior, frame.measured_camera_from_mcmf, np.eye(3))
-    altitude_m = max(float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M, 1_000.0)
-    margin_px = min(3.5 * prior.position_sigma_m / altitude_m * CAMERA.focal_px, 200.0)
-    sighting = in_view(board, pose, CAMERA, margin_px)
-    count = len(sighting)
-    if not count or not len(frame.found):
-        return None
-    design = kalman.design_matrix(sighting, prior).reshape(2 * count, prior.mean.size)
-    tilt = sighting.by_attitude.reshape(2 * count, 3) * errors.attitude_noise_rad
-    spread = (design @ prior.covariance @ design.T + tilt @ tilt.T).reshape(count, 2, count, 2)
-    scaled = sighting.by_offset * board.sigma_m[sighting.index][:, None, :]
-    result = identify(
-        frame.found,
-        sighting,
-        spread,
-        scaled @ np.swapaxes(scaled, 1, 2),
-        frame.found.sigma_px**2,
-        float(CAMERA.width_px * CAMERA.height_px),
-        _IDENTIFICATION,
-        sighting.by_position @ prior.covariance[:3, :3] @ np.swapaxes(sighting.by_position, 1, 2),
-    )
-    return (result.detection, sighting.index[result.sighted]) if result.believed else None
-
-
-def _contradicts_truth(
-    frame: StudyFrame,
-    prior: kalman.FilterState,
-    board: LandmarkMap,
-    detection: IntArray,
-    crater: IntArray,
-    errors: kalman.CommonErrors,
-) -> bool:
-    """Return whether the fix of these pairs claims what the truth rules out."""
-    updated = kalman.update(
-        prior.with_craters(crater, board.sigma_m[crater]),
-        frame.measured_camera_from_mcmf,
-        np.eye(3),
-        board,
-        crater,
-        np.stack([frame.found.u_px, frame.found.v_px], axis=1)[detection],
-        frame.found.sigma_px[detection] ** 2,
-        CAMERA,
-        errors,
-    )
-    if updated is None:
-        return False
-    error = updated.state.mean[:3] - frame.pose.position_icrf_m
-    return bool(error @ np.linalg.solve(updated.state.covariance[:3, :3], error) > _WRONG_NEES)

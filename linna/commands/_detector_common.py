@@ -1,4 +1,4 @@
-"""What the verbs of `linna detector` share: the model option, torch, files written whole."""
+"""What the verbs of `linna detector` share: the model option and torch."""
 
 from __future__ import annotations
 
@@ -66,11 +66,3 @@ def restart_for_training() -> None:
             [sys.executable, "-m", "linna", *sys.argv[1:]],
             set_environment() | {"LINNA_TRAIN_CHILD": "1"},
         )
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file in one move."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import getpass
 import os
+import signal
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -71,6 +73,14 @@ def server_of(arguments: argparse.Namespace) -> str | None:
     if arguments.home and named and not arguments.server:
         log(f"linna: warning: --home {arguments.home} is used, LINNA_SERVER={named} is not")
     return arguments.server or (None if arguments.home else named) or None
+
+
+def event_of_signals() -> threading.Event:
+    """Return an event that SIGTERM and SIGINT set."""
+    stopping = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopping.set())
+    return stopping
 
 
 def local_actor() -> str:

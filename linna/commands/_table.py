@@ -8,14 +8,11 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 from linna.commands._ground import add_operator_options, ground_client
 from linna.output import emit, finish
 from linna.parser import LinnaParser
-
-if TYPE_CHECKING:
-    pass
 
 LIMIT = 50
 HELP = {

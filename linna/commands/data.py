@@ -11,7 +11,6 @@ from linna.parser import option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-
     verbs = parser.add_subparsers(title="verbs", required=True)
     listing = verbs.add_parser("list", help="list the products: available files, size, licence, address")
     fetch = verbs.add_parser("fetch", help="download products into the data folder; resumes what broke off")

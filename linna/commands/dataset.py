@@ -1,4 +1,4 @@
-"""`linna dataset`: build, check, summarise and show detector data sets."""
+"""`linna dataset`: build and check detector data sets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ _CLASSES = ("5-10 km", "10-15 km", "15-30 km")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-
     verbs = parser.add_subparsers(title="verbs", required=True)
     build = verbs.add_parser("build", help="render frames with labels; resumes an unfinished data set")
     option(build, "recipe SCENARIO", Path, "TOML with a [dataset] table, or the name of a shipped scenario")
@@ -24,20 +23,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(build, "--bits", int, "of the PNG files", None, choices=(8, 16))
     option(build, "--renderer NAME", str, "fast (default), raymarch or cycles", None)
     finish(build, _build)
-    for name, handler, text in (
-        ("check", _check, "find missing and damaged files"),
-        ("stats", _stats, "frames by split, crater instances by class, compared with the paper"),
-    ):
-        verb = verbs.add_parser(name, help=text)
-        option(verb, "folder DIR", Path)
-        finish(verb, handler)
-    sheet = verbs.add_parser("sheet", help="a picture of frames with their labels, as the paper's Fig. 5")
-    option(sheet, "folder DIR", Path)
-    option(sheet, "--out F.png", Path, required=True)
-    option(sheet, "--split", ("train", "val", "test"), "default: all", "")
-    option(sheet, "--columns", int, "", 4)
-    option(sheet, "--rows", int, "", 2)
-    finish(sheet, _sheet)
+    check = verbs.add_parser(
+        "check", help="find missing and damaged files; frames and craters compared with the paper"
+    )
+    option(check, "folder DIR", Path)
+    finish(check, _check)
 
 
 def _build(arguments: argparse.Namespace) -> int:
@@ -92,29 +82,6 @@ def _check(arguments: argparse.Namespace) -> int:
         return 1
     figures = summarise(arguments.folder)
     return emit(arguments, figures | {"whole": True, "problems": []}, f"{_text(figures)}\nwhole")
-
-
-def _stats(arguments: argparse.Namespace) -> int:
-    from linna.output import emit
-    from payload_emulator.training.data.summary import summarise
-
-    figures = summarise(arguments.folder)
-    return emit(arguments, figures, _text(figures))
-
-
-def _sheet(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
-    from linna.output import emit
-    from payload_emulator.training.data.dataset import Dataset, write_picture
-    from payload_emulator.training.data.sheet import draw_sheet
-
-    if arguments.out.suffix.lower() != ".png":
-        raise UsageError(f"--out: expected a .png file, found {arguments.out.name}")
-    if min(arguments.columns, arguments.rows) < 1:
-        raise UsageError("--columns, --rows: expected 1 or more each")
-    picture = draw_sheet(Dataset(arguments.folder), arguments.split, arguments.columns, arguments.rows)
-    write_picture(arguments.out, picture[..., ::-1])
-    return emit(arguments, {"sheet": str(arguments.out)}, str(arguments.out))
 
 
 def _text(figures: dict[str, Any]) -> str:

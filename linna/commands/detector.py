@@ -11,7 +11,6 @@ from linna.commands._detector_common import (
     model_octets,
     need_torch,
     restart_for_training,
-    write_text,
 )
 from linna.output import finish
 from linna.parser import option
@@ -28,11 +27,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_evaluate(verbs)
     _add_compare(verbs)
     _detector_pictures.configure(verbs)
-    _add_bench_and_info(verbs)
+    _add_info(verbs)
 
 
 def _add_train(verbs: Any) -> None:
-
     train = verbs.add_parser("train", help="train a network; resumes the run of the same folder")
     option(train, "datasets DATASET", Path, nargs="+")
     option(train, "--out RUN", Path, required=True)
@@ -84,7 +82,6 @@ def _add_train(verbs: Any) -> None:
 
 
 def _add_export(verbs: Any) -> None:
-
     export = verbs.add_parser("export", help="write the ONNX network of a run, checked against torch")
     option(export, "run RUN", Path, "folder of a run, a checkpoint file, or an exported network")
     option(export, "--out M.onnx", Path, required=True)
@@ -175,25 +172,16 @@ def _add_evaluate(verbs: Any) -> None:
 
 
 def _add_compare(verbs: Any) -> None:
-
     compare = verbs.add_parser("compare", help="two networks on the same frames, with paired intervals")
     option(compare, "model M.onnx", Path, "ONNX file or name of a shipped network")
     option(compare, "reference REFERENCE.onnx", Path)
     option(compare, "--dataset DIR", Path, nargs="+", required=True)
     option(compare, "--split", ("train", "val", "test"), "", "val")
     option(compare, "--source", str, "only the frames of this source", "")
-    option(compare, "--picture F.png", Path, "draw both networks' detections on some frames", None)
     finish(compare, _compare)
 
 
-def _add_bench_and_info(verbs: Any) -> None:
-
-    bench = verbs.add_parser("bench", help="latency and memory on this machine")
-    add_model(bench)
-    option(bench, "--threads", int, "", 1)
-    option(bench, "--frames", int, "", 100)
-    finish(bench, _bench)
-
+def _add_info(verbs: Any) -> None:
     info = verbs.add_parser("info", help="what a model says of itself")
     add_model(info)
     finish(info, _info)
@@ -288,7 +276,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from linna.commands._detector_pictures import evaluate_set, refuse_options_of_sets
-    from linna.output import emit, progress
+    from linna.output import emit, progress, save
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.data.refits import load_refitted
     from payload_emulator.training.evaluate.evaluate import format_figures, open_for_evaluation, run, summary
@@ -313,33 +301,25 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         from payload_emulator.training.evaluate.report import detector_report
         from reports.render import render_html
 
+        arguments.report.parent.mkdir(parents=True, exist_ok=True)
         report = detector_report(detector, scored, figures, arguments.run)
-        write_text(arguments.report, render_html(report))
+        save(arguments.report, render_html(report).encode())
     return emit(arguments, figures, format_figures(figures))
 
 
 def _compare(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
     from payload_emulator.training.data.dataset import Dataset
-    from payload_emulator.training.evaluate.compare import compare, draw_comparison, format_comparison
+    from payload_emulator.training.evaluate.compare import compare, format_comparison
 
-    document, pair = compare(
+    document, _ = compare(
         (model_octets(arguments.model), model_octets(arguments.reference)),
         [Dataset(folder) for folder in arguments.dataset],
         arguments.split,
         arguments.source,
         lambda frames: progress(frames, len(frames), "compare", "frames"),
     )
-    if arguments.picture is not None:
-        draw_comparison(pair, arguments.picture)
     return emit(arguments, document, format_comparison(document))
-
-
-def _bench(arguments: argparse.Namespace) -> int:
-    from linna.output import emit
-    from payload_emulator.training.model.bench import bench
-
-    return emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
 
 
 def _info(arguments: argparse.Namespace) -> int:

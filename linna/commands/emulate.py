@@ -206,6 +206,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
     from linna.data import data_folder
     from linna.errors import UsageError
+    from lunar.timescales import format_utc
     from payload_emulator.session.live import LiveSession, station_names
     from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
     from payload_emulator.session.starting import launch, load_scenario_payload
@@ -254,16 +255,9 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     log(", ".join(f"{name} on {arguments.host}:{port}" for name, port in session.ports.items()))
     session.run()
     account = asdict(session.account)
-    figures = {"ports": session.ports, "utc": format_time(session.utc_ns), **account}
+    figures = {"ports": session.ports, "utc": format_utc(session.utc_ns, 0), **account}
     counted = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in account.items())
     return emit(arguments, figures, text=f"stopped at {figures['utc']}; {counted}")
-
-
-def format_time(utc_ns: int) -> str:
-    """Return a time for people, to the second."""
-    from lunar.timescales import format_utc
-
-    return format_utc(utc_ns, 0)
 
 
 def _station_ports(texts: list[str], stations: tuple[str, ...]) -> dict[str, tuple[int, int]]:

@@ -22,24 +22,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     lost = commands.add_parser(
         "lost", help="lost in space: places found from one frame or four, without a prior"
     )
-    tracking = commands.add_parser(
-        "tracking", help="identification around a prediction: wrong pairs, wrong fixes"
+    option(
+        lost,
+        "catalogue FILE",
+        str,
+        "anchoring table of `linna catalogue curate`, or a catalogue (default: the available one)",
+        nargs="?",
     )
-    for command, frames in ((lost, 300), (tracking, 10_000)):
-        option(
-            command,
-            "catalogue FILE",
-            str,
-            "anchoring table of `linna catalogue curate`, or a catalogue (default: the available one)",
-            nargs="?",
-        )
-        option(command, "--frames", int, f"default: {frames}", default=frames)
-        option(command, "--seed", int, "", 1)
-        option(command, "--recall", float, "", 0.5)
-        option(command, "--precision", float, "", 0.8)
-        option(command, "--sigma-px", float, "per axis", 1.4)
-        option(command, "--log-diameter-sigma", float, "", 0.05)
-        add_json_flag(command)
+    option(lost, "--frames", int, "", 300)
+    option(lost, "--seed", int, "", 1)
+    option(lost, "--recall", float, "", 0.5)
+    option(lost, "--precision", float, "", 0.8)
+    option(lost, "--sigma-px", float, "per axis", 1.4)
+    option(lost, "--log-diameter-sigma", float, "", 0.05)
+    add_json_flag(lost)
     option(lost, "--attitude-deg", float, "error of nadir and heading, 1 sigma per axis", 0.5)
     option(lost, "--sets", int, "sets of four frames (default: a third of the frames)")
     rendered = lost.add_argument_group("rendered", "frames along a scenario and the detector that flies")
@@ -58,7 +54,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "search each frame also with its detections mirrored, turned and scattered: each fix is wrong",
     )
     lost.set_defaults(handler=run_lost)
-    tracking.set_defaults(handler=run_tracking)
 
 
 def run_lost(arguments: argparse.Namespace) -> int:
@@ -111,46 +106,6 @@ def run_lost(arguments: argparse.Namespace) -> int:
             f"{score.kind:<12}{score.frames:>9}{score.correct:>9}{score.wrong:>7}{none:>8}"
             f"{score.median_error_m:>9.0f}{score.p95_error_m:>7.0f}{score.median_cpu_s:>7.2f}"
         )
-    return emit(
-        arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"])
-    )
-
-
-def run_tracking(arguments: argparse.Namespace) -> int:
-    from studies.identification import KINDS, study_tracking
-
-    model = _model(arguments)
-    world = _world(arguments)
-    hostile = max(arguments.frames // 10, 1)
-    scores = []
-    for kind in KINDS:
-        frames = arguments.frames - 3 * hostile if kind == "true" else hostile
-        log(f"{frames} frames, {kind}")
-        scores.append(study_tracking(world, max(frames, 1), arguments.seed, kind=kind, model=model))
-    pairs = sum(score.pairs for score in scores)
-    figures: dict[str, Any] = {
-        "frames": sum(score.frames for score in scores),
-        "wrong_association_share": sum(score.wrong_pairs for score in scores) / max(pairs, 1),
-        "wrong_fixes": sum(score.wrong_fixes for score in scores),
-        "majority_wrong": sum(score.majority_wrong for score in scores),
-        "fixed_of_four_or_more": scores[0].findable_fixed / max(scores[0].findable, 1),
-        "scores": [asdict(score) for score in scores],
-        "craters": len(world.board),
-        "prior_sigma_m": [30.0, 1400.0],
-        **_provenance(arguments, world.name, model),
-    }
-    lines = [
-        f"{'frames':<12}{'count':>7}{'fixed':>7}{'pairs':>8}{'wrong':>7}{'majority wrong':>16}{'wrong fixes':>13}"
-    ]
-    lines += [
-        f"{score.kind:<12}{score.frames:>7}{score.fixed:>7}{score.pairs:>8}{score.wrong_pairs:>7}"
-        f"{score.majority_wrong:>16}{score.wrong_fixes:>13}"
-        for score in scores
-    ]
-    lines.append(
-        f"wrong associations {100 * figures['wrong_association_share']:.2f} %; "
-        f"{100 * figures['fixed_of_four_or_more']:.1f} % of frames with four findable craters fixed"
-    )
     return emit(
         arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"])
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_service_options, open_ground_only, settings_of
+from linna.commands._ground import add_service_options, event_of_signals, open_ground_only, settings_of
 from linna.commands._table import Command, Commands, Hand, Option, add_commands
 from linna.output import emit, finish, log
 from linna.parser import option
@@ -137,16 +137,13 @@ def _configure_run(parser: LinnaParser) -> None:
 
 
 def operate(arguments: argparse.Namespace) -> int:
-    import signal
-    import threading
-
     from ground_service.links.service import declared_links
     from ground_service.links.supervisor import LinkSupervisor
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
     from linna.errors import UsageError
 
-    stopping = threading.Event()
+    stopping = event_of_signals()
     with open_ground_only(arguments) as ground:
         dispatcher = dispatcher_for(ground, settings_of(arguments))
         follow_in_process(ground, dispatcher.start)
@@ -157,12 +154,9 @@ def operate(arguments: argparse.Namespace) -> int:
                 f"{unknown[0]}: expected a link of a mission description, found none of this name"
             )
         supervisor = LinkSupervisor(ground, names or None)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stopping.set())
         supervisor.start()
         log(f"links: {', '.join(sorted(names)) or 'all'}")
-        while not stopping.wait(0.5):
-            pass
+        stopping.wait()
         supervisor.stop()
         dispatcher.close()
     return 0

@@ -331,17 +331,14 @@ def _build(arguments: argparse.Namespace) -> int:
         with ground_client(arguments) as service:
             build = _registered(service, arguments.file)
         figures = build.model_dump(mode="json", include={"digest", "name", "version"})
-        return emit(arguments, figures, text=_title(build))
+        parts = (build.name, build.version, f"({build.digest[:12]})")
+        return emit(arguments, figures, text=" ".join(filter(None, parts)))
     with ground_client(arguments) as service:
         builds = list(service.list_builds())
     shown = {"digest", "name", "version", "kind", "provenance"}
     lines = [f"{one.digest[:16]}  {one.kind:<8} {one.name} {one.version}".rstrip() for one in builds]
     rows = [one.model_dump(mode="json", include=shown) for one in builds]
     return emit(arguments, {"builds": rows}, text="\n".join(lines) or "no build is registered")
-
-
-def _title(build: Build) -> str:
-    return " ".join(part for part in (build.name, build.version, f"({build.digest[:12]})") if part)
 
 
 def _registered(service: Client, given: str) -> Build:

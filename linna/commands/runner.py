@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from linna.commands._ground import event_of_signals
 from linna.output import checked
 from linna.parser import option
 
@@ -18,8 +19,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     import logging.config
-    import signal
-    import threading
 
     from ground_service.logs import logging_config
     from ground_service.regression.runner import alive, runner_mode, serve_exchange
@@ -35,11 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.check:
             return checked(alive(exchange), f"a runner that serves {exchange}")
         logging.config.dictConfig(logging_config(settings.log_format))
-        stopping = threading.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: stopping.set())
         print(f"builds are isolated by: {runner_mode(exchange)}", flush=True)
-        serve_exchange(exchange, jobs=arguments.jobs, stopping=stopping)
+        serve_exchange(exchange, jobs=arguments.jobs, stopping=event_of_signals())
     except SandboxRefused as error:
         raise UsageError(str(error)) from None
     return 0

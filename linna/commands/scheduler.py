@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from linna.commands._ground import add_service_options, settings_of
+from linna.commands._ground import add_service_options, event_of_signals, settings_of
 from linna.output import checked
 from linna.parser import option
 
@@ -21,8 +21,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     import logging.config
-    import signal
-    import threading
 
     from ground_service.ground import ground_from_settings
     from ground_service.logs import logging_config
@@ -37,9 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.check:
             return checked(has_scheduler(ground), "a process with the lease of the recurring work")
         logging.config.dictConfig(logging_config(settings.log_format))
-        stopping = threading.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: stopping.set())
+        stopping = event_of_signals()
         dispatcher = dispatcher_for(ground, settings)
         follow_up = follow_in_process(ground, dispatcher.start)
         try:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linna.output import emit, finish
+from linna.output import emit, finish, save
 from linna.parser import option
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _write(
     if arguments.out is None:
         sys.stdout.buffer.write(octets)
         return 0
-    _save(arguments.out, octets)
+    save(arguments.out, octets)
     figures = {**figures, "written": count, "out": str(arguments.out)}
     return emit(arguments, figures, text=f"{count} packets written to {arguments.out}\n{text}")
 
@@ -154,7 +154,7 @@ def _document(arguments: argparse.Namespace, text: str) -> int:
     figures = {"dictionary_version": DICTIONARY.version, "dictionary_hash": DICTIONARY.hash}
     if arguments.out is None:
         return emit(arguments, {**figures, "text": text}, text=text.rstrip("\n"))
-    _save(arguments.out, text.encode())
+    save(arguments.out, text.encode())
     return emit(arguments, {**figures, "out": str(arguments.out)}, text=f"written to {arguments.out}")
 
 
@@ -214,16 +214,6 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
             f"{arguments.file}: expected CADUs or space packets, found none in its {len(octets)} octets"
         )
     return decoded
-
-
-def _save(path: Path, octets: bytes) -> None:
-    """Write all or nothing."""
-    unfinished = path.with_name(path.name + ".unfinished")
-    try:
-        unfinished.write_bytes(octets)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _describe_verdicts(found: XtceDecode) -> str:

@@ -11,7 +11,6 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.datafolder import DataFolder, default_gravity, default_orientation
 from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, EphemerisSegment
-from lunar.errors import ImpactError
 from lunar.frames import IauOrientation, Orientation, mci_from_icrf
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
@@ -135,16 +134,6 @@ def propagate_from(
     else:
         trajectory = propagate(epoch_tdb_s, state[:3], state[3:], duration_s, model, integrator=integrator)
     return ScenarioOrbit(trajectory, maneuvers, model, epoch_utc_ns)
-
-
-def free_impact(scenario: Scenario, model: ForceModel, duration_s: float) -> ImpactError | None:
-    """Return place and time of the impact without burns; None without an impact within the span."""
-    state = initial_state_icrf(scenario, model.gm_m3_s2)
-    try:
-        propagate(tdb_s_from_utc_ns(scenario.epoch_utc_ns), state[:3], state[3:], duration_s, model)
-    except ImpactError as impact:
-        return impact
-    return None
 
 
 def sample(

@@ -64,7 +64,7 @@ def test_a_downlink_without_a_map_has_none(tmp_path: Path, capsys: pytest.Captur
     assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
 
 
-def test_tracking_identification_is_measured_on_an_anchoring_table(
+def test_places_without_a_prior_are_measured_on_an_anchoring_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(3)
@@ -79,11 +79,11 @@ def test_tracking_identification_is_measured_on_an_anchoring_table(
         np.full((count, 3), 80.0),
     )
     path.write_bytes(pack_catalogue_table(table))
-    assert run(["identify", "tracking", str(path), "--frames", "60", "--json"]) == 0
+    assert run(["identify", "lost", str(path), "--frames", "3", "--sets", "1", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["craters"] == count
-    assert figures["frames"] == 60
-    assert figures["wrong_fixes"] == 0
+    assert figures["searches"] == 3 + 3 * 1 + 1
+    assert figures["wrong"] == 0
     assert figures["level"].startswith("level 1-2")
 
 
@@ -127,7 +127,7 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
         (["catalogue", "register", "none.csv"], "--terrain: expected height rasters"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
-        (["identify", "tracking", "--recall", "2"], "--recall"),
+        (["identify", "lost", "--recall", "2"], "--recall"),
         (["identify", "lost", "--frames", "0"], "--frames"),
         (["identify", "lost", "--hostile"], "--hostile: expected --scenario"),
     ],
@@ -149,5 +149,5 @@ def test_a_damaged_anchoring_table_is_refused(tmp_path: Path, capsys: pytest.Cap
         CatalogueTable(np.arange(3), 0.1 * one, 0.1 * one, 5e3 * one, one, np.ones((3, 3)))
     )
     path.write_bytes(octets[:-1] + bytes([octets[-1] ^ 1]))
-    assert run(["identify", "tracking", str(path), "--frames", "5"]) == 2
+    assert run(["identify", "lost", str(path), "--frames", "5"]) == 2
     assert "CRC-32" in capsys.readouterr().err

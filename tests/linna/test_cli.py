@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from linna import cli, completion
-from linna.parser import REQUIRED, LinnaParser, all_commands
+from linna.parser import REQUIRED, all_commands
 from payload_emulator.errors import install_hint
 from payload_emulator.session.recipe import load_recipe, procedural_recipe
 from payload_emulator.session.scenario import load_scenario
@@ -83,18 +83,6 @@ def test_errors_are_a_json_object_with_json(capsys: pytest.CaptureFixture[str]) 
     assert "no such scenario file" in json.loads(capsys.readouterr().out)["error"]
     assert cli.run(["plan", "add"]) == 2
     assert capsys.readouterr().out == ""
-
-
-def test_help_is_colored_only_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    parser = LinnaParser(prog="linna test")
-    parser.add_argument("--out", required=True, help="folder")
-    assert "\x1b[" not in parser.format_help()
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    assert "\x1b[36m--out\x1b[0m" in parser.format_help()
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert "\x1b[" not in parser.format_help()
 
 
 def completions(line: str, tmp_path: Path) -> set[str]:

@@ -1,4 +1,4 @@
-"""The commands on ephemerides, catalogues and the field of view as users run them."""
+"""The commands on ephemerides as users run them."""
 
 import json
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from linna import cli
-from lunar.catalogue import PAPER_CLASS_COUNTS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
 from lunar.messages.oem import save_oem
@@ -56,55 +55,12 @@ def error_line(capsys, *arguments):
 def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys):
     other = tmp_path / "orbit.e"
     other.write_text(format_stk(orbit(radius_m=1_768_190.0)))
-    plot = tmp_path / "difference.png"
-    figures = run_json(capsys, "orbit", "compare", oem_path, other, "--plot", plot)
+    figures = run_json(capsys, "orbit", "compare", oem_path, other)
     assert figures["samples"] == 48 * 60 + 1
     assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)
     assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
-    assert plot.read_bytes().startswith(b"\x89PNG")
     assert cli.run(["orbit", "compare", str(oem_path), str(other), "--step", "3600"]) == 0
     assert capsys.readouterr().out.startswith("49 epochs from 2029-08-07T00:00:00.000Z")
-
-
-def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, capsys):
-    epochs = tmp_path / "epochs.txt"
-    epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
-    figures = run_json(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
-    first, second = figures["states"]
-    assert set(first) == {
-        *("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km"),
-    }
-    assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
-    assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
-    assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
-    assert abs(first["latitude_deg"]) < 0.1
-    assert cli.run(["orbit", "interpolate", str(oem_path), "--epochs", str(epochs)]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 3
-
-
-def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(
-    oem_path, tmp_path, capsys
-):
-    epochs = tmp_path / "epochs.txt"
-    epochs.write_text("2029-09-07T00:00:00Z\n")
-    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
-    assert "found 2029-09-07T00:00:00.000Z; nothing is extrapolated" in line
-    epochs.write_text("2029-08-07T00:00:00Z\nnoon\n")
-    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
-    assert "epochs.txt: line 2: expected a UTC epoch" in line and line.endswith("found 'noon'")
-    epochs.write_text("# none\n")
-    assert "at least one UTC epoch" in error_line(
-        capsys, "orbit", "interpolate", oem_path, "--epochs", epochs
-    )
-
-
-def test_stats_summarise_an_ephemeris_and_draw_it(oem_path, tmp_path, capsys):
-    plot = tmp_path / "altitude.svg"
-    figures = run_json(capsys, "orbit", "stats", oem_path, "--plot", plot)
-    assert figures["altitude_km"] == pytest.approx({"mean": 30.78, "min": 30.78, "max": 30.78}, abs=1e-6)
-    assert figures["period_min"] == pytest.approx(111.2, abs=0.01)
-    assert figures["orientation"] == "IAU WGCCRE 2009"
-    assert "<svg" in plot.read_text()
 
 
 @pytest.mark.parametrize("ending", [".oem", ".xml", ".e", ".csv", ".tum"])
@@ -136,70 +92,10 @@ def test_a_conversion_to_an_unknown_format_is_one_line(oem_path, tmp_path, capsy
     assert "expected a name ending in .oem, .xml, .bsp, .e, .csv, .tum, found 'orbit.json'" in line
 
 
-@pytest.mark.parametrize("command", [("orbit", "stats"), ("orbit", "compare")])
-def test_a_file_cut_short_is_one_line(oem_path, tmp_path, capsys, command):
+def test_a_file_cut_short_is_one_line(oem_path, tmp_path, capsys):
     cut = tmp_path / "cut.oem"
     cut.write_text(oem_path.read_text()[:2000])
-    files = [cut] if command[1] == "stats" else [cut, oem_path]
-    assert "cut.oem: line" in error_line(capsys, *command, *files)
-
-
-def test_a_plot_of_an_unknown_kind_is_one_line(oem_path, tmp_path, capsys):
-    line = error_line(capsys, "orbit", "stats", oem_path, "--plot", tmp_path / "altitude.bmp")
-    assert "expected a picture name ending in .png, .svg, .pdf" in line
-    assert not (tmp_path / "altitude.bmp").exists()
-
-
-def test_catalogue_stats_counts_the_classes_of_the_papers_density(tmp_path, capsys):
-    plot = tmp_path / "classes.pdf"
-    figures = run_json(capsys, "catalogue", "stats", "paper-density", "--plot", plot)
-    assert figures["class_counts"] == list(PAPER_CLASS_COUNTS)
-    assert figures["total"] == sum(PAPER_CLASS_COUNTS)
-    assert figures["source"].startswith("synthetic")
-    assert plot.read_bytes().startswith(b"%PDF")
-
-
-def test_catalogue_stats_of_a_faulty_file_is_one_line(tmp_path, capsys):
-    path = tmp_path / "faulty.csv"
-    path.write_text("lat,lon,diam\n1,2,three\n")
-    assert "faulty.csv: line 2, column diam: expected a number" in error_line(
-        capsys, "catalogue", "stats", path
-    )
-
-
-@pytest.mark.real_data
-def test_catalogue_stats_of_the_real_catalogue(data_path, capsys):
-    figures = run_json(capsys, "catalogue", "stats", data_path / "craters/lu1319381_ge2km.csv.gz")
-    assert figures["class_counts"] == [30_494, 6_677, 3_983]
-
-
-def test_the_fov_study_draws_its_curves_and_gives_the_keys(oem_path, tmp_path, capsys):
-    plot = tmp_path / "fov.png"
-    figures = run_json(
-        capsys, "camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density", "--plot", plot
-    )
-    assert figures["fov_deg"] == list(range(10, 161, 10))
-    assert set(figures["probability_at_least"]) == {"1", "3", "5"}
-    assert all(len(values) == 16 for values in figures["probability_at_least"].values())
-    enough = [p > 0.9 for p in figures["probability_at_least"]["3"]]
-    assert figures["selected_fov_deg"] == figures["fov_deg"][enough.index(True)]
-    assert plot.stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        (("--fov-step", "0"), "--fov-step: expected"),
-        (("--threshold", "1.5"), "--threshold: expected"),
-        (("--needed", "0"), "--needed: expected"),
-        (("--step", "-1"), "--step: expected"),
-    ],
-)
-def test_the_fov_study_refuses_what_makes_no_sense(oem_path, capsys, option, message):
-    line = error_line(
-        capsys, "camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density", *option
-    )
-    assert message in line
+    assert "cut.oem: line" in error_line(capsys, "orbit", "compare", cut, oem_path)
 
 
 def test_visibility_lists_eclipses_and_the_contacts_of_a_station(oem_path, capsys):

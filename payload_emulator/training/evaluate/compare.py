@@ -1,23 +1,17 @@
-"""Two networks on the same frames: figures of each, paired differences with intervals, and a picture of both."""
+"""Two networks on the same frames: figures of each, paired differences with intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lunar.arrays import FloatArray, OctetArray
-from payload_emulator.training.data.dataset import Dataset, write_picture
+from payload_emulator.training.data.dataset import Dataset
 from payload_emulator.training.data.visibility import VISIBLE
 from payload_emulator.training.evaluate.evaluate import Scored, evidence_level, open_for_evaluation, run
 from payload_emulator.training.evaluate.metrics import score
 from payload_emulator.training.evaluate.scoring import Tally, bootstrap_f1, bootstrap_f1_difference, tally
 
 _RANGES_M = {"5_to_30_km": (5_000.0, 30_000.0), "3_to_30_km": (3_000.0, 30_000.0)}
-_FOUND, _FALSE, _MISSED = (90, 220, 90), (80, 80, 255), (60, 210, 255)  # blue, green, red
-_GAP_PX = 6
 
 
 def compare(
@@ -116,54 +110,3 @@ def format_comparison(document: dict[str, Any]) -> str:
             f"rms of error over sigma {sigma['rms']:.2f}, inside one sigma {sigma['inside_one_sigma']:.2f}"
         )
     return "\n".join(lines)
-
-
-def draw_comparison(pair: tuple[Scored, Scored], path: Path, frames: int = 3) -> None:
-    """A picture: a row for each of some frames spread over the set, reference at the left, network at the right.
-
-    Circles of 3 to 30 km: green a detection of a catalogued crater, red one of none, yellow a visible crater not found.
-    """
-    one, other = pair
-    chosen = np.unique(np.linspace(0, len(one.frames) - 1, frames + 2).astype(int)[1:-1])
-    rows = [
-        np.concatenate([_drawn(other, int(k)), _gap(one, int(k)), _drawn(one, int(k))], axis=1)
-        for k in chosen
-    ]
-    write_picture(
-        path, np.concatenate([part for row in rows for part in (row, row[:_GAP_PX] * 0 + 255)][:-1])
-    )
-
-
-def _gap(scored: Scored, k: int) -> OctetArray:
-    return np.full((scored.truths[k].height_px, _GAP_PX, 3), 255, np.uint8)
-
-
-def _drawn(scored: Scored, k: int) -> OctetArray:
-    import cv2
-
-    dataset, frame = scored.frames[k]
-    truth, found = scored.truths[k], scored.found[k]
-    image = np.repeat(dataset.gray(frame)[..., None], 3, axis=2)
-    tallied = tally([truth], [found], low_m=3_000.0)
-    kept = (found.diameter_m >= 3_000.0) & (found.diameter_m <= 30_000.0)
-    threshold = scored.thresholds.on_board
-
-    def circle(u: float, v: float, diameter: float, colour: tuple[int, int, int]) -> None:
-        cv2.circle(image, (round(u), round(v)), max(2, round(0.5 * diameter)), colour, 1, cv2.LINE_AA)
-
-    with np.errstate(invalid="ignore"):
-        missed = ~(tallied.crater_score >= threshold) & (tallied.crater_visibility >= VISIBLE)
-    for u, v, diameter in _columns(tallied.crater_u, tallied.crater_v, tallied.crater_diameter_px, missed):
-        circle(u, v, diameter, _MISSED)
-    diameter_px = found.diameter_px[kept]
-    for outcome, colour in ((0, _FALSE), (1, _FOUND)):
-        which = (tallied.score >= threshold) & (tallied.outcome == outcome)
-        for u, v, diameter in _columns(tallied.detection_u, tallied.detection_v, diameter_px, which):
-            circle(u, v, diameter, colour)
-    return image
-
-
-def _columns(
-    u: FloatArray, v: FloatArray, diameter: FloatArray, which: Any
-) -> Iterable[tuple[float, float, float]]:
-    return zip(u[which].tolist(), v[which].tolist(), diameter[which].tolist(), strict=True)

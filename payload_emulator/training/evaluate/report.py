@@ -97,7 +97,7 @@ def detector_report(
         },
         remarks=_remarks(figures),
         not_available={
-            "cost": "latency depends on the machine: `linna detector bench` measures it",
+            "cost": "latency depends on the machine: `python -m benchmarks detector` measures it",
             **({"training": "no training run was given"} if run is None else {}),
         },
     )
