@@ -146,8 +146,7 @@ def work(service: Deployment, token: str, seconds: float) -> None:
         for turn, piece in enumerate(pieces * 100):
             if time.monotonic() > until:
                 break
-            path = f"/telemetry?spacecraft_id=76&stream=downlink&offset={piece.offset}"
-            client.post(path, content=piece.octets).raise_for_status()
+            client.post(f"/telemetry?spacecraft_id=76&{piece.place}", content=piece.octets).raise_for_status()
             client.get(READS[turn % len(READS)])
             if turn % 20 == 0:
                 client.post("/passes/1/reports")

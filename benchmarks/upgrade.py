@@ -238,7 +238,7 @@ class Load:
                 else:
                     with self._lock:
                         piece = next(self._pieces)
-                    path = f"/telemetry?spacecraft_id=76&stream=downlink&offset={piece.offset}"
+                    path = f"/telemetry?spacecraft_id=76&{piece.place}"
                     answer = client.post(path, content=piece.octets)
             except httpx.HTTPError as error:
                 with self._lock:

@@ -45,11 +45,16 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Octets of a downlink with their position."""
+    """Octets of a downlink, and their offset in it."""
 
     name: str
     octets: bytes
     offset: int
+
+    @property
+    def place(self) -> str:
+        """Parameters of the upload that state recording and offset."""
+        return f"stream=downlink&offset={self.offset}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +144,7 @@ class Client(threading.Thread):
             yield self._rng.choices(every, (3, 4, 2, 1))[0]
 
     def _upload(self, piece: Piece) -> None:
-        path = f"/telemetry?spacecraft_id={self._spacecraft}"
-        path += f"&stream=downlink&offset={piece.offset}"
+        path = f"/telemetry?spacecraft_id={self._spacecraft}&{piece.place}"
         answer = self._session.ask("POST", path, piece.octets, piece.name)
         if answer.status != 202:
             raise SystemExit(f"POST {path}: {answer.status} {answer.body[:300]!r}")
@@ -210,7 +214,7 @@ class Client(threading.Thread):
 
 
 def cut_pieces(stream: bytes, pieces: int, rng: random.Random, name: str) -> list[Piece]:
-    """Return a stream cut at random octets, in random order; each piece states its position."""
+    """Return a stream cut at random octets, in random order."""
     places = sorted(rng.sample(range(1, len(stream)), pieces - 1))
     made = [
         Piece(f"{name} {start}", stream[start:stop], start)

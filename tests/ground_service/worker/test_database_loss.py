@@ -51,7 +51,7 @@ def test_uploads_and_jobs_go_on_after_the_server_was_killed_and_came_back(tmp_pa
 
         def upload() -> None:
             for piece in cut_pieces(stream, PIECES, random.Random(5), "piece"):
-                path = f"/telemetry?spacecraft_id=76&stream=downlink&offset={piece.name.split()[1]}"
+                path = f"/telemetry?spacecraft_id=76&{piece.place}"
                 answer = session.ask("POST", path, piece.octets, piece.name)
                 if answer.status != 202:
                     broken.append(answer.body)
