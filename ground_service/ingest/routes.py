@@ -45,7 +45,7 @@ async def upload_telemetry(
             min_length=1,
             max_length=200,
             pattern=r"^[^\x00-\x1f\x7f]*$",
-            description="Stream to which the octets belong; requires `offset`",
+            description="Recording to which the octets belong; requires `offset`",
         ),
     ] = None,
     offset: Annotated[
@@ -70,8 +70,8 @@ async def upload_telemetry(
 ) -> IngestAccepted:
     """Ingest a downlink, or a piece of one cut at any octet.
 
-    A downlink is a stream of CADUs or of space packets. Pieces are joined by `stream` and `offset` if given, otherwise
-    by order of arrival and by content.
+    A downlink is a stream of CADUs or of space packets. A piece states its recording, one reception of one station, as
+    `stream`, and its `offset` in it; octets without them are a whole recording.
     """
     if (stream is None) != (offset is None):
         raise InvalidInput("telemetry", "stream, offset", "both or neither", "one of them")
