@@ -1,8 +1,9 @@
-"""TOML files read as pydantic models: each fault is one line with its place, what was expected and what was found."""
+"""TOML and JSON of others: each fault is one line with its place, what was expected and what was found."""
 
 from __future__ import annotations
 
 import difflib
+import json
 import tomllib
 from collections.abc import Sequence
 from typing import Any, TypeVar, get_args
@@ -24,8 +25,31 @@ def read_table(text: str | bytes, source: str, what: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(text.decode("utf-8") if isinstance(text, bytes) else text)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InvalidInput(source, "", what, str(error)) from None
+    except (ValueError, RecursionError) as error:
+        raise InvalidInput(source, "", what, _met(error)) from None
+
+
+def read_json(octets: str | bytes, source: str, what: str = "JSON", limit_octets: int = 16 << 20) -> Any:
+    """Return the value of a JSON text.
+
+    Raises
+    ------
+    InvalidInput
+        The text is too long or not JSON; `what` names the expected content.
+    """
+    if len(octets) > limit_octets:
+        raise InvalidInput(source, "", f"at most {limit_octets} octets", str(len(octets)))
+    try:
+        return json.loads(octets)
+    except (ValueError, RecursionError) as error:
+        raise InvalidInput(source, "", what, _met(error)) from None
+
+
+def _met(error: Exception) -> str:
+    """Return why a reader gave up."""
+    if isinstance(error, RecursionError):
+        return "brackets that are nested too deeply"
+    return "a number with too many digits" if "int_max_str_digits" in str(error) else str(error)
 
 
 def parse_table(kind: type[Model], table: Any, source: str) -> Model:

@@ -26,27 +26,30 @@ def read_expanded(path: Path | str, expected: str, limit_octets: int = EXPANDED_
         If the file cannot be read, the compression is damaged, or the expanded file is larger than the limit.
     """
     try:
-        octets = Path(path).read_bytes()
+        with Path(path).open("rb") as stream:
+            octets = stream.read(limit_octets + 1)
     except OSError as error:
         raise DataFileError(path, "", expected, error.strerror or str(error)) from None
-    if octets.startswith(_GZIP):
-        return _gunzipped(octets, path, limit_octets)
-    if octets.startswith(_ZIP):
-        return _unzipped(octets, path, limit_octets)
+    for mark, expanded in ((_GZIP, _gunzipped), (_ZIP, _unzipped)):
+        if octets.startswith(mark) and len(octets) <= limit_octets:
+            octets = expanded(octets, path, limit_octets)
+            break
+    if len(octets) > limit_octets:
+        raise DataFileError(path, "", f"at most {limit_octets >> 20} MiB when expanded", "more")
     return octets
+
+
+# Both read no more than one octet above the limit, whatever size the archive states.
 
 
 def _gunzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(octets)) as stream:
-            expanded = stream.read(limit_octets + 1)
+            return stream.read(limit_octets + 1)
     except EOFError:
         raise DataFileError(path, "", "a complete gzip file", "one that is cut short") from None
     except (OSError, zlib.error) as error:
         raise DataFileError(path, "", "a gzip file", f"damaged data ({error})") from None
-    if len(expanded) > limit_octets:
-        raise _too_large(path, limit_octets)
-    return expanded
 
 
 def _unzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
@@ -56,14 +59,6 @@ def _unzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
             if len(files) != 1:
                 raise DataFileError(path, "", "a zip archive of one file", f"{len(files)} files")
             with archive.open(files[0]) as stream:
-                # Read no more than the limit, whatever size the archive states.
-                expanded = stream.read(limit_octets + 1)
+                return stream.read(limit_octets + 1)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise DataFileError(path, "", "a zip archive", f"damaged data ({error})") from None
-    if len(expanded) > limit_octets:
-        raise _too_large(path, limit_octets)
-    return expanded
-
-
-def _too_large(path: Path | str, limit_octets: int) -> DataFileError:
-    return DataFileError(path, "", f"at most {limit_octets >> 20} MiB when expanded", "more")

@@ -232,6 +232,25 @@ def test_compiled_functions_use_no_linear_algebra_of_numba_which_asks_for_scipy(
     assert asking == []
 
 
+UNSAFE = re.compile(
+    r"\bimport (?:pickle|marshal|shelve|dill)\b|from (?:pickle|marshal|shelve) |weights_only=False|allow_pickle=True"
+    r"|yaml\.(?:unsafe_)?load\(|torch\.load\((?!.*weights_only=True)"
+)
+
+
+def test_no_module_reads_data_that_can_name_code() -> None:
+    """Except the cache of compiled functions, whose files are machine code of the same user."""
+    found = [
+        f"{name}: {line.strip()}"
+        for name, file in modules_of(ROOT).items()
+        for line in file.read_text(encoding="utf-8").splitlines()
+        if UNSAFE.search(line) and name != "kernels.compiled"
+    ]
+    assert found == []
+    assert UNSAFE.search("stored = torch.load(path, map_location=device)")
+
+
+
 LONGEST_FUNCTION = 80
 
 

@@ -37,7 +37,7 @@ def parse_dictionary(text: str, source: str = "dictionary") -> Dictionary:
             tuple(_definition(item) for item in content["telemetry"]),
             tuple(_definition(item) for item in content["telecommands"]),
         )
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise MalformedPacket(
             f"{source}: expected a packet dictionary, found something else ({error})"
         ) from None

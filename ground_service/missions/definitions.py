@@ -7,7 +7,6 @@ import binascii
 import gzip
 import hashlib
 import json
-import tomllib
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pathlib import Path
 
 from ground_service.errors import InvalidInput
 from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketSource, format_toml
+from ground_service.toml import read_table
 from tmtc.errors import DefinitionError
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
@@ -119,8 +119,8 @@ def embed_documents(text: str, folder: Path, source: str) -> str:
         A file is not readable or not text.
     """
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
+        table = read_table(text, source, "TOML")
+    except InvalidInput:
         return text
     packets = table.get("packets")
     named = False

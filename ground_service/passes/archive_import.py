@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import SPACECRAFT_ID_MAX, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.recorrelation import enter_receptions, read_receptions
+from ground_service.toml import read_json
 from lunar.catalogue import load_catalogue
 from lunar.errors import LunarError
 from lunar.messages.ephemeris_files import load_ephemeris
@@ -35,7 +35,6 @@ SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"
 MISSION_FILE = "mission.toml"
 MANIFEST_FILE = "manifest.json"
-MANIFEST_LIMIT_OCTETS = 16 << 20
 
 FRAMES_KEPT = 200
 """Images kept with a pass, spread evenly: galleries need a few, and a day of them would fill the archive."""
@@ -48,6 +47,14 @@ _REQUIRED: dict[str, type | tuple[type, ...]] = {
     "stop_utc": str,
     "files": dict,
 }
+_NUMBERS = {
+    "cadence_s": (0.0, 86_400.0),
+    "frames_expected": (0, 10_000_000),
+    "camera.width_px": (1, 16_384),
+    "camera.height_px": (1, 16_384),
+    "camera.fov_deg": (0.0, 180.0),
+}
+"""Least and greatest value of what a manifest may state; NaN is neither."""
 
 
 def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None] | None = None) -> int:
@@ -71,6 +78,7 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
         if name in names:
             _refuse_unreadable(folder / name, load)
+    receptions = read_receptions(folder / RECEPTIONS_FILE) if RECEPTIONS_FILE in names else None
     attitudes = attitude_file(names, str(folder))
     if attitudes is not None:
         load_attitudes(folder / attitudes, str(folder / attitudes))
@@ -81,12 +89,12 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     pass_id = _register(
         ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text)
     )
-    if RECEPTIONS_FILE in stored:
+    if receptions is not None:
         enter_receptions(
             ground,
             int(manifest["spacecraft_id"]),
             instance_of(manifest, digest),
-            read_receptions(folder / RECEPTIONS_FILE),
+            receptions,
             actor="archive",
         )
     if "downlink.cadu" in stored:
@@ -118,13 +126,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         raise InvalidInput(str(folder), "", "a pass archive with manifest.json", "no manifest.json") from None
     except OSError as error:
         raise storage_error(error, path) from None
-    if len(octets) > MANIFEST_LIMIT_OCTETS:
-        raise InvalidInput(str(path), "", f"at most {MANIFEST_LIMIT_OCTETS} octets", str(len(octets)))
-    try:
-        manifest = json.loads(octets)
-    except (ValueError, RecursionError) as error:
-        place = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
-        raise InvalidInput(str(path), place, "JSON", "something else") from None
+    manifest = read_json(octets, str(path))
     if not isinstance(manifest, dict):
         raise InvalidInput(str(path), "", "a JSON object", type(manifest).__name__)
     for key, kind in _REQUIRED.items():
@@ -138,6 +140,12 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             f"{SCHEMA_VERSION} or less",
             f"{manifest['schema_version']} of a newer version",
         )
+    for place, (least, most) in _NUMBERS.items():
+        section, _, key = place.rpartition(".")
+        table = manifest.get(section) if section else manifest
+        value = table.get(key) if isinstance(table, dict) else None
+        if value is not None and not (isinstance(value, int | float) and least <= value <= most):
+            raise InvalidInput(str(path), place, f"a number from {least} to {most}", repr(value)[:40])
     require_line(manifest["pass_name"], str(path), "pass_name")
     if not 0 <= manifest["spacecraft_id"] <= SPACECRAFT_ID_MAX:
         found = str(manifest["spacecraft_id"])[:40]
@@ -167,6 +175,9 @@ def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
             )
         if not path.is_file():
             raise InvalidInput(str(folder), name, "a file of the archive", "nothing there")
+        size = path.stat().st_size
+        if entry.get("bytes", size) != size:
+            raise InvalidInput(str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size))
         found = _sha256(path)
         if found != entry["sha256"]:
             raise InvalidInput(

@@ -11,7 +11,6 @@ import logging
 import shutil
 import struct
 import tempfile
-import tomllib
 import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -42,6 +41,7 @@ from ground_service.store.files import (
     replace_durably,
     unfinished_prefix,
 )
+from ground_service.toml import read_json, read_table
 
 _log = logging.getLogger(__name__)
 
@@ -220,8 +220,9 @@ def write_flight_view(archive: Path, folder: Path) -> None:
 def coding_of(manifest: dict[str, Any]) -> str:
     """Coding of the downlink of a pass, as its scenario says."""
     try:
-        return str(tomllib.loads(str(manifest.get("scenario_toml") or ""))["link"]["coding"])
-    except (tomllib.TOMLDecodeError, KeyError, TypeError):
+        scenario = read_table(str(manifest.get("scenario_toml") or ""), "scenario", "TOML")
+        return str(scenario["link"]["coding"])
+    except (InvalidInput, KeyError, TypeError):
         return "rs"
 
 
@@ -445,12 +446,12 @@ def frame_inputs(folder: Path) -> list[dict[str, Any]]:
     rows = []
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()):
-            row = json.loads(line)
+            row = read_json(line, f"line {number + 1}")
             if not isinstance(row["frame"], int) or not isinstance(row["shape"], list):
                 raise ValueError(f"line {number + 1}")
             if row["frame"] >= 0:
                 rows.append({"image": None, **row})
-    except (ValueError, KeyError, TypeError) as error:
+    except (InvalidInput, ValueError, KeyError, TypeError) as error:
         raise InvalidInput(str(path), "", "a line of inputs for each step", str(error)) from None
     return rows
 

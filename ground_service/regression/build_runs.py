@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import itertools
+import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -21,8 +22,9 @@ from ground_service.regression.runner import (
     run_in_sandbox,
 )
 from ground_service.sandbox.host import SandboxRefused, check_private, tail
+from ground_service.toml import read_json
 
-PERFORMANCE_LIMIT_OCTETS = 64 << 20
+PERFORMANCE_LIMIT_OCTETS = 8 << 20
 PRINTED_SHOWN = 2000
 PRINTED = "printed.txt"
 
@@ -128,11 +130,7 @@ def _judged(build: Build, report: Mapping[str, Any], written: Path, out: Path) -
             shutil.move(found, downlink)
             break
     measured = written / PERFORMANCE
-    if (
-        measured.is_file()
-        and not measured.is_symlink()
-        and measured.stat().st_size <= PERFORMANCE_LIMIT_OCTETS
-    ):
+    if measured.is_file() and not measured.is_symlink():
         shutil.move(measured, out / PERFORMANCE)
         performance = read_performance(out / PERFORMANCE)
     if outcome == OK and downlink is None:
@@ -174,8 +172,12 @@ def _outcome(report: Mapping[str, Any], printed: str) -> tuple[str, str]:
 def read_performance(path: Path) -> dict[str, Any] | None:
     """The costs that a build reports of itself, None where they are not in the form of the contract."""
     try:
-        given = json.loads(path.read_text())
+        with path.open("rb") as stream:
+            octets = stream.read(PERFORMANCE_LIMIT_OCTETS + 1)
+        given = read_json(octets, PERFORMANCE, limit_octets=PERFORMANCE_LIMIT_OCTETS)
         stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
-        return {"stages": stages, "yardstick": [float(value) for value in given.get("yardstick", [])]}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        found = {"stages": stages, "yardstick": [float(value) for value in given.get("yardstick", [])]}
+        is_finite = all(map(math.isfinite, itertools.chain(found["yardstick"], *stages.values())))
+        return found if is_finite else None
+    except (InvalidInput, OSError, ArithmeticError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -2,7 +2,7 @@
 
 A build is a program (any command that keeps the contract in docs/build-contract.md), or a network and a parameter file
 on the installed flight code. Its identity is the hash of everything that decides what it does: command and files, or
-network, parameters and the flight code itself.
+network, parameters and the flight code itself. The limits of a program belong to it, those of the flight code do not.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ class Limits(_Table):
     `cpu_s` and `memory_mib` count all processes of the run together, and `folder_mib` everything that it writes.
     """
 
-    wall_s: PositiveInt = 900
-    cpu_s: PositiveInt = 900
-    memory_mib: PositiveInt = 6144
-    file_mib: PositiveInt = 256
-    folder_mib: PositiveInt = 512
-    open_files: PositiveInt = 256
-    processes: PositiveInt = 128
+    wall_s: PositiveInt = Field(900, le=7_200)
+    cpu_s: PositiveInt = Field(900, le=28_800)
+    memory_mib: PositiveInt = Field(6144, le=65_536)
+    file_mib: PositiveInt = Field(256, le=4_096)
+    folder_mib: PositiveInt = Field(512, le=8_192)
+    open_files: PositiveInt = Field(256, le=4_096)
+    processes: PositiveInt = Field(128, le=4_096)
 
 
 class CameraTable(_Table):
@@ -212,6 +212,8 @@ def load_build(given: str | Path) -> Build:
         if not any("{archive}" in word for word in command) or not any("{out}" in word for word in command):
             raise InvalidInput(source, "command", "the places {archive} and {out} in it", " ".join(command))
         content: dict[str, Any] = {"command": command, "files": files}
+        if table.limits != Limits():
+            content["limits"] = table.limits.model_dump()
     else:
         model = dict(files).get(table.model) or _hash_of(_root() / _SHIPPED_MODEL)
         content = {"model": model, "parameters": dict(files).get(table.parameters, ""), "flight_code": code}

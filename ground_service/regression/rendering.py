@@ -20,7 +20,6 @@ import subprocess
 import sys
 import threading
 import time
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -47,6 +46,7 @@ from ground_service.regression.archives import (
 )
 from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY, TO_RENDER, KeptArchive
 from ground_service.sandbox.host import package_root, tail
+from ground_service.toml import read_table
 from tmtc.definitions import parse_dictionary
 from tmtc.downlink import decode
 from tmtc.errors import TmtcError
@@ -161,8 +161,8 @@ def untrusted_scenario(manifest: Mapping[str, Any]) -> str:
     Text that is not a scenario is left to the renderer, which refuses it.
     """
     try:
-        scenario = tomllib.loads(str(manifest["scenario_toml"]))
-    except (tomllib.TOMLDecodeError, RecursionError):
+        scenario = read_table(str(manifest["scenario_toml"]), "scenario", "TOML")
+    except InvalidInput:
         return ""
 
     def value(section: str, key: str, default: Any) -> Any:

@@ -17,6 +17,10 @@ from lunar.messages.stk import parse_stk
 
 EXPECTED = "a CCSDS OEM, STK .e or Horizons ephemeris"
 SPK_MARK = b"DAF/SPK"
+OCTETS_LIMIT = 96 << 20
+LINES_LIMIT = 1_000_000
+"""Limits of a file: a year of states each minute has 60 MB, and reading it takes 400 MB of memory."""
+
 _FIRST = "CCSDS_OEM_VERS, stk.v., XML or a Horizons table"
 
 
@@ -31,7 +35,9 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
     DataFileError
         Where the file is none of them, or says something that cannot be.
     """
-    octets = read_expanded(path, EXPECTED)
+    octets = read_expanded(path, EXPECTED, OCTETS_LIMIT)
+    if (lines := octets.count(b"\n")) > LINES_LIMIT:
+        raise DataFileError(path, "", f"at most {LINES_LIMIT} lines", str(lines))
     if octets.startswith(SPK_MARK):
         raise DataFileError(path, "", EXPECTED, "a SPICE kernel; convert it with 'linna orbit convert'")
     try:

@@ -84,7 +84,7 @@ def load_campaign(path: Path | str) -> Campaign:
     except FileNotFoundError:
         shipped = ", ".join(sorted(file.stem for file in CAMPAIGNS.glob("*.toml")))
         raise ScenarioError(f"{path}: no such campaign file; shipped campaigns: {shipped}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ScenarioError(f"{where}: not TOML: {error}") from None
     seeds, cases = table.get("seeds", [1]), table.get("case", [])
     if not isinstance(seeds, list) or not seeds or not all(type(seed) is int and seed >= 0 for seed in seeds):

@@ -82,7 +82,7 @@ def parse_parameters(
     """
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ParameterError(source, "", "parameters (TOML)", str(error)) from None
     return _read(flown, table, source, dropped)
 

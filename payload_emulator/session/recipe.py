@@ -167,7 +167,7 @@ def load_recipe(path: Path) -> Recipe:
     path = shipped_file(path)
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: expected a TOML file, found: {error}") from error
     if "dataset" not in document:
         return procedural_recipe(int(document.get("seed", 1)))

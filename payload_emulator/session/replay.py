@@ -466,7 +466,7 @@ def _build_table(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ParameterError(str(path), "", "a build file", f"none ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ParameterError(str(path), "", "a build file (TOML)", str(error)) from None
 
 

@@ -391,7 +391,7 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
     """The scenario written in `text`; `source` names it in error messages."""
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ScenarioError(f"{source}: not TOML: {error}") from None
     if "name" not in table:
         raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")

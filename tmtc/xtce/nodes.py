@@ -13,7 +13,7 @@ from xml.parsers import expat
 from tmtc.errors import DefinitionError
 
 MAX_OCTETS = 64 << 20
-MAX_ELEMENTS = 2_000_000
+MAX_ELEMENTS = 400_000
 MAX_DEPTH = 100
 """Limits of a document; the largest public XTCE databases have some 10 MB."""
 

@@ -39,20 +39,12 @@ OUTPUT_CONVENTION = (
 
 def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     """The averaged network of a checkpoint in evaluation mode, and the checkpoint's document."""
-    import torch
-
     from payload_emulator.training.model.model import CraterNet, ModelConfig
+    from payload_emulator.training.model.restore import read_checkpoint
 
-    try:
-        stored = torch.load(path, map_location="cpu", weights_only=False)
-        network = CraterNet(ModelConfig(**stored["config"]))
-        network.load_state_dict(stored["average"])
-    except FileNotFoundError:
-        raise ModelError(f"{path}: expected a checkpoint of a training run, found no file") from None
-    except Exception as error:  # torch raises whatever its unpickler meets
-        raise ModelError(
-            f"{path}: expected a checkpoint of a training run, found: {str(error)[:120]}"
-        ) from error
+    stored = read_checkpoint(path, ("config", "average", "progress"))
+    network = CraterNet(ModelConfig(**stored["config"]))
+    network.load_state_dict(stored["average"])
     return network.eval(), stored
 
 

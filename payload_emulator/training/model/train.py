@@ -251,9 +251,9 @@ class _RunFiles:
 
     def resume(self, device: str) -> _Progress:
         """Give networks and optimiser the state of the checkpoint; return its progress."""
-        import torch
+        from payload_emulator.training.model.restore import read_checkpoint
 
-        stored = torch.load(self.checkpoint, map_location=device, weights_only=False)
+        stored = read_checkpoint(self.checkpoint, ("network", "average", "optimiser", "progress"), device)
         self.network.load_state_dict(stored["network"])
         self.average.load_state_dict(stored["average"])
         self.optimiser.load_state_dict(stored["optimiser"])

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -216,10 +217,24 @@ def test_data_sets_of_two_cameras_are_refused(blob_dataset, make_blob_dataset, t
         train([blob_dataset, other], tmp_path / "run", SHORT)
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path):
-    (tmp_path / "x.pt").write_bytes(b"damaged")
+class _Hostile:
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return Path.touch, (self.mark,)
+
+
+def test_a_damaged_checkpoint_is_refused_and_a_hostile_one_runs_nothing(blob_dataset, tmp_path):
+    (tmp_path / "checkpoint.pt").write_bytes(b"damaged")
     with pytest.raises(ModelError, match="expected a checkpoint"):
-        load_network(tmp_path / "x.pt")
+        load_network(tmp_path / "checkpoint.pt")
+    torch.save({"config": _Hostile(tmp_path / "mark")}, tmp_path / "checkpoint.pt")
+    with pytest.raises(ModelError, match="expected a checkpoint"):
+        load_network(tmp_path / "checkpoint.pt")
+    with pytest.raises(ModelError, match="expected a checkpoint"):
+        train([blob_dataset], tmp_path, SHORT)
+    assert not (tmp_path / "mark").exists()
 
 
 def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dataset, tmp_path):

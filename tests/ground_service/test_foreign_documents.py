@@ -1,0 +1,122 @@
+"""Documents of others are read with limits of depth, digits, size and count: each fault is one line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.app import create_app
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground
+from ground_service.passes.archive_import import import_archive
+from ground_service.regression.build_runs import read_performance
+from ground_service.regression.builds import load_build
+from ground_service.settings import Settings
+from lunar.errors import DataFileError
+from lunar.messages import ephemeris_files
+from payload_emulator.errors import ScenarioError
+from payload_emulator.session.scenario import parse_scenario
+from tmtc.definitions import parse_dictionary
+from tmtc.errors import MalformedPacket
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+DEEP = "a = " + "[" * 50_000 + "]" * 50_000
+LONG = "a = " + "9" * 5_000
+
+
+@pytest.mark.parametrize(("text", "told"), [(DEEP, "nested too deeply"), (LONG, "too many digits")])
+def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path: Path) -> None:
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
+        answer = client.post(
+            "/api/v1/missions", content=text, headers={"Content-Type": "application/octet-stream"}
+        )
+    assert answer.status_code == 422 and told in answer.json()["detail"]
+    (tmp_path / "build.toml").write_text(text)
+    with pytest.raises(InvalidInput, match=told):
+        load_build(tmp_path / "build.toml")
+    with pytest.raises(ScenarioError, match="not TOML"):
+        parse_scenario(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 50_000,
+        '{"stages": {"a": [' + "9" * 5_000 + "]}}",
+        '{"stages": {"a": [1' + "0" * 400 + "]}}",
+        '{"stages": {"a": [NaN]}}',
+        '{"stages": {"a": [1.0]}}' + " " * (8 << 20),
+    ],
+    ids=["deep", "digits", "overflow", "not a number", "long"],
+)
+def test_costs_that_a_build_states_without_end_are_not_read(text: str, tmp_path: Path) -> None:
+    (tmp_path / "performance.json").write_text('{"stages": {"a": [1.0]}}')
+    assert read_performance(tmp_path / "performance.json") == {"stages": {"a": [1.0]}, "yardstick": []}
+    (tmp_path / "performance.json").write_text(text)
+    assert read_performance(tmp_path / "performance.json") is None
+    with pytest.raises(MalformedPacket, match="expected a packet dictionary"):
+        parse_dictionary(text)
+
+
+def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path: Path) -> None:
+    def digest(limits: str) -> str:
+        file = tmp_path / "build.toml"
+        file.write_text(f'name = "x"\ncommand = ["x", "{{archive}}", "{{out}}"]\n{limits}')
+        return load_build(file).digest
+
+    assert digest("") == digest("[limits]\nwall_s = 900") != digest("[limits]\nwall_s = 901")
+    for name in ("wall_s", "cpu_s", "memory_mib", "file_mib", "folder_mib", "open_files", "processes"):
+        with pytest.raises(InvalidInput, match=f"limits.{name}: expected less than or equal to"):
+            digest(f"[limits]\n{name} = 1_000_000_000")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"camera": {"width_px": 10**9, "height_px": 512}}, "camera.width_px: expected a number from 1 to"),
+        ({"camera": {"height_px": -1}}, "camera.height_px: expected"),
+        ({"camera": {"fov_deg": float("nan")}}, "camera.fov_deg: expected"),
+        ({"cadence_s": -1}, "cadence_s: expected"),
+        ({"frames_expected": float("inf")}, "frames_expected: expected"),
+        ({"octets": -1}, "expected -1 octets as in the manifest"),
+        ({"receptions": b"packet_ticks\n1\n"}, "receptions.csv, line 1: expected a column sequence_count"),
+    ],
+)
+def test_an_archive_with_impossible_numbers_leaves_no_pass(
+    change: dict[str, Any], told: str, ground: Ground, synthetic_pass: Any, tmp_path: Path
+) -> None:
+    folder = tmp_path / "archive"
+    shutil.copytree(synthetic_pass.folder, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    if "octets" in change:
+        manifest["files"]["downlink.cadu"]["bytes"] = change["octets"]
+    elif "receptions" in change:
+        (folder / "receptions.csv").write_bytes(change["receptions"])
+        manifest["files"]["receptions.csv"] = {"sha256": hashlib.sha256(change["receptions"]).hexdigest()}
+    else:
+        manifest |= change
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(InvalidInput, match=told):
+        import_archive(ground, folder)
+    with TestClient(create_app(Settings(home=ground.home), inline_jobs=True)) as client:
+        assert client.get("/api/v1/passes").json()["items"] == []
+
+
+def test_ephemerides_are_limited_in_size_and_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "a.oem"
+    path.write_text("CCSDS_OEM_VERS = 2.0\n" + "COMMENT\n" * 100)
+    monkeypatch.setattr(ephemeris_files, "LINES_LIMIT", 100)
+    with pytest.raises(DataFileError, match="expected at most 100 lines, found 101"):
+        ephemeris_files.load_ephemeris(path)
+    path.write_bytes(bytes(ephemeris_files.OCTETS_LIMIT + 1))
+    with pytest.raises(DataFileError, match="expected at most 96 MiB"):
+        ephemeris_files.load_ephemeris(path)
