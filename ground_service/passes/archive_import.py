@@ -177,7 +177,9 @@ def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
             raise InvalidInput(str(folder), name, "a file of the archive", "nothing there")
         size = path.stat().st_size
         if entry.get("bytes", size) != size:
-            raise InvalidInput(str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size))
+            raise InvalidInput(
+                str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size)
+            )
         found = _sha256(path)
         if found != entry["sha256"]:
             raise InvalidInput(

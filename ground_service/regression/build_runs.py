@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ground_service.errors import InvalidInput
 from ground_service.regression.archives import write_flight_view
@@ -18,10 +19,9 @@ from ground_service.regression.runner import (
     DOWNLINKS,
     PERFORMANCE,
     RunRequest,
-    run_by_runner,
-    run_in_sandbox,
+    run_confined,
 )
-from ground_service.sandbox.host import SandboxRefused, check_private, tail
+from ground_service.sandbox.host import SandboxRefused, tail
 from ground_service.toml import read_json
 
 PERFORMANCE_LIMIT_OCTETS = 8 << 20
@@ -106,11 +106,7 @@ def run_build(
         written.mkdir()
         request = RunRequest(build.words, build.limits.model_dump())
         try:
-            if runner is not None:
-                report = run_by_runner(runner, request, work, written, out / PRINTED)
-            else:
-                check_private(private)
-                report = run_in_sandbox(request, work, written, out / PRINTED)
+            report = run_confined(request, work, written, out / PRINTED, runner=runner, private=private)
         except SandboxRefused as error:
             return BuildRun(build.title, "refused", str(error), None, None, 0.0, 0.0, 0.0, "")
         return _judged(build, report, written, out)
@@ -176,8 +172,8 @@ def read_performance(path: Path) -> dict[str, Any] | None:
             octets = stream.read(PERFORMANCE_LIMIT_OCTETS + 1)
         given = read_json(octets, PERFORMANCE, limit_octets=PERFORMANCE_LIMIT_OCTETS)
         stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
-        found = {"stages": stages, "yardstick": [float(value) for value in given.get("yardstick", [])]}
-        is_finite = all(map(math.isfinite, itertools.chain(found["yardstick"], *stages.values())))
-        return found if is_finite else None
+        yardstick = [float(value) for value in given.get("yardstick", [])]
+        is_finite = np.isfinite([*yardstick, *itertools.chain(*stages.values())]).all()
+        return {"stages": stages, "yardstick": yardstick} if is_finite else None
     except (InvalidInput, OSError, ArithmeticError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -27,8 +27,8 @@ from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, stora
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.regression import model, store
-from ground_service.regression.runner import RunRequest, run_by_runner, run_in_sandbox
-from ground_service.sandbox.host import SandboxRefused, check_private, tail
+from ground_service.regression.runner import RunRequest, run_confined
+from ground_service.sandbox.host import SandboxRefused, tail
 from ground_service.store.files import make_durable_folder, replace_durably
 from ground_service.store.stored_files import register_file
 from ground_service.text import require_line
@@ -67,13 +67,13 @@ class Limits(_Table):
     `cpu_s` and `memory_mib` count all processes of the run together, and `folder_mib` everything that it writes.
     """
 
-    wall_s: PositiveInt = Field(900, le=7_200)
-    cpu_s: PositiveInt = Field(900, le=28_800)
-    memory_mib: PositiveInt = Field(6144, le=65_536)
-    file_mib: PositiveInt = Field(256, le=4_096)
-    folder_mib: PositiveInt = Field(512, le=8_192)
-    open_files: PositiveInt = Field(256, le=4_096)
-    processes: PositiveInt = Field(128, le=4_096)
+    wall_s: PositiveInt = Field(default=900, le=7_200)
+    cpu_s: PositiveInt = Field(default=900, le=28_800)
+    memory_mib: PositiveInt = Field(default=6144, le=65_536)
+    file_mib: PositiveInt = Field(default=256, le=4_096)
+    folder_mib: PositiveInt = Field(default=512, le=8_192)
+    open_files: PositiveInt = Field(default=256, le=4_096)
+    processes: PositiveInt = Field(default=128, le=4_096)
 
 
 class CameraTable(_Table):
@@ -362,11 +362,7 @@ def check_parameters(build: Build, *, runner: Path | None = None, private: Seque
         request = RunRequest(CHECK_COMMAND, CHECK_LIMITS.model_dump())
         printed = work / "printed.txt"
         try:
-            if runner is not None:
-                report = run_by_runner(runner, request, work, work / "out", printed)
-            else:
-                check_private(private)
-                report = run_in_sandbox(request, work, work / "out", printed)
+            report = run_confined(request, work, work / "out", printed, runner=runner, private=private)
         except SandboxRefused as error:
             raise BuildNotChecked(build.title, str(error)) from None
         told = tail(printed, CHECK_LIMIT_OCTETS).strip()

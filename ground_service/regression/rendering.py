@@ -1,12 +1,12 @@
 """Missing frames of kept archives: rendered from the declared scenario by an external program, and compared by hash.
 
-The renderer is `linna replay --complete` in a subprocess. It refuses every frame whose pixels do not have the hash that
-was recorded in flight, so that a rendered frame is the one that the payload was given. If it refuses the archive, the
-archive becomes telemetry only, with the reason: its received detections then replace the frames. If it fails otherwise
-(time limit, signal, full disk), the archive is left as it is.
+The renderer is `linna replay --complete` in the sandbox of builds. It refuses every frame whose pixels do not have the
+hash that was recorded in flight, so that a rendered frame is the one that the payload was given. If it refuses the
+archive, the archive becomes telemetry only, with the reason: its received detections then replace the frames. If it
+fails otherwise (no sandbox, a limit, declared data that are missing here), the archive is left as it is.
 
-An uploaded archive is not trusted: its scenario must not name files, its images have a limited size, no module is
-imported from its folder, and the renderer has limits of memory and of the size of files.
+An uploaded archive is not trusted: whatever its scenario names, the renderer sees the archive and the public data
+products only.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ import errno
 import hashlib
 import json
 import os
-import signal
-import subprocess
-import sys
+import re
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +29,7 @@ from numpy.typing import NDArray
 
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground
+from ground_service.passes.archive_zip import unpacked
 from ground_service.regression import store
 from ground_service.regression.archives import (
     DETECTIONS,
@@ -44,23 +43,31 @@ from ground_service.regression.archives import (
     restock_archive,
     working_folder,
 )
+from ground_service.regression.builds import Limits
 from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY, TO_RENDER, KeptArchive
-from ground_service.sandbox.host import package_root, tail
-from ground_service.toml import read_table
+from ground_service.regression.runner import RunRequest, run_confined
+from ground_service.sandbox.host import SandboxRefused, tail
 from tmtc.definitions import parse_dictionary
 from tmtc.downlink import decode
 from tmtc.errors import TmtcError
 
-RENDER_LIMIT_S = 1500.0
-"""Longest time for the frames of one archive; a job of a worker has half an hour."""
+COMPLETED = "complete.zip"
+RENDERING = RunRequest(
+    (
+        "{python}", "-P", "-c",
+        "import shutil, sys; from linna.cli import run; "
+        "ended = run(['replay', '{archive}', '--complete', '--out', '{out}/complete']); "
+        "ended or shutil.make_archive('{out}/complete', 'zip', '{out}/complete'); sys.exit(ended)",
+    ),
+    Limits(wall_s=1500, cpu_s=3000, memory_mib=8192, file_mib=1024, folder_mib=2048).model_dump(),
+    (COMPLETED,),
+    reads_data=True,
+)  # fmt: skip
+"""Request of a run that renders the frames of one archive; a job of a worker has half an hour."""
 
-LARGEST_IMAGE_PX = 4096
-"""Largest width and height of an image that is rendered."""
+LACKING = "data product missing: "
+"""Beginning of a refusal because of data that the archive declares and this installation does not have."""
 
-RENDER_OCTETS = 8 << 30
-"""Memory of the renderer."""
-
-RENDERED_FILE_OCTETS = 1 << 30
 REASON_LIMIT = 300
 LIVE_BEGINNING = "the pass was received live"
 """Beginning of the reason of an archive of a live pass that has no inputs of the payload."""
@@ -69,28 +76,8 @@ NO_DETECTIONS = "; no received detections: "
 """Part of the reason of an archive whose downlink has no detections that can be decoded."""
 
 WAIT_S = 0.2
-_ENVIRONMENT = ("PATH", "HOME", "LANG", "TMPDIR", "OMP_NUM_THREADS", "NUMBA_CACHE_DIR")
 _DOWNLINKS = ("downlink.cadu", "downlink.packets")
-# Settings of a scenario by which the renderer opens a file, and their values that name none.
-_FILE_SETTINGS = (("orbit", "oem", ("",)), ("dynamics", "gravity", ("auto", "builtin")))
-# The same for the archive of a live pass, whose payload is loaded as at launch.
-_LAUNCH_SETTINGS = (
-    ("navigation", "filter_gravity", ("auto", "builtin")),
-    ("navigation", "anchoring_catalogue", ("",)),
-)
-# Run by the process that becomes the renderer: limits, and its end with that of the service.
-_LAUNCH = """
-import ctypes, os, resource, signal, sys
-service, memory, size = map(int, sys.argv[1:4])
-for kind, limit in ((resource.RLIMIT_DATA, memory), (resource.RLIMIT_FSIZE, size), (resource.RLIMIT_CORE, 0)):
-    hard = resource.getrlimit(kind)[1]
-    limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
-    resource.setrlimit(kind, (limit, limit))
-ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-if os.getppid() != service:
-    sys.exit(1)
-os.execv(sys.executable, [sys.executable, "-P", "-m", "linna", *sys.argv[4:]])
-"""
+_ARCHIVE = re.compile(r"(?:/[\w.-]+)*/archive\b")
 _rendering: set[str] = set()
 _changed = threading.Condition()
 
@@ -140,7 +127,7 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
         archive = _without_detections(archive)
     reason = archive.reason
     if renders:
-        reason = untrusted_scenario(archive.manifest) or _render(ground, archive, out)
+        reason = _render(ground, archive, out)
     if not reason:
         whole = check_archive(out)
         if whole.state == COMPLETE:
@@ -155,40 +142,6 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
         return replace(archive, reason=f"{reason}{NO_DETECTIONS}{_told(str(error))}")
 
 
-def untrusted_scenario(manifest: Mapping[str, Any]) -> str:
-    """Return why the scenario of an archive is not given to the renderer; empty if it is.
-
-    Text that is not a scenario is left to the renderer, which refuses it.
-    """
-    try:
-        scenario = read_table(str(manifest["scenario_toml"]), "scenario", "TOML")
-    except InvalidInput:
-        return ""
-
-    def value(section: str, key: str, default: Any) -> Any:
-        table = scenario.get(section)
-        return table.get(key, default) if isinstance(table, dict) else default
-
-    is_live = INPUTS not in manifest["files"]
-    if is_live and "/" in str(value("detector", "network", "")):
-        return (
-            "the scenario of the archive is not rendered: detector.network: expected the name of a shipped network, "
-            "found a file"
-        )
-    for section, key, permitted in (*_FILE_SETTINGS, *(_LAUNCH_SETTINGS if is_live else ())):
-        if value(section, key, permitted[0]) not in permitted:
-            expected = " or ".join(permitted) or "none"
-            return f"the scenario of the archive is not rendered: {section}.{key}: expected {expected}, found a file"
-    for key in ("width_px", "height_px"):
-        found = value("camera", key, 0)
-        if isinstance(found, int) and found > LARGEST_IMAGE_PX:
-            return (
-                f"the scenario of the archive is not rendered: camera.{key}: expected at most {LARGEST_IMAGE_PX}, "
-                f"found {str(found)[:20]}"
-            )
-    return ""
-
-
 def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
     """Write a complete copy of an archive; return why the renderer refuses it, otherwise an empty text.
 
@@ -197,43 +150,26 @@ def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
     RenderingFailed
         The renderer failed without refusing the archive.
     """
-    limits = (os.getpid(), RENDER_OCTETS, RENDERED_FILE_OCTETS)
-    options = (str(archive.folder.absolute()), "--complete", "--out", str(out.absolute()), "--json")
-    environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
-    environment["PYTHONPATH"] = str(package_root())
-    if ground.data.root is not None:
-        environment["LINNA_DATA"] = str(ground.data.root)
-    printed = out.with_name("printed.txt")
-    with printed.open("wb") as stream:
-        # With -P no module is imported from the folder in which the process runs.
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _LAUNCH, *map(str, limits), "replay", *options],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=stream,
-            env=environment,
-            cwd=out.parent,
-            start_new_session=True,
+    work = archive.folder.parent
+    written, printed = work / "written", work / "printed.txt"
+    for folder in (work / "build", written):
+        folder.mkdir()
+    private, data = (ground.home,), ground.data.root
+    try:
+        report = run_confined(
+            RENDERING, work, written, printed, runner=ground.runner, private=private, data=data
         )
-        deadline = time.monotonic() + RENDER_LIMIT_S
-        try:
-            while process.poll() is None:
-                ground.check_stopping()
-                if time.monotonic() > deadline:
-                    raise RenderingFailed(archive.name, f"no end within {RENDER_LIMIT_S:.0f} s")
-                time.sleep(WAIT_S)
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-    if process.returncode == 0:
+    except SandboxRefused as error:
+        raise RenderingFailed(archive.name, str(error)) from None
+    if report["exit_status"] == 0 and not report["cause"]:
+        with unpacked(written / COMPLETED, work, archive.name) as folder:
+            folder.rename(out)
         return ""
-    refusal = _refusal(process.returncode, tail(printed))
-    if not refusal:
-        raise RenderingFailed(archive.name, f"exit status {process.returncode}")
-    for place, name in ((archive.folder, "archive"), (out, "archive"), (ground.data.root, "data folder")):
-        refusal = refusal if place is None else refusal.replace(str(place), name)
-    return f"the frames cannot be rendered: {_told(refusal)}"
+    refusal = _refusal(report["exit_status"], tail(printed))
+    if not refusal or refusal.startswith(LACKING):
+        cause = refusal or report["cause"] or f"exit status {report['exit_status']}"
+        raise RenderingFailed(archive.name, cause)
+    return f"the frames cannot be rendered: {_told(_ARCHIVE.sub('archive', refusal))}"
 
 
 def _refusal(status: int, printed: str) -> str:

@@ -23,7 +23,7 @@ import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -40,7 +40,7 @@ DOWNLINKS = ("downlink.cadu", "downlink.packets")
 PERFORMANCE = "performance.json"
 OUTPUTS = (*DOWNLINKS, PERFORMANCE)
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 REQUEST, REPORT, PRINTED, ALIVE = "request.json", "report.json", "printed.txt", "runner.json"
 REPORT_LIMIT_OCTETS = 1 << 16
 PRINTED_LIMIT_OCTETS = 1 << 17
@@ -55,10 +55,15 @@ Seconds = Annotated[float, Field(ge=0.0, le=1e7, allow_inf_nan=False)]
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """Request of a run: words with the placeholders {python}, {archive}, {out} and {folder}, and limits."""
+    """Request of a run: words with the placeholders {python}, {archive}, {out} and {folder}, limits, and outputs.
+
+    A renderer reads the public data products; a build does not.
+    """
 
     words: tuple[str, ...]
     limits: Mapping[str, int]
+    outputs: tuple[Annotated[str, Field(pattern=r"^[a-z]+\.[a-z]+$")], ...] = OUTPUTS
+    reads_data: bool = False
     version: int = PROTOCOL_VERSION
 
 
@@ -78,15 +83,17 @@ class RunReport(BaseModel):
     refused: Annotated[str, Field(max_length=2000)] = ""
 
 
-def run_in_sandbox(
+def run_confined(
     request: RunRequest,
     staged: Path,
     written: Path,
     printed: Path,
     *,
-    mode: Literal["namespaces", "user"] = "namespaces",
+    runner: Path | None,
+    private: Sequence[Path],
+    data: Path | None = None,
 ) -> dict[str, Any]:
-    """Run a build in a local sandbox.
+    """Run a program in a runner or in a local sandbox; return the report.
 
     Parameters
     ----------
@@ -94,12 +101,32 @@ def run_in_sandbox(
         Folder with `archive` and `build`, copies that belong to this run.
     written, printed
         Destinations of the outputs and of the end of the program's printed text.
+    runner
+        Exchange folder of the runner that executes the run; None runs it in a local sandbox.
+    private
+        Folders that the program must not be able to read, such as the archive of the service.
+    data
+        Folder of the public data products, for a request that reads them.
 
     Raises
     ------
     SandboxRefused
-        The build cannot be isolated.
+        The program cannot be isolated.
     """
+    if runner is not None:
+        return _run_by_runner(runner, request, staged, written, printed)
+    host.check_private(private, [data] if request.reads_data and data else ())
+    return _run_in_sandbox(request, staged, written, printed, data)
+
+
+def _run_in_sandbox(
+    request: RunRequest,
+    staged: Path,
+    written: Path,
+    printed: Path,
+    data: Path | None,
+    mode: Literal["namespaces", "user"] = "namespaces",
+) -> dict[str, Any]:
     host.make_readable(staged / "archive")
     host.make_readable(staged / "build")
     if mode == "namespaces":
@@ -108,6 +135,8 @@ def run_in_sandbox(
             raise SandboxRefused(confined.refusal)
         archive, folder, private = "/archive", "/build", ""
         folders = {"archive": staged / "archive", "build": staged / "build", "kernels": cache_folder()}
+        if request.reads_data and data is not None:
+            folders["data"], data = data, Path("/data")
         inputs = [
             host.Part("bind", str(path.absolute()), f"/{name}")
             for name, path in folders.items()
@@ -118,6 +147,8 @@ def run_in_sandbox(
     else:
         archive, folder, private = str(staged / "archive"), str(staged / "build"), "{private}"
         view, home, compiled = (), "{private}/home", {}
+    if request.reads_data and data is not None:
+        compiled["LINNA_DATA"] = str(data)
     places = {
         "{python}": sys.executable,
         "{archive}": archive,
@@ -130,7 +161,7 @@ def run_in_sandbox(
         f"{private}/out",
         {**environment(home, f"{private}/tmp"), **compiled},
         dict(request.limits),
-        OUTPUTS,
+        request.outputs,
         str(written.absolute()),
         str(printed.absolute()),
         view,
@@ -138,16 +169,9 @@ def run_in_sandbox(
     return host.execute(run)
 
 
-def run_by_runner(
+def _run_by_runner(
     exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path
 ) -> dict[str, Any]:
-    """Run a build in a runner; parameters as in `run_in_sandbox`.
-
-    Raises
-    ------
-    SandboxRefused
-        There is no runner, the runner refuses, or its result is invalid.
-    """
     identity = uuid.uuid4().hex
     try:
         for name in ("jobs", "running", "results"):
@@ -171,7 +195,7 @@ def run_by_runner(
 
 
 def environment(home: str, temporary: str) -> dict[str, str]:
-    """Return the environment variables of a build: no data folder, no proxies, one thread."""
+    """Return the environment variables of a program: no proxies, one thread."""
     path = [os.path.dirname(sys.executable), "/usr/local/bin", "/usr/bin", "/bin"]
     return {
         "PATH": ":".join(path),
@@ -194,9 +218,15 @@ def environment(home: str, temporary: str) -> dict[str, str]:
 
 
 def serve_exchange(
-    exchange: Path, *, jobs: int | None = None, stopping: threading.Event | None = None
+    exchange: Path,
+    *,
+    jobs: int | None = None,
+    stopping: threading.Event | None = None,
+    data: Path | None = None,
 ) -> int:
     """Run the jobs of an exchange folder one by one, until `jobs` of them are done or `stopping` is set.
+
+    `data` is the folder of the public data products for renderers.
 
     Returns
     -------
@@ -216,13 +246,13 @@ def serve_exchange(
     with _alone(exchange), _heartbeat(exchange, mode, stopping):
         for left in sorted((exchange / "running").iterdir()):
             # The runner ended during this job.
-            _publish(exchange, left.name, {"cause": "crashed"}, None)
+            _publish(exchange, left.name, {"cause": "crashed"}, None, ())
         while not stopping.is_set() and (jobs is None or done < jobs):
             job = _next_job(exchange)
             if job is None:
                 stopping.wait(POLL_S)
                 continue
-            _run_job(exchange, job, mode)
+            _run_job(exchange, job, mode, data)
             done += 1
             remains = next(build_remains(), None) if mode == "user" else None
             if remains is not None:
@@ -256,7 +286,7 @@ def _next_job(exchange: Path) -> Path | None:
     return None
 
 
-def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"]) -> None:
+def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"], data: Path | None) -> None:
     with tempfile.TemporaryDirectory(prefix="runner-") as name:
         folder = Path(name)
         # All users that can reach this folder may read it; it contains only the copies of the build.
@@ -264,25 +294,29 @@ def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"]) -> 
         out = folder / "out"
         out.mkdir(mode=0o700)
         report: dict[str, Any]
+        outputs: tuple[str, ...] = ()
         try:
             request = RunRequest(**json.loads((job / REQUEST).read_text()))
             if request.version != PROTOCOL_VERSION:
                 raise SandboxRefused(f"request: expected version {PROTOCOL_VERSION}, found {request.version}")
             for part in ("archive", "build"):
                 shutil.copytree(job / part, folder / part)
-            report = run_in_sandbox(request, folder, out, out / PRINTED, mode=mode)
+            outputs = request.outputs
+            report = _run_in_sandbox(request, folder, out, out / PRINTED, data, mode)
         except SandboxRefused as error:
             report = {"refused": str(error)}
         except (OSError, ValueError, TypeError, KeyError) as error:
             report = {"refused": f"request: {type(error).__name__}: {error}"[:500]}
-        _publish(exchange, job.name, report, out)
+        _publish(exchange, job.name, report, out, outputs)
 
 
-def _publish(exchange: Path, identity: str, report: Mapping[str, Any], out: Path | None) -> None:
+def _publish(
+    exchange: Path, identity: str, report: Mapping[str, Any], out: Path | None, outputs: Sequence[str]
+) -> None:
     partial = exchange / "results" / f".{identity}"
     shutil.rmtree(partial, ignore_errors=True)
     _make_shared(partial)
-    for name in (*OUTPUTS, PRINTED):
+    for name in (*outputs, PRINTED):
         if out is not None and (out / name).is_file():
             shutil.copyfile(out / name, partial / name)
     (partial / REPORT).write_text(json.dumps(report))
@@ -372,7 +406,7 @@ def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> d
         if report.refused:
             raise SandboxRefused("runner: " + " ".join(report.refused.split()), remedy="")
         limit = request.limits["file_mib"] << 20
-        for name in OUTPUTS:
+        for name in request.outputs:
             octets = _octets(folder, name, limit)
             if octets is not None:
                 (written / name).write_bytes(octets)

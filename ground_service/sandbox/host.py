@@ -158,19 +158,19 @@ def program_view() -> tuple[Part, ...]:
     return tuple(parts)
 
 
-def check_private(folders: Sequence[Path]) -> None:
-    """Refuse a layout in which a folder of the service is inside a folder that a build can read.
+def check_private(folders: Sequence[Path], shown: Sequence[Path] = ()) -> None:
+    """Refuse a layout in which a folder of the service is inside a folder that a program can read, such as `shown`.
 
     Raises
     ------
     SandboxRefused
         If there is such a folder.
     """
-    parts = [*program_view()]
+    parts = [*program_view(), *(Part("bind", "", os.path.realpath(one)) for one in shown)]
     for folder in folders:
         if _covered(os.path.realpath(folder), parts):
             raise SandboxRefused(
-                f"{folder}: expected a folder outside those of Python and of the system, which builds can read"
+                f"{folder}: expected a folder outside those of Python, of the system and of data, which are readable"
             )
 
 

@@ -13,18 +13,18 @@ import json
 import shutil
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray
 from lunar.datafolder import DataFolder
-from payload_emulator.errors import ModelError, ParameterError, RecordError
+from payload_emulator.errors import ModelError, ParameterError, RecordError, TerrainError
 from payload_emulator.flight.models import DEFAULT_NETWORK, NETWORKS, load_shipped_model
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.payload import Payload
@@ -44,6 +44,10 @@ from payload_emulator.session.recording import (
     save_image,
 )
 from tmtc.downlink import encode_cadus
+
+if TYPE_CHECKING:
+    from payload_emulator.session.scenario import Scenario
+    from payload_emulator.session.world import World
 
 Image = NDArray[Any]
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
@@ -292,12 +296,13 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     """The images of a pass, those that its archive lacks rendered from scenario and seed and found to be the same."""
     from payload_emulator.session.camera import expose
     from payload_emulator.session.scenario import parse_scenario
-    from payload_emulator.session.world import build_world
 
-    text = _manifest(archive).get("scenario_toml")
+    manifest = _manifest(archive)
+    text = manifest.get("scenario_toml")
     if not text:
         raise RecordError(f"{archive}: expected frames, or a scenario to render them from, found neither")
-    world = build_world(parse_scenario(str(text), source=f"scenario of {archive}"), data)
+    scenario = parse_scenario(str(text), source=f"scenario of {archive}")
+    world = _declared_world(scenario, data, manifest.get("data_sources") or ())
     world.terrain.release_thread()
     absent = set(missing_frames(archive, record.inputs))
 
@@ -313,6 +318,30 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
         return image
 
     return _ahead(image_of, record.inputs)
+
+
+def _declared_world(scenario: Scenario, data: DataFolder, declared: Collection[str]) -> World:
+    """Return the world of a scenario with the data that an archive declares, whatever else is in the data folder.
+
+    Raises
+    ------
+    RecordError
+        A declared data product is missing.
+    """
+    from payload_emulator.session.world import build_world
+
+    needed = [name for name in declared if ", seed " not in name]  # what is made of a seed is no data product
+    lacking: list[str] = []
+    for folder in (data, DataFolder(None)):
+        try:
+            world = build_world(scenario, folder)
+        except TerrainError as error:
+            lacking = lacking or [str(error)]
+            continue
+        lacking = [name for name in needed if name not in world.data_names]
+        if not lacking:
+            return world
+    raise RecordError(f"data product missing: {lacking[0]}")
 
 
 def load_detections(archive: Path) -> dict[int, Recorded] | None:

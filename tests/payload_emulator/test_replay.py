@@ -19,6 +19,7 @@ from payload_emulator.errors import ParameterError, RecordError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.session import world
 from payload_emulator.session.emulator import emulate, file_entries
 from payload_emulator.session.parameter_file import (
     BuildParameters,
@@ -124,6 +125,24 @@ def test_the_service_renders_the_frames_that_an_archive_lacks(copy: Path, tmp_pa
         settled = settle_archive(ground, kept.digest)
         assert (settled.state, settled.reason, settled.frames_stored) == ("complete", "", kept.frames)
         assert list((tmp_path / "home/regression/scratch").iterdir()) == []
+
+
+def test_frames_are_rendered_with_the_data_that_the_archive_declares(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other data in the folder of the worker change nothing; without the declared data nothing is rendered."""
+    shutil.rmtree(copy / "frames")
+    built, other = world.build_world, DataFolder(tmp_path)
+    foreign = replace(built(parse_scenario(SCENARIO), other), data_names=("SLDEM2015",))
+    monkeypatch.setattr(
+        world, "build_world", lambda scenario, data: foreign if data is other else built(scenario, data)
+    )
+    assert complete_archive(copy, tmp_path / "complete", other)["files"].keys() >= {"frames/000000.png"}
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["data_sources"].append("height model of Mars")
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(RecordError, match=r"^data product missing: height model of Mars$"):
+        complete_archive(copy, tmp_path / "incomplete", other)
 
 
 def test_received_detections_replace_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:

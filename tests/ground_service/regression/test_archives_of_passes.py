@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -25,7 +26,6 @@ from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store
 from ground_service.regression.archives import (
-    INPUTS,
     PassArchive,
     check_out,
     keep_archive,
@@ -244,21 +244,34 @@ def changed(folder: Path, **values: Any) -> None:
     write_manifest(folder, {**manifest, **values})
 
 
-@pytest.mark.parametrize("status", [-1.0, 1e3])
+@pytest.mark.parametrize(
+    ("words", "limit", "found"),
+    [
+        (("sleep", "9"), {"wall_s": 1}, "timeout"),
+        (("{python}", "-c", "import sys; sys.exit('linna: error: x')"), {}, "exit status 1"),
+        (
+            ("{python}", "-c", "print('linna: error: data product missing: DEM'); exit(2)"),
+            {},
+            "data product missing: DEM",
+        ),
+    ],
+)
 def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
     ground: Ground,
     unrendered: Path,
     make_build: Callable,
     monkeypatch: pytest.MonkeyPatch,
-    status: float,
+    words: tuple[str, ...],
+    limit: dict[str, int],
+    found: str,
 ) -> None:
-    """The renderer exceeds its time, or ends as on a full disk; the pass is unusable in this verdict only."""
-    monkeypatch.setattr(rendering, "RENDER_LIMIT_S", status)
-    if status > 0.0:
-        failure = "import sys; sys.exit('linna: error: No space left on device (/x)') "
-        monkeypatch.setattr(rendering, "_LAUNCH", failure)
+    """The renderer exceeds its time, fails, or lacks declared data; the pass is unusable in this verdict only."""
+    asked = rendering.RENDERING
+    monkeypatch.setattr(
+        rendering, "RENDERING", dataclasses.replace(asked, words=words, limits={**asked.limits, **limit})
+    )
     digest = keep_archive(ground, unrendered).digest
-    with pytest.raises(rendering.RenderingFailed, match=r"found (no end within -1 s|exit status 1)"):
+    with pytest.raises(rendering.RenderingFailed, match=f"found {found}"):
         rendering.settle_archive(ground, digest)
     build = register_build(ground, load_build(make_build("good", {})))
     outcome = run_regression(ground, [digest], build, build, load_policy())
@@ -282,52 +295,6 @@ def test_only_a_message_of_the_renderer_itself_is_a_refusal() -> None:
         assert rendering._refusal(status, printed) == "", printed
 
 
-@pytest.mark.parametrize(
-    ("scenario", "reason"),
-    [
-        ('[orbit]\noem = "{secret}"', "orbit.oem: expected none, found a file"),
-        ('[orbit]\noem = "../secret"', "orbit.oem: expected none, found a file"),
-        ('[dynamics]\ngravity = "{secret}"', "dynamics.gravity: expected auto or builtin, found a file"),
-        ("[camera]\nwidth_px = 4097", "camera.width_px: expected at most 4096, found 4097"),
-        ("[camera]\nheight_px = 8192", "camera.height_px: expected at most 4096, found 8192"),
-    ],
-)
-def test_the_scenario_of_an_archive_opens_no_file_and_renders_no_large_images(
-    ground: Ground, unrendered: Path, tmp_path: Path, scenario: str, reason: str
-) -> None:
-    secret = tmp_path / "secret"
-    secret.write_text("secret words")
-    changed(unrendered, scenario_toml=f'name = "x"\n{scenario.format(secret=secret)}\n')
-    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
-    assert kept.state == "telemetry only"
-    assert kept.reason == f"the scenario of the archive is not rendered: {reason}"
-
-
-@pytest.mark.parametrize(
-    ("scenario", "reason"),
-    [
-        (
-            '[detector]\nnetwork = "/etc/x"',
-            "detector.network: expected the name of a shipped network, found a file",
-        ),
-        (
-            '[navigation]\nfilter_gravity = "/etc/x"',
-            "navigation.filter_gravity: expected auto or builtin, found a file",
-        ),
-        (
-            '[navigation]\nanchoring_catalogue = "x"',
-            "navigation.anchoring_catalogue: expected none, found a file",
-        ),
-        ('[detector]\nnetwork = "craters"\n[navigation]\nfilter_gravity = "builtin"', ""),
-    ],
-)
-def test_the_declared_world_of_a_live_pass_opens_no_file(scenario: str, reason: str) -> None:
-    """The payload is loaded as at launch, from the scenario; an archive with inputs of the payload has it on record."""
-    found = rendering.untrusted_scenario({"scenario_toml": scenario, "files": {}})
-    assert found == (reason and f"the scenario of the archive is not rendered: {reason}")
-    assert rendering.untrusted_scenario({"scenario_toml": scenario, "files": {INPUTS: {}}}) == ""
-
-
 def test_the_renderer_imports_nothing_from_the_archive(
     ground: Ground, unrendered: Path, tmp_path: Path
 ) -> None:
@@ -339,6 +306,19 @@ def test_the_renderer_imports_nothing_from_the_archive(
     kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
     assert kept.reason.startswith("the frames cannot be rendered: archive/payload/inputs.jsonl, line 1: ")
     assert not taken.exists()
+
+
+def test_the_renderer_sees_neither_the_archive_of_the_service_nor_a_network(
+    ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    probe = (
+        f"import os; seen = os.path.exists({str(ground.home)!r}), os.path.exists('/archive/manifest.json'); "
+        "print('linna: error: sees', *seen, len(open('/proc/net/dev').readlines()) - 2); exit(2)"
+    )
+    asked = dataclasses.replace(rendering.RENDERING, words=("{python}", "-c", probe))
+    monkeypatch.setattr(rendering, "RENDERING", asked)
+    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
+    assert kept.reason == "the frames cannot be rendered: sees False True 1"
 
 
 def test_an_archive_that_cannot_be_rendered_is_settled_once(

@@ -63,16 +63,16 @@ def test_right_parameters_are_registered_and_checked_once(
     file = write("flight.anchored.gravity_degree = 60")
     first = register_build(home, load_build(file))
     assert [one.digest for one in home.read(list_builds, Paging()).items] == [first.digest]
-    monkeypatch.setattr(builds, "run_in_sandbox", None)
+    monkeypatch.setattr(builds, "run_confined", None)
     assert register_build(home, load_build(file)).digest == first.digest
 
 
-def _refused(*_: Any) -> dict[str, Any]:
+def _refused(*_: Any, **__: Any) -> dict[str, Any]:
     raise SandboxRefused("no user namespaces")
 
 
 def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
-    def run(request: Any, staged: Path, written: Path, printed: Path) -> dict[str, Any]:
+    def run(request: Any, staged: Path, written: Path, printed: Path, **_: Any) -> dict[str, Any]:
         printed.write_text("Traceback\nMemoryError\n")
         return {"cause": "", "exit_status": 0, "signal": None} | changes
 
@@ -96,7 +96,7 @@ def test_a_build_that_cannot_be_checked_is_not_registered(
     run: Callable[..., dict[str, Any]],
     told: str,
 ) -> None:
-    monkeypatch.setattr(builds, "run_in_sandbox", run)
+    monkeypatch.setattr(builds, "run_confined", run)
     with pytest.raises(BuildNotChecked, match=told):
         register_build(home, load_build(write("flight.anchored.gravity_degree = 60")))
     assert home.read(list_builds, Paging()).items == []

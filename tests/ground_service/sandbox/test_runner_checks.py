@@ -198,7 +198,7 @@ def test_processes_of_another_pid_namespace_are_not_those_of_the_runner(shared: 
 def test_a_runner_ends_if_a_build_left_something(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "jobs" / "one").mkdir(parents=True)
     monkeypatch.setattr(runner, "runner_mode", lambda exchange: "user")
-    monkeypatch.setattr(runner, "_run_job", lambda exchange, job, mode: job.rmdir())
+    monkeypatch.setattr(runner, "_run_job", lambda exchange, job, *_: job.rmdir())
     monkeypatch.setattr(runner, "build_remains", lambda: iter(["process 7"]))
     with pytest.raises(SandboxRefused, match="found process 7"):
         runner.serve_exchange(tmp_path, jobs=1)
