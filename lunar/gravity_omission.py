@@ -113,8 +113,8 @@ def field_noise(name: str, degree: int) -> FieldNoise:
         densities = [_at_reference(*part) for part in parts]
         # Approximate the sum of two exponentials by one with the same slope at the reference altitude.
         slope = sum(psd[0] / height for psd, (_, height) in zip(densities, parts, strict=True))
-        total = _sum(*densities)
-        sides.append((total, total[0] / slope))
+        r, t, n = np.sum(densities, axis=0).tolist()
+        sides.append(((r, t, n), r / slope))
     (near, near_height), (far, far_height) = sides
     oblique = _at_reference(_FAR_SIDE_OBLIQUE_M2_S3, _scale_height_m(_FAR_SIDE_DEGREE))
     return FieldNoise(near, far, oblique, near_height, far_height)
@@ -156,10 +156,6 @@ def omission_psd_m2_s3(degree: int) -> Densities:
         for axis in range(3)
     )
     return r, t, n
-
-
-def _sum(one: Densities, other: Densities) -> Densities:
-    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
 def _times(one: Densities, factor: float) -> Densities:

@@ -78,9 +78,6 @@ from reports.values import (
     TrackSeries,
 )
 
-ESTIMATOR_NAMES = ("paper", "spherical", "anchored")
-"""On-board estimators by their number in telemetry."""
-
 ESTIMATOR_DESCRIPTIONS = {
     "paper": "the paper's visual odometry on a flat Moon",
     "spherical": "the same odometry with exact spherical back-projection",

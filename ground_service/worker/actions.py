@@ -32,8 +32,11 @@ from ground_service.evaluation.store import newest_report
 from ground_service.events import AutomationChanged, LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.service import add_job
+from ground_service.landmarks.service import update_landmarks
 from ground_service.missions.rules import DEFAULT_RULES, Rule
 from ground_service.planning.progress import close_window, note_reason
+from ground_service.regression.jobs import prepared, regression_job
+from ground_service.regression.pass_archives import keep_pass
 from ground_service.timekeeping.recorrelation import recorrelate
 from ground_service.worker.notifications import send
 from ground_service.worker.outgoing import NotDelivered
@@ -267,21 +270,15 @@ def _mark_processed(ground: Ground, action: AutomationAction) -> dict[str, Any]:
 
 
 def _keep_archive(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    from ground_service.regression.pass_archives import keep_pass
-
     kept = keep_pass(ground, _pass_of(action))
     return {"archive": kept.digest, "frames": kept.frames, "state": kept.state, "reason": kept.reason}
 
 
 def _find_landmarks(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    from ground_service.landmarks.service import update_landmarks
-
     return update_landmarks(ground, _pass_of(action)).model_dump(mode="json")
 
 
 def _run_regression(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    from ground_service.regression.jobs import prepared, regression_job
-
     rule = _rule(ground, action)
     arguments = prepared(ground, rule.candidate or "current", rule.baseline or "current", ())
     return regression_job(ground, arguments, _identity(action))

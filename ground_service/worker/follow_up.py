@@ -14,7 +14,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 
 from pydantic import ValidationError
 from sqlalchemy import Connection
@@ -38,7 +37,7 @@ from ground_service.events import (
     WindowChanged,
     publish,
 )
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import Ground
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments
@@ -51,7 +50,6 @@ from ground_service.store.events import LoggedEvent
 from ground_service.timekeeping.recorrelation import recorrelate
 from ground_service.timekeeping.store import vehicles_with_receptions
 from ground_service.worker.jobs import run_job
-from lunar.datafolder import DataFolder
 
 log = logging.getLogger(__name__)
 
@@ -348,19 +346,6 @@ def follow_in_process(ground: Ground, start: Start | None = None) -> FollowUp:
     follow_up = FollowUp(ground, start)
     ground.database.listeners.add(follow_up)
     return follow_up
-
-
-def open_following(
-    home: Path,
-    data: DataFolder | None = None,
-    *,
-    database_url: str | None = None,
-    runner: Path | None = None,
-) -> Ground:
-    """Return the ground service under `home` (see `open_ground`), which handles its events in this process."""
-    ground = open_ground(home, data, database_url=database_url, runner=runner)
-    follow_in_process(ground)
-    return ground
 
 
 def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:

@@ -33,6 +33,7 @@ from ground_service.jobs.store import FINISHED
 from ground_service.memory import give_back
 from ground_service.passes.archive_zip import import_zip
 from ground_service.planning.standing import plan_tick
+from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
 from ground_service.tracing import span
 from ground_service.worker.actions import run_actions
 from ground_service.worker.upkeep import nightly
@@ -93,38 +94,14 @@ def _notification(ground: Ground, arguments: Mapping[str, Any], _job_id: str) ->
     return run_actions(ground, int(arguments["event"]), notify=True)
 
 
-def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    from ground_service.regression.jobs import replay_job
-
-    return replay_job(ground, arguments, job_id)
-
-
-def _rendering(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    from ground_service.regression.jobs import rendering_job
-
-    return rendering_job(ground, arguments, job_id)
-
-
-def _regression(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    from ground_service.regression.jobs import regression_job
-
-    return regression_job(ground, arguments, job_id)
-
-
-def _analysis(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    from ground_service.regression.jobs import analysis_job
-
-    return analysis_job(ground, arguments, job_id)
-
-
 WORK: dict[str, Work] = {
     "report": _report,
     "ingest": _ingest,
     "archive": _archive,
-    "replay": _replay,
-    "rendering": _rendering,
-    "regression": _regression,
-    "analysis": _analysis,
+    "replay": replay_job,
+    "rendering": rendering_job,
+    "regression": regression_job,
+    "analysis": analysis_job,
     "nightly": nightly,
     "plan": _plan,
     "redecode": _redecode,

@@ -27,8 +27,6 @@ from lunar.timescales import format_utc
 
 RETENTION_DAYS = 90
 DAY_NS = 86_400_000_000_000
-ABANDONED_S = 86_400.0
-"""Age from which temporary files are leftovers."""
 
 
 def nightly_job_id(utc_ns: int) -> str:

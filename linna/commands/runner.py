@@ -35,9 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
             return checked(alive(exchange), f"a runner that serves {exchange}")
         logging.config.dictConfig(logging_config(settings.log_format))
         print(f"builds are isolated by: {runner_mode(exchange)}", flush=True)
-        serve_exchange(
-            exchange, jobs=arguments.jobs, stopping=event_of_signals(), data=settings.data
-        )
+        serve_exchange(exchange, jobs=arguments.jobs, stopping=event_of_signals(), data=settings.data)
     except SandboxRefused as error:
         raise UsageError(str(error)) from None
     return 0

@@ -225,7 +225,7 @@ def replay(
     recorded
         Received detections by on-board time of the image, in place of the detector; None: the images are examined.
     """
-    parameters = parameters_of(build, record.parameters)
+    parameters = parse_parameters(build.parameters, record.parameters, source=f"parameters of {build.name}")
     model = load_shipped_model() if build.model is None else build.model
     detector = _TimedDetector(model, parameters, cpu_clock, recorded)
     board = RecordedBoard()
@@ -282,11 +282,6 @@ def _with_network(build: FlightBuild, manifest: dict[str, Any]) -> FlightBuild:
     return replace(build, model=same[0] if same else shipped[DEFAULT_NETWORK])
 
 
-def parameters_of(build: FlightBuild, flown: BuildParameters) -> BuildParameters:
-    """The parameters that a build flies with: those of the pass, with the changes of the build."""
-    return parse_parameters(build.parameters, flown, source=f"parameters of {build.name}")
-
-
 def stored_images(archive: Path, record: PassRecord) -> Iterator[Image]:
     """The images of a pass from its archive, the next one read while this one is worked on."""
     return _ahead(lambda item: load_image(archive, item), record.inputs)
@@ -321,27 +316,19 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
 
 
 def _declared_world(scenario: Scenario, data: DataFolder, declared: Collection[str]) -> World:
-    """Return the world of a scenario with the data that an archive declares, whatever else is in the data folder.
-
-    Raises
-    ------
-    RecordError
-        A declared data product is missing.
-    """
+    """Return the world of a scenario with the declared data, apart from names of seeds; `RecordError` without them."""
     from payload_emulator.session.world import build_world
 
-    needed = [name for name in declared if ", seed " not in name]  # what is made of a seed is no data product
-    lacking: list[str] = []
+    lacking = needed = [name for name in declared if ", seed " not in name]
     for folder in (data, DataFolder(None)):
         try:
             world = build_world(scenario, folder)
-        except TerrainError as error:
-            lacking = lacking or [str(error)]
+        except TerrainError:
             continue
         lacking = [name for name in needed if name not in world.data_names]
         if not lacking:
             return world
-    raise RecordError(f"data product missing: {lacking[0]}")
+    raise RecordError(f"data product missing: {', '.join(lacking) or 'terrain'}")
 
 
 def load_detections(archive: Path) -> dict[int, Recorded] | None:

@@ -108,7 +108,6 @@ class _Builder:
         self.parser.EndElementHandler = self.end
         self.parser.CharacterDataHandler = self.characters
         self.parser.StartDoctypeDeclHandler = self.doctype
-        self.parser.ExternalEntityRefHandler = self.external
 
     def parse(self, octets: bytes) -> Node:
         try:
@@ -161,6 +160,3 @@ class _Builder:
             f"{self.document}, line {self.parser.CurrentLineNumber}: expected no document type declaration, "
             f"found one of {name!r}"
         )
-
-    def external(self, *_reference: object) -> int:
-        return 0

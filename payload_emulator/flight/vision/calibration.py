@@ -212,10 +212,13 @@ def load_calibration(metadata: Mapping[str, str], model_octets: bytes) -> Calibr
             f"{where}: expected a calibration of this network ({own[:12]}), found one of "
             f"{str(document.get('network_sha256'))[:12]}: fit it again with `linna detector calibrate`"
         )
+    kinds = ("fresh", "total", "low", "high")
     try:
         return Calibration(
             _score_model(document["score"]) if "score" in document else None,
-            _sigma_model(document["sigma"]) if "sigma" in document else None,
+            SigmaModel(*(_numbers(document["sigma"], kind, SIGMA_FEATURES) for kind in kinds))
+            if "sigma" in document
+            else None,
             SunModel(_numbers(document["sun"], "coefficients", SUN_FEATURES)) if "sun" in document else None,
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -228,10 +231,6 @@ def _score_model(part: Mapping[str, Any]) -> ScoreModel:
     if not (len(knots) >= 1 and np.all(np.diff(knots) > 0.0) and np.isfinite(slope) and slope > 0.0):
         raise ValueError("score: knots that do not rise, or a slope that is not above zero")
     return ScoreModel(knots, _numbers(part, "offset", len(knots)), slope)
-
-
-def _sigma_model(part: Mapping[str, Any]) -> SigmaModel:
-    return SigmaModel(*(_numbers(part, name, SIGMA_FEATURES) for name in ("fresh", "total", "low", "high")))
 
 
 def _numbers(part: Mapping[str, Any], name: str, count: int) -> tuple[float, ...]:

@@ -111,7 +111,9 @@ def build(
     total = sum(shard.frames for shard in shards)
     _claim(folder, recipe, frames, tracks)
     with _locked(folder):
-        _sweep(folder)
+        for place in (folder, *(folder / name for name in _FOLDERS)):
+            for path in place.glob(".*"):  # what a killed build left half-written
+                path.unlink(missing_ok=True)
         todo = [shard for shard in shards if not _shard_path(folder, shard).is_file()]
         done = total - sum(shard.frames for shard in todo)
         yield done, total
@@ -353,13 +355,6 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what a killed build left half-written."""
-    for place in (folder, *(folder / name for name in _FOLDERS)):
-        for path in place.glob(".*"):
-            path.unlink(missing_ok=True)
 
 
 def _data_names(recipe: Recipe, data: DataFolder) -> list[str]:

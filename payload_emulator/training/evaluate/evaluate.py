@@ -182,16 +182,14 @@ def evaluate(
     split: str = "test",
     source: str = "",
     threshold: float | None = None,
-    progress: Callable[[Sequence[Any]], Any] = iter,
     *,
     paper_classes: bool = False,
-    rims: RefittedRims | None = None,
 ) -> dict[str, Any]:
     """Figures of a model on a split of one or several data sets; see `run` for what is refused."""
     datasets = [datasets] if isinstance(datasets, Dataset) else list(datasets)
     detector = open_for_evaluation(model_octets)
-    scored = run(detector, datasets, split, source, threshold, progress, paper_classes=paper_classes)
-    return summary(detector, datasets, scored, split, source, rims)
+    scored = run(detector, datasets, split, source, threshold, paper_classes=paper_classes)
+    return summary(detector, datasets, scored, split, source)
 
 
 def summary(

@@ -52,7 +52,7 @@ class Calibration:
     figures: dict[str, Any]
 
 
-def calibrate(network: Any, datasets: Sequence[Dataset], limit: int = 400) -> Calibration:
+def calibrate(network: Any, datasets: Sequence[Dataset]) -> Calibration:
     """Thresholds and corrections from the validation split, on real terrain where there is any.
 
     Thresholds: greatest strict F0.5 (on board) and F1, and the precision that navigation may want. Corrections, each a
@@ -63,7 +63,7 @@ def calibrate(network: Any, datasets: Sequence[Dataset], limit: int = 400) -> Ca
     every = [(d, f) for d in datasets for f in d.frames("val")]
     if not every:
         return Calibration(0.4, 0.4, 0.6, (0.0, 0.0, 0.0, 0.0), 0.0, float("nan"), {})
-    chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, limit).astype(int))]
+    chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, 400).astype(int))]
     pairs = [_sun_up(frame_truth(d, f), detect_with_network(network, d, f), f) for d, f in chosen]
     parallax, parallax_error = fit_parallax(pairs)
     real = [not f.complete for _, f in chosen]

@@ -42,7 +42,7 @@ def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     from payload_emulator.training.model.model import CraterNet, ModelConfig
     from payload_emulator.training.model.restore import read_checkpoint
 
-    stored = read_checkpoint(path, ("config", "average", "progress"))
+    stored = read_checkpoint(path)
     network = CraterNet(ModelConfig(**stored["config"]))
     network.load_state_dict(stored["average"])
     return network.eval(), stored
@@ -300,14 +300,14 @@ def _test_figures(octets: bytes, datasets: Sequence[Dataset], paper_classes: boo
     return tested
 
 
-def parity(exported: Any, octets: bytes, seed: int = 0, images: int = 3) -> float:
+def parity(exported: Any, octets: bytes) -> float:
     """Greatest difference between torch and the flight detector's runtime over random images."""
     import torch
 
     detector = OnnxDetector(octets)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     worst = 0.0
-    for _ in range(images):
+    for _ in range(3):
         image = rng.standard_normal((1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX)).astype(np.float32)
         with torch.no_grad():
             expected = [part.numpy() for part in exported(torch.from_numpy(image))]

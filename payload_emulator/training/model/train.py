@@ -59,14 +59,12 @@ def train(
     start_from: Path | None = None,
     landmarks: Landmarks | None = None,
     rims: RefittedRims | None = None,
-    train_frames: Sequence[tuple[Dataset, Frame]] | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Train (or resume) a run; the best validation figures come back.
 
     `start_from` gives the first weights, `landmarks` further labels that no catalogue lists, `rims` circles measured on
-    the terrain that replace those of the catalogue, `train_frames` the frames to learn from where it is not the split
-    "train" as it stands.
+    the terrain that replace those of the catalogue.
 
     Raises
     ------
@@ -79,7 +77,7 @@ def train(
     from payload_emulator.training.model.model import CraterNet
     from payload_emulator.training.model.restore import count_statistics
 
-    frames, moved = _training_frames(datasets, train_frames, landmarks, rims)
+    frames, moved = _training_frames(datasets, landmarks, rims)
     validation = [(d, f) for d in datasets for f in d.frames("val")]
     _check_datasets(datasets, frames, parameters)
     run.mkdir(parents=True, exist_ok=True)
@@ -128,7 +126,6 @@ def train(
 
 def _training_frames(
     datasets: Sequence[Dataset],
-    chosen: Sequence[tuple[Dataset, Frame]] | None,
     landmarks: Landmarks | None,
     rims: RefittedRims | None,
 ) -> tuple[list[tuple[Dataset, Frame]], int]:
@@ -139,7 +136,7 @@ def _training_frames(
     DatasetError
         Rims are given, but none is of a crater of these frames.
     """
-    frames = [(d, f) for d in datasets for f in d.frames("train")] if chosen is None else list(chosen)
+    frames = [(d, f) for d in datasets for f in d.frames("train")]
     moved = 0
     if rims is not None:
         placed = [(d, *refitted_frame(d, f, rims)) for d, f in frames]
@@ -223,7 +220,7 @@ def _optimise(
             )
             if learns_blindly or figures["f1"] >= state.best_f1:
                 state.best_f1, state.best_step, state.stale = figures["f1"], state.step, 0
-                files.save_best(state, figures)
+                files.write(files.run / "best.pt", state, figures, {})
             else:
                 state.stale += 1
             files.save(state, figures)
@@ -253,7 +250,7 @@ class _RunFiles:
         """Give networks and optimiser the state of the checkpoint; return its progress."""
         from payload_emulator.training.model.restore import read_checkpoint
 
-        stored = read_checkpoint(self.checkpoint, ("network", "average", "optimiser", "progress"), device)
+        stored = read_checkpoint(self.checkpoint, device)
         self.network.load_state_dict(stored["network"])
         self.average.load_state_dict(stored["average"])
         self.optimiser.load_state_dict(stored["optimiser"])
@@ -261,13 +258,9 @@ class _RunFiles:
 
     def save(self, state: _Progress, figures: dict[str, float]) -> None:
         """Write the checkpoint, from which a run can be resumed."""
-        self._write(self.checkpoint, state, figures, {"optimiser": self.optimiser.state_dict()})
+        self.write(self.checkpoint, state, figures, {"optimiser": self.optimiser.state_dict()})
 
-    def save_best(self, state: _Progress, figures: dict[str, float]) -> None:
-        """Write the weights of the best validation."""
-        self._write(self.run / "best.pt", state, figures, {})
-
-    def _write(self, path: Path, state: _Progress, figures: dict[str, float], more: dict[str, Any]) -> None:
+    def write(self, path: Path, state: _Progress, figures: dict[str, float], more: dict[str, Any]) -> None:
         import torch
 
         document = {

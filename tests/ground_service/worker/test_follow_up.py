@@ -30,7 +30,7 @@ from ground_service.passes.service import define_pass
 from ground_service.store import events as log
 from ground_service.store import repository
 from ground_service.worker import follow_up
-from ground_service.worker.follow_up import FollowUp, follow_in_process, open_following
+from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import SPACECRAFT, SyntheticPass, encode_downlink
 
@@ -178,7 +178,9 @@ def test_several_processes_handle_each_event_once(
     migrated_postgres: Callable[[], str], recorded: Recorded, tmp_path: Path
 ) -> None:
     url = migrated_postgres()
-    grounds = [open_following(tmp_path / f"{k}", database_url=url) for k in range(3)]
+    grounds = [open_ground(tmp_path / f"{k}", database_url=url) for k in range(3)]
+    for ground in grounds:
+        follow_in_process(ground)
 
     def run(ground: Ground, first: int) -> None:
         for k in range(8):
