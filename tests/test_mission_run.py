@@ -15,7 +15,6 @@ import pytest
 
 from ground_service.client.local import local_client
 from ground_service.ground import open_ground
-from linna import cli
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import LinkError, ScenarioError
@@ -183,14 +182,6 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
         assert connection.execute("select number from one").fetchall() == [(1,), (2,)]
     assert not (home / "incoming").exists()
     assert Checkpoints(tmp_path / "other", home, snapshot).restore() is None and not home.exists()
-
-
-@pytest.mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"]])
-def test_impossible_options_are_refused_in_one_line(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.slow

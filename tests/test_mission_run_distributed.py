@@ -324,6 +324,9 @@ def test_private_and_shared_memory_are_told_apart_and_shared_pages_count_once(tm
 @pytest.mark.parametrize(
     "words",
     [
+        ["--speed", "0"],
+        ["--speed", "quick"],
+        ["--window-min", "0.1"],
         ["--kill", "1"],
         ["--database", "postgresql://x/y"],
         ["--distributed", "--kills", "3"],
@@ -331,7 +334,7 @@ def test_private_and_shared_memory_are_told_apart_and_shared_pages_count_once(tm
         ["--distributed", "--kill", "1", "--kills", "-1"],
     ],
 )
-def test_options_of_the_distributed_form_that_do_not_fit_are_refused_in_one_line(
+def test_options_that_do_not_fit_are_refused_in_one_line(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2

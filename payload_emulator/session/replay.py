@@ -325,8 +325,7 @@ def _declared_world(scenario: Scenario, data: DataFolder, declared: Collection[s
             world = build_world(scenario, folder)
         except TerrainError:
             continue
-        lacking = [name for name in needed if name not in world.data_names]
-        if not lacking:
+        if not (lacking := [name for name in needed if name not in world.data_names]):
             return world
     raise RecordError(f"data product missing: {', '.join(lacking) or 'terrain'}")
 

@@ -159,14 +159,6 @@ def test_every_process_has_the_same_settings() -> None:
     assert all(set(environment_of(name)) <= known for name in PROCESSES)
 
 
-def test_prometheus_in_the_inner_network_may_name_the_api() -> None:
-    hosts = SERVICES["api"]["environment"]["LINNA_ALLOWED_HOSTS"]
-    assert default_of(hosts).split(",") == ["localhost", "api", "api2"]
-    command = SERVICES["api"]["command"]
-    target = f"api:{command[command.index('--port') + 1]}"
-    assert f"`{target}`" in (ROOT / "docs/deployment.md").read_text()
-
-
 def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None:
     backup = SERVICES["backup"]
     assert backup["profiles"] == ["backup"] and backup["restart"] == "no"
@@ -218,8 +210,8 @@ def test_the_service_is_not_the_owner_of_its_schema() -> None:
 def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     runner = SERVICES["runner"]
     assert runner["network_mode"] == "none" and "networks" not in runner and "secrets" not in runner
-    assert runner["volumes"] == ["exchange:/exchange"]
-    assert not {name for name in runner["environment"] if name != "LINNA_LOG_FORMAT"}
+    assert runner["volumes"] == ["exchange:/exchange", "${LINNA_DATA_DIR:-empty-data}:/data:ro"]
+    assert set(runner["environment"]) == {"LINNA_LOG_FORMAT", "LINNA_DATA"}
     # A user for each build, and an end to its processes; user 0 can do nothing else.
     assert set(runner["cap_add"]) == {"SETUID", "SETGID", "KILL"} and runner["user"] == "0:10001"
     assert all("size=" in place for place in runner["tmpfs"])
@@ -452,11 +444,6 @@ def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -
     # The worker writes the archive and has the role of the service, the migration that of the owner.
     assert "archive:/var/lib/linna" in SERVICES["worker"]["volumes"]
     assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
-
-
-def test_there_is_a_second_worker_and_a_second_scheduler() -> None:
-    assert SERVICES["scheduler"]["scale"] == 2 and default_of(SERVICES["worker"]["scale"]) == "2"
-    assert SERVICES["scheduler"]["command"] == ["scheduler"]
 
 
 def test_the_image_runs_as_nobody_in_particular() -> None:

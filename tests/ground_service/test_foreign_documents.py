@@ -5,19 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ground_service.app import create_app
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
+from ground_service.missions.service import read_mission
 from ground_service.passes.archive_import import import_archive
+from ground_service.passes.model import PassFilter
+from ground_service.passes.store import list_passes
 from ground_service.regression.build_runs import read_performance
 from ground_service.regression.builds import load_build
-from ground_service.settings import Settings
 from lunar.errors import DataFileError
 from lunar.messages import ephemeris_files
 from payload_emulator.errors import ScenarioError
@@ -25,21 +25,14 @@ from payload_emulator.session.scenario import parse_scenario
 from tmtc.definitions import parse_dictionary
 from tmtc.errors import MalformedPacket
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
-
 DEEP = "a = " + "[" * 50_000 + "]" * 50_000
 LONG = "a = " + "9" * 5_000
 
 
 @pytest.mark.parametrize(("text", "told"), [(DEEP, "nested too deeply"), (LONG, "too many digits")])
 def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path: Path) -> None:
-    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
-        answer = client.post(
-            "/api/v1/missions", content=text, headers={"Content-Type": "application/octet-stream"}
-        )
-    assert answer.status_code == 422 and told in answer.json()["detail"]
+    with pytest.raises(InvalidInput, match=told):
+        read_mission(text.encode(), "body")
     (tmp_path / "build.toml").write_text(text)
     with pytest.raises(InvalidInput, match=told):
         load_build(tmp_path / "build.toml")
@@ -107,8 +100,7 @@ def test_an_archive_with_impossible_numbers_leaves_no_pass(
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(InvalidInput, match=told):
         import_archive(ground, folder)
-    with TestClient(create_app(Settings(home=ground.home), inline_jobs=True)) as client:
-        assert client.get("/api/v1/passes").json()["items"] == []
+    assert ground.read(list_passes, PassFilter()).items == []
 
 
 def test_ephemerides_are_limited_in_size_and_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

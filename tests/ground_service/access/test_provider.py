@@ -484,6 +484,9 @@ def test_incomplete_settings_are_refused_at_the_start(tmp_path, provider, given,
         ("OIDC_ISSUER", "http://login.example.org", "expected an https address"),
         ("OIDC_ISSUER", "login", "expected the address"),
         ("OIDC_ROLES", "root=x", "expected viewer=, operator= or admin="),
+        ("OBJECTS", "/var/lib/linna", "LINNA_OBJECTS"),
+        ("OBJECTS", "s3://", "LINNA_OBJECTS"),
+        ("OBJECTS_ENDPOINT", "127.0.0.1:9000", "LINNA_OBJECTS_ENDPOINT"),
     ],
 )
 def test_wrong_settings_are_one_line(monkeypatch, name, value, word):

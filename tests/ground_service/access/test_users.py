@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from sqlalchemy import update
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.service import (
@@ -27,7 +26,6 @@ from ground_service.access.service import (
 from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
 from ground_service.ground import Ground, open_ground
-from ground_service.store import repository
 
 SECRET = "a-token-of-a-deployment-0123456789"
 
@@ -78,32 +76,6 @@ def test_a_revoked_token_is_refused_and_others_stay(either: Ground) -> None:
     assert actions(either)[-1] == ("eve", "revoke token", "ann")
     third = renew_token(either, "ann")
     assert [token_valid(either, one) for one in (first, second, third)] == [False, False, True]
-
-
-def test_the_last_use_is_kept_to_the_hour(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    token = add_user(ground, "ann", "viewer")
-    assert list_tokens(ground)[0].used is None
-    hour = 3_600_000_000_000
-    now = 500_000 * hour + 5
-    monkeypatch.setattr("ground_service.access.service.utc_now_ns", lambda: now)
-    authenticate(ground, token)
-    first = list_tokens(ground)[0].used
-    now += hour // 2
-    authenticate(ground, token)
-    assert list_tokens(ground)[0].used == first and first is not None and first.endswith(":00:00.000000Z")
-    now += hour
-    authenticate(ground, token)
-    assert list_tokens(ground)[0].used != first
-
-
-def test_an_expired_token_is_refused(ground: Ground) -> None:
-    token = add_user(ground, "ann", "viewer", days_valid=1.0)
-    with ground.database.writing() as connection:
-        connection.execute(update(repository.TOKENS).values(expires_utc_ns=5))
-    with pytest.raises(NotAuthorised, match="has expired"):
-        authenticate(ground, token)
-    assert not token_valid(ground, token)
-    assert list_tokens(ground)[0].state == "expired"
 
 
 def test_the_last_administrator_stays(either: Ground) -> None:
@@ -170,7 +142,7 @@ def test_a_name_that_cannot_be_used_is_refused_in_one_line(ground: Ground, name:
     assert list_users(ground) == []
 
 
-@pytest.mark.parametrize("days", [0.0, -1.0, float("nan"), float("inf"), 1e9, True])
+@pytest.mark.parametrize("days", [0.0, -1.0, float("nan"), float("inf"), 36_500.001, True])
 def test_a_validity_that_cannot_be_used_is_refused(ground: Ground, days: float) -> None:
     with pytest.raises(InvalidInput, match="days valid"):
         add_user(ground, "ann", "viewer", days_valid=days)
@@ -288,12 +260,6 @@ def test_further_tokens_expire_too(
         make(ground, "ann", days_valid=-1)
     with pytest.raises(NotFound):
         make(ground, "bob")
-
-
-def test_a_century_is_the_longest_validity(ground: Ground) -> None:
-    add_user(ground, "ann", "viewer", days_valid=36_500.0)
-    with pytest.raises(InvalidInput, match="days valid"):
-        add_user(ground, "bob", "viewer", days_valid=36_500.001)
 
 
 def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(
@@ -425,17 +391,6 @@ def test_users_are_listed_by_name_and_tokens_newest_first(ground: Ground) -> Non
     assert [one.id for one in list_tokens(ground, "ann")] == [4, 2]
     with pytest.raises(NotFound):
         list_tokens(ground, "eve")
-
-
-def test_an_administrator_may_be_demoted_while_another_is_active(ground: Ground) -> None:
-    add_user(ground, "ann", "admin")
-    add_user(ground, "bob", "admin")
-    assert change_user(ground, "ann", role="operator").role == "operator"
-    # Nobody else is left, but an administrator may stay one, and others may be disabled.
-    with pytest.raises(Conflict, match="another active administrator"):
-        change_user(ground, "bob", role="viewer")
-    assert change_user(ground, "bob", role="admin").role == "admin"
-    assert change_user(ground, "ann", state="disabled").state == "disabled"
 
 
 def test_renewing_revokes_only_the_tokens_of_that_user(ground: Ground) -> None:

@@ -295,19 +295,6 @@ def test_only_a_message_of_the_renderer_itself_is_a_refusal() -> None:
         assert rendering._refusal(status, printed) == "", printed
 
 
-def test_the_renderer_imports_nothing_from_the_archive(
-    ground: Ground, unrendered: Path, tmp_path: Path
-) -> None:
-    taken = tmp_path / "taken"
-    for name in ("linna/__init__.py", "linna/__main__.py", "ctypes.py", "numpy.py"):
-        (unrendered / name).parent.mkdir(exist_ok=True)
-        (unrendered / name).write_text(f"open({str(taken)!r}, 'w')\n")
-    changed(unrendered)
-    kept = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
-    assert kept.reason.startswith("the frames cannot be rendered: archive/payload/inputs.jsonl, line 1: ")
-    assert not taken.exists()
-
-
 def test_the_renderer_sees_neither_the_archive_of_the_service_nor_a_network(
     ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,20 +173,6 @@ def test_a_folder_is_never_trimmed(tmp_path: Path) -> None:
     assert files.trim(time.time() + 1e9) == 0 and stored.path.exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "word"),
-    [
-        ("OBJECTS", "/var/lib/linna", "LINNA_OBJECTS"),
-        ("OBJECTS", "s3://", "LINNA_OBJECTS"),
-        ("OBJECTS_ENDPOINT", "127.0.0.1:9000", "LINNA_OBJECTS_ENDPOINT"),
-    ],
-)
-def test_wrong_settings_are_one_line(monkeypatch, name: str, value: str, word: str) -> None:
-    monkeypatch.setenv(f"LINNA_{name}", value)
-    with pytest.raises(SettingsError, match=word):
-        load_settings()
-
-
 def test_keys_come_from_files_and_are_not_shown(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setenv("LINNA_OBJECTS", "s3://linna")
     for name in ("access", "secret"):
