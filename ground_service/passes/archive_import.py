@@ -175,11 +175,6 @@ def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
             )
         if not path.is_file():
             raise InvalidInput(str(folder), name, "a file of the archive", "nothing there")
-        size = path.stat().st_size
-        if entry.get("bytes", size) != size:
-            raise InvalidInput(
-                str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size)
-            )
         found = _sha256(path)
         if found != entry["sha256"]:
             raise InvalidInput(
@@ -187,6 +182,11 @@ def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
                 "",
                 f"SHA-256 {entry['sha256'][:16]}… of the manifest",
                 f"{found[:16]}… (damaged or cut short)",
+            )
+        size = path.stat().st_size
+        if entry.get("bytes", size) != size:
+            raise InvalidInput(
+                str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size)
             )
         names.append(name)
     return names
