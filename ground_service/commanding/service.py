@@ -18,7 +18,6 @@ from sqlalchemy import Connection
 from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding import store
-from ground_service.commanding.approval import DEFAULT_POLICY, ApprovalPolicy
 from ground_service.commanding.model import (
     CommandOctets,
     CommandRecord,
@@ -316,20 +315,13 @@ def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
         raise InvalidInput("telecommand", name, "numbers or names as arguments", str(error)[:200]) from None
 
 
-def policy_of(connection: Connection, vehicle: int) -> ApprovalPolicy:
-    """Return the approval policy of a spacecraft: that of the dictionary, modified by its mission description."""
-    approval = approval_in_force(connection, get_vehicle(connection, vehicle, "spacecraft").ccsds_id)
-    return DEFAULT_POLICY.raised(*(approval.second_person_for or ())).relaxed(
-        *(approval.one_person_for or ())
-    )
-
-
 def _second_person(
     connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]
 ) -> CommandEffect | None:
     """Return the effect for which a telecommand needs a second person; None if it needs none."""
     effect = effect_of(DICTIONARY, name, arguments, _packed(name, arguments, 0))
-    return effect if policy_of(connection, vehicle).needs_second_person(effect) else None
+    rules = approval_in_force(connection, get_vehicle(connection, vehicle, "spacecraft").ccsds_id)
+    return effect if rules.needs_second_person(effect.subject) else None
 
 
 def _require_approval(

@@ -79,8 +79,14 @@ def packet_definitions(mission: Mission) -> PacketDefinitions:
 
 
 def definition_faults(mission: Mission, source: str) -> list[InvalidInput]:
-    """Return one fault for each declaration whose documents cannot be used; empty if all can."""
+    """Return one fault for each declaration that cannot be used: documents of packets, approval; empty if all can."""
     faults = []
+    if mission.approval.windows == "automatic" and mission.critical_in_windows:
+        expected = "approval.one_person_for with the telecommands of a window that is approved automatically"
+        needed = ", ".join(mission.critical_in_windows)
+        faults.append(
+            InvalidInput(source, "approval.windows", expected, f"a second person needed for {needed}")
+        )
     for index, one in enumerate(mission.packets or ()):
         try:
             _decoder(one)

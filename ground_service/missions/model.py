@@ -23,7 +23,7 @@ from ground_service.toml import faults, read_table
 from lunar.errors import TimeFormatError
 from lunar.timescales import parse_utc
 from tmtc.dictionary import DICTIONARY
-from tmtc.effects import EFFECTS
+from tmtc.effects import EFFECTS, FUNCTION, Effect
 
 SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20
@@ -289,6 +289,22 @@ def weakest_evidence(worlds: Sequence[Evidence]) -> str:
     return min(worlds, key=lambda one: order.index(one.level or "1")).text
 
 
+class Observation(Section):
+    """Limits of where and when images can be taken.
+
+    Attributes
+    ----------
+    latitude_limit_deg
+        Largest latitude of the sub-satellite point, north and south: beyond it the ground in view has no data.
+    needs_daylight
+        Whether the Sun has to be above the horizon of the sub-satellite point; a simulated world can draw its light.
+        Not stated: yes with a stated camera.
+    """
+
+    latitude_limit_deg: Annotated[float, Field(gt=0.0, le=90.0)] | None = None
+    needs_daylight: bool | None = None
+
+
 class DeclaredWorld(Section):
     """Simulated world of an emulated mission, from which images of a pass are rendered again; a real mission has none.
 
@@ -366,6 +382,15 @@ class Approval(Section):
         if both:
             raise ValueError(f"each telecommand in one list, found {min(both)} in both")
         return self
+
+    def needs_second_person(self, subject: str) -> bool:
+        """Return whether a telecommand, or one of its functions, needs a second person for release.
+
+        By the packet dictionary: all that change on-board state or destroy data, and those whose effect is unknown.
+        """
+        if subject not in EFFECTS or subject in (self.second_person_for or ()):
+            return True
+        return subject not in (self.one_person_for or ()) and EFFECTS[subject].effect is not Effect.ROUTINE
 
 
 LinkName = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
@@ -526,6 +551,7 @@ class Mission(Section):
     detector: Detector = Detector()
     reference: Reference = Reference()
     evidence: Evidence = Evidence()
+    observation: Observation = Observation()
     world: DeclaredWorld = DeclaredWorld()
     requirements: Requirements = Requirements()
     automation: Automation = Automation()
@@ -563,6 +589,16 @@ class Mission(Section):
         if len(set(names)) < len(names):
             raise ValueError("each name of packets once, found one again")
         return self
+
+    @property
+    def critical_in_windows(self) -> tuple[str, ...]:
+        """Telecommands of the sequence of a window that need a second person."""
+        subjects = ["enable_schedule", f"{FUNCTION}/start_observation", f"{FUNCTION}/stop_observation"]
+        if self.uploads is not None:
+            subjects.append(f"{FUNCTION}/set_mode")
+            if self.uploads.tables:
+                subjects += ["uplink_first", "uplink_middle", "uplink_last"]
+        return tuple(one for one in subjects if self.approval.needs_second_person(one))
 
     @property
     def revision(self) -> str:

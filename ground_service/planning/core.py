@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, groupby, pairwise
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,7 @@ CONTACT_HORIZON_S = 86_400.0
 """Data that are not down a day after their window are taken to stay on board."""
 
 EDGE_TOLERANCE_S = 1.0
+_DEGREE = 180.0 / math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,21 @@ class Constraints:
     maximum_duration_s: float = 2400.0
     minimum_battery: float | None = None
     needs_contact: bool = False
+    limit_rad: float | None = None
+    """Largest latitude, north and south, that the mission description permits."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Excess:
+    """A constraint, and by how much it is broken (n,) in its unit: 0 where it holds, infinite where nothing is near.
+
+    A fixed one is no choice of the request.
+    """
+
+    name: str
+    value: FloatArray
+    unit: str = ""
+    is_fixed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +145,7 @@ class SearchResult:
     candidates: tuple[Candidate, ...]
     contacts: tuple[Contact, ...]
     rejected: tuple[RejectedSpan, ...] = ()
+    reason: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +162,10 @@ class Conditions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planner:
-    """Window search in one ephemeris; `mare` and `catalogue` are None if not available."""
+    """Window search in one ephemeris; `mare` and `catalogue` are None if not available.
+
+    `gap_ns` is the time between two windows that their telecommands need (`preparation.gap_ns`).
+    """
 
     ephemeris: Ephemeris
     orientation: Orientation
@@ -152,6 +173,7 @@ class Planner:
     camera: PinholeCamera
     catalogue: CraterCatalogue | None = None
     mare: TerrainAt | None = None
+    gap_ns: int = 0
 
     def search(
         self,
@@ -170,36 +192,36 @@ class Planner:
         EphemerisCoverageError
             If the ephemeris does not cover the span.
         """
-        spans = find_windows(
-            lambda epochs: self._holds(epochs, constraints),
-            start_utc_ns,
-            stop_utc_ns,
-            step_s,
-            EDGE_TOLERANCE_S,
-        )
         contacts = self.contacts(start_utc_ns, stop_utc_ns)
         battery = self._battery(start_utc_ns, stop_utc_ns, step_s)
         rejected = []
         candidates = []
-        for begin, end in spans:
-            for first, last in _cut(begin, end, constraints.maximum_duration_s):
-                if last - first < constraints.minimum_duration_s * NS:
-                    rejected.append(RejectedSpan(first, last, "too short"))
-                    continue
-                candidate = self._candidate(
-                    constraints, first, last, cadence_s, contacts, battery, commitments
-                )
-                reason = self._refusal(candidate, constraints)
-                if reason:
-                    rejected.append(RejectedSpan(first, last, reason))
-                else:
-                    candidates.append(candidate)
-        return SearchResult(tuple(candidates), contacts, tuple(rejected))
+        for first, last in self._pieces(constraints, start_utc_ns, stop_utc_ns, step_s):
+            if last - first < constraints.minimum_duration_s * NS:
+                rejected.append(RejectedSpan(first, last, "too short"))
+                continue
+            candidate = self._candidate(constraints, first, last, cadence_s, contacts, battery, commitments)
+            reason = self._refusal(candidate, constraints)
+            if reason:
+                rejected.append(RejectedSpan(first, last, reason))
+            else:
+                candidates.append(candidate)
+        if any(one.reason != "too short" for one in rejected) or candidates:
+            return SearchResult(tuple(candidates), contacts, tuple(rejected))
+        reason = self.exclusion(constraints, start_utc_ns, stop_utc_ns, step_s=step_s)
+        return SearchResult((), contacts, tuple(rejected), reason)
 
     def spans(
         self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0
     ) -> list[tuple[int, int]]:
         """Return the spans in which the constraints hold, cut at the maximum duration, without short ones."""
+        parts = self._pieces(constraints, start_utc_ns, stop_utc_ns, step_s)
+        return [(a, b) for a, b in parts if b - a >= constraints.minimum_duration_s * NS]
+
+    def _pieces(
+        self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, step_s: float
+    ) -> list[tuple[int, int]]:
+        """Return the spans in which the constraints hold, cut at the maximum duration with the gap in between."""
         found = find_windows(
             lambda epochs: self._holds(epochs, constraints),
             start_utc_ns,
@@ -207,8 +229,17 @@ class Planner:
             step_s,
             EDGE_TOLERANCE_S,
         )
-        parts = [part for span in found for part in _cut(*span, constraints.maximum_duration_s)]
-        return [(a, b) for a, b in parts if b - a >= constraints.minimum_duration_s * NS]
+        maximum_ns = round(constraints.maximum_duration_s * NS)
+        return [part for span in found for part in _cut(*span, maximum_ns, self.gap_ns)]
+
+    def exclusion(
+        self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0
+    ) -> str:
+        """Return the smallest set of constraints that no span of the minimum duration fulfils, and what would help."""
+        epochs = np.arange(start_utc_ns, stop_utc_ns + 1, round(step_s * NS), dtype=np.int64)
+        excess = self._excess(self.conditions(epochs), constraints, everywhere=True)
+        needed = math.ceil(constraints.minimum_duration_s / step_s) + 1
+        return explain_exclusion(excess, needed, step_s)
 
     def sunlit(self, utc_ns: IntArray) -> FloatArray:
         """Return the share (n,) of the Sun that the spacecraft sees."""
@@ -265,28 +296,45 @@ class Planner:
         return Conditions(place, latitude, longitude, altitude, elevation, lit)
 
     def _holds(self, utc_ns: IntArray, constraints: Constraints) -> BoolArray:
-        """Whether the constraints hold at epochs (n,); the dear one, the craters, only where the others do."""
-        at = self.conditions(utc_ns)
-        held = np.ones(len(utc_ns), dtype=np.bool_)
-        for value, limits in (
-            (at.altitude_m, constraints.altitude_m),
-            (at.sun_elevation_rad, constraints.sun_elevation_rad),
-            (at.latitude_rad, constraints.latitude_rad),
+        """Whether the constraints hold at epochs (n,)."""
+        return _hold(self._excess(self.conditions(utc_ns), constraints), len(utc_ns))
+
+    def _excess(self, at: Conditions, constraints: Constraints, *, everywhere: bool = False) -> list[Excess]:
+        """Return by how much each constraint is broken (n,).
+
+        The dear one, the craters, is counted `everywhere`, or only where the others hold.
+        """
+        found: list[Excess] = []
+        for name, unit, scale, value, limits in (
+            ("altitude", "km", 1e-3, at.altitude_m, constraints.altitude_m),
+            ("Sun elevation", "deg", _DEGREE, at.sun_elevation_rad, constraints.sun_elevation_rad),
+            ("latitude", "deg", _DEGREE, at.latitude_rad, constraints.latitude_rad),
         ):
             if limits is not None:
-                held &= (value >= limits[0]) & (value <= limits[1])
+                beyond = np.maximum(limits[0] - value, value - limits[1])
+                text = f"{scale * limits[0]:g} to {scale * limits[1]:g} {unit}"
+                found.append(Excess(f"{name} {text}", scale * np.maximum(beyond, 0.0), unit))
+        flags: list[tuple[str, BoolArray]] = []
+        if constraints.limit_rad is not None:
+            inside = np.abs(at.latitude_rad) <= constraints.limit_rad
+            name = f"latitude limit of the mission description {_DEGREE * constraints.limit_rad:g} deg"
+            found.append(Excess(name, np.where(inside, 0.0, np.inf), is_fixed=True))
         if constraints.regions_rad:
-            held &= in_regions(at.latitude_rad, at.longitude_rad, constraints.regions_rad)
+            flags.append(("regions", in_regions(at.latitude_rad, at.longitude_rad, constraints.regions_rad)))
         if constraints.sunlit:
-            held &= at.sunlit >= 1.0
+            flags.append(("spacecraft in sunlight", at.sunlit >= 1.0))
         if constraints.mare is not None and self.mare is not None:
-            held &= self.mare(at.latitude_rad, at.longitude_rad) == constraints.mare
-        if constraints.craters_per_frame is not None and held.any():
-            rows = np.flatnonzero(held)
+            wanted = self.mare(at.latitude_rad, at.longitude_rad) == constraints.mare
+            flags.append(("terrain " + ("mare" if constraints.mare else "highland"), wanted))
+        found += [Excess(name, np.where(held, 0.0, np.inf)) for name, held in flags]
+        if constraints.craters_per_frame is not None and self.catalogue is not None:
+            missing = np.zeros(len(at.altitude_m))
+            rows = np.flatnonzero(_hold([] if everywhere else found, len(missing)))
             counts = self._craters(at.position_mcmf_m[rows], constraints)
-            if counts is not None:
-                held[rows] = counts >= constraints.craters_per_frame
-        return held
+            assert counts is not None
+            missing[rows] = np.maximum(constraints.craters_per_frame - counts, 0.0)
+            found.append(Excess(f"craters per frame {constraints.craters_per_frame:g}", missing, "craters"))
+        return found
 
     def _craters(self, position_mcmf_m: FloatArray, constraints: Constraints) -> IntArray | None:
         """Catalogued craters of the wanted sizes that a nadir camera sees from each position (n,)."""
@@ -435,11 +483,64 @@ def _union(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
     return spans
 
 
-def _cut(start: int, stop: int, maximum_s: float) -> list[tuple[int, int]]:
-    """The span in pieces of equal length, none longer than the maximum."""
-    pieces = max(math.ceil((stop - start) / (maximum_s * NS)), 1)
-    edges = np.linspace(start, stop, pieces + 1).astype(np.int64).tolist()
-    return list(pairwise(edges))
+def _cut(start: int, stop: int, maximum_ns: int, gap_ns: int) -> list[tuple[int, int]]:
+    """The span in pieces of equal length, none longer than the maximum, with a gap after each."""
+    pieces = max(math.ceil((stop - start + gap_ns) / (maximum_ns + gap_ns)), 1)
+    edges = np.linspace(start, stop + gap_ns, pieces + 1).astype(np.int64).tolist()
+    return [(first, last - gap_ns) for first, last in pairwise(edges)]
+
+
+def _hold(excess: Sequence[Excess], n: int) -> BoolArray:
+    """Return where all constraints hold (n,)."""
+    held = np.ones(n, dtype=np.bool_)
+    for one in excess:
+        held &= one.value <= 0.0
+    return held
+
+
+def explain_exclusion(excess: Sequence[Excess], needed: int, step_s: float) -> str:
+    """Return the smallest set of constraints that exclude every span, and the nearest relaxation of one of them.
+
+    Parameters
+    ----------
+    needed
+        Consecutive samples in which all constraints have to hold.
+    """
+    duration = f"minimum duration {(needed - 1) * step_s:g} s"
+    if not excess or len(excess[0].value) < needed:
+        return f"no window: the span that was searched is shorter than the {duration}"
+
+    n = len(excess[0].value)
+
+    def spans(held: FloatArray | BoolArray) -> Any:
+        return np.lib.stride_tricks.sliding_window_view(held, needed)
+
+    excluding = (
+        chosen
+        for size in range(1, len(excess) + 1)
+        for chosen in combinations(excess, size)
+        if not spans(_hold(chosen, n)).all(axis=1).any()
+    )
+    smallest = next(excluding, ())
+    if not smallest:
+        return f"no window: the constraints hold for about the {duration} only"
+    reason = f"no window: excluded by {', '.join(one.name for one in smallest)} with the {duration}"
+    helps = []
+    for one in smallest:
+        free = spans(_hold([other for other in excess if other is not one], n)).all(axis=1)
+        if one.is_fixed or not free.any():
+            continue
+        nearest = float(spans(one.value).max(axis=1)[free].min())
+        helps.append(
+            f"{one.name} relaxed by {nearest:.3g} {one.unit}"
+            if math.isfinite(nearest)
+            else f"without {one.name}"
+        )
+    runs = groupby(_hold(excess, n).tolist())
+    longest = max((len(list(run)) for holds, run in runs if holds), default=0)
+    if longest > 1:
+        helps.append(f"a minimum duration of {(longest - 1) * step_s:g} s")
+    return reason + (f"; possible: {' or '.join(helps)}" if helps else "; no single relaxation gives one")
 
 
 def _range(values: FloatArray | IntArray) -> Range:

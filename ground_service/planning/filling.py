@@ -50,6 +50,8 @@ class ResourceGrid:
         Octets that contacts can take in each step (n,).
     observe_s_per_day
         Largest duration of windows that begin within 24 hours; None: any.
+    gap_ns
+        Time between two windows that their telecommands need.
     """
 
     start_utc_ns: int
@@ -62,6 +64,7 @@ class ResourceGrid:
     storage_octets: float
     downlink_within_s: float = 86_400.0
     observe_s_per_day: float | None = None
+    gap_ns: int = 0
 
     @property
     def step_ns(self) -> int:
@@ -93,8 +96,8 @@ def violation(grid: ResourceGrid, chosen: Sequence[Option]) -> str | None:
     """Return the first limit that a set of windows breaks; None if it keeps all."""
     ordered = sorted(chosen, key=lambda one: (one.start_utc_ns, one.stop_utc_ns))
     for before, after in pairwise(ordered):
-        if after.start_utc_ns < before.stop_utc_ns:
-            return "overlaps another window"
+        if after.start_utc_ns < before.stop_utc_ns + grid.gap_ns:
+            return "overlaps another window or its telecommands"
     if (reason := _duty_violation(grid, ordered)) is not None:
         return reason
     change = grid.gain_wh.copy()

@@ -234,6 +234,10 @@ class SearchResult(Entity):
     candidates: list[Candidate]
     contacts: list[Contact]
     rejected: list[RejectedSpan] = Field(description="Spans that were left out, in order of time")
+    reason: str | None = Field(
+        default=None,
+        description="Without a span: the constraints that exclude all, and the nearest relaxation",
+    )
 
 
 class WindowConflict(Entity):

@@ -53,6 +53,11 @@ class StartState:
     velocity_icrf_m_s: FloatArray
 
 
+def gap_ns(uploads: Uploads | None) -> int:
+    """Return the time between two windows that the end of one sequence and the begin of the next need."""
+    return 0 if uploads is None else AFTER_NS + LEAD_NS + NS
+
+
 def prepare_window(
     uploads: Uploads,
     reference: Ephemeris | None,

@@ -72,10 +72,10 @@ def close_window(ground: Ground, window_id: int) -> str:
 
 
 def note_reason(ground: Ground, window_id: int, reason: str) -> None:
-    """Record why a window whose data are on the ground is not processed; its next state replaces the reason."""
+    """Record why a window does not get its telecommands, or is not processed; its next state replaces the reason."""
     with ground.database.writing() as connection:
         window = store.get_record(connection, window_id)
-        if window.state in ("executed", "downlinked"):
+        if window.state in ("approved", "executed", "downlinked"):
             store.change_window(connection, window, reason=reason[:REASON_LENGTH])
 
 

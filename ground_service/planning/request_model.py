@@ -39,7 +39,7 @@ class RequestTerms(Given):
     regions: list[Region] | None = Field(default=None, min_length=1, max_length=50)
     sun_elevation_deg: Limits | None = Field(
         default=None,
-        description="Default: the Sun above the horizon, if the mission description states a camera",
+        description="Default: the Sun above the horizon, unless the mission description needs no daylight",
         examples=[{"min": 5.0, "max": 40.0}],
     )
     altitude_km: Limits | None = None
@@ -49,10 +49,9 @@ class RequestTerms(Given):
     minimum_battery: Finite = Field(default=0.3, ge=0.0, le=1.0, description="Share of its capacity")
     needs_contact: bool = Field(default=True, description="Data must be down within a day")
 
-    def constraints(self, *, daylight: bool) -> Constraints:
-        """Return the value for the window search; `daylight`: the Sun is above the horizon if nothing is stated."""
+    def constraints(self) -> Constraints:
+        """Return the value for the window search."""
         sun = self.sun_elevation_deg
-        elevation = (0.0, math.pi / 2.0) if daylight else None
         radians = math.pi / 180.0
         regions = [
             (one.latitude_deg.scaled(radians), (one.west_deg * radians, one.east_deg * radians))
@@ -60,7 +59,7 @@ class RequestTerms(Given):
         ]
         return Constraints(
             altitude_m=None if self.altitude_km is None else self.altitude_km.scaled(1e3),
-            sun_elevation_rad=elevation if sun is None else sun.scaled(radians),
+            sun_elevation_rad=None if sun is None else sun.scaled(radians),
             regions_rad=tuple(regions),
             minimum_duration_s=self.minimum_duration_s,
             maximum_duration_s=self.maximum_duration_s,

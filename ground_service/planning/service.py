@@ -31,6 +31,7 @@ from ground_service.planning import model, store
 from ground_service.planning.core import (
     Candidate,
     Commitment,
+    Constraints,
     Planner,
     Resources,
     data_octets,
@@ -48,7 +49,7 @@ from ground_service.planning.model import (
     WindowRecord,
     WindowSearch,
 )
-from ground_service.planning.preparation import MARGIN_NS, Activity, TicksOf, prepare_window
+from ground_service.planning.preparation import MARGIN_NS, Activity, TicksOf, gap_ns, prepare_window
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
@@ -96,18 +97,12 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     NotFound
         If there is no such ephemeris or pass.
     """
-    constraints = given.constraints()
     start = None if given.start is None else given.start.utc_ns
     stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
         reference = ephemeris_for(connection, given.ephemeris_id, start, stop)
         mission = missions.mission_in_force(connection, given.spacecraft_id)
-        if (
-            mission is not None
-            and mission.camera.fov_deg is not None
-            and constraints.sun_elevation_rad is None
-        ):
-            constraints = replace(constraints, sun_elevation_rad=DAYLIGHT_RAD)
+        constraints = observable(given.constraints(), mission)
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
         catalogue_sha256 = None
         if given.catalogue_pass_id is not None:
@@ -148,7 +143,22 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
             )
             for one in found.rejected
         ],
+        reason=found.reason,
     )
+
+
+def observable(constraints: Constraints, mission: Mission | None) -> Constraints:
+    """Return constraints with the limits of images that a mission description states: latitude, and daylight."""
+    if mission is None:
+        return constraints
+    limit, daylight = mission.observation.latitude_limit_deg, mission.observation.needs_daylight
+    if limit is not None:
+        constraints = replace(constraints, limit_rad=math.radians(limit))
+    if daylight is None:
+        daylight = mission.camera.fov_deg is not None
+    if daylight and constraints.sun_elevation_rad is None:
+        constraints = replace(constraints, sun_elevation_rad=DAYLIGHT_RAD)
+    return constraints
 
 
 def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> Window:
@@ -389,12 +399,23 @@ def _assessed(
         It conflicts with committed windows or resources.
     """
     conflicts = _span_conflicts(connection, vehicle, window_id, entry)
+    mission = missions.mission_in_force(connection, entry.spacecraft_id)
     commitments = store.commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
     prediction = _prediction(ground, connection, entry, commitments)
     frames = frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
     octets = data_octets(frames, entry.resources.detections_per_frame, entry.resources.estimators)
+    limit = None if mission is None else mission.observation.latitude_limit_deg
     if prediction is not None:
         peak = prediction.storage_peak_octets
+        furthest = math.degrees(max(map(abs, prediction.latitude_rad)))
+        if limit is not None and furthest > limit:
+            conflicts.append(
+                PlanConflict(
+                    "latitude",
+                    None,
+                    f"expected latitudes within the {limit:g} deg of the mission description, found {furthest:.1f} deg",
+                )
+            )
         if prediction.battery_minimum < BATTERY_FLOOR:
             conflicts.append(
                 PlanConflict(
@@ -444,6 +465,7 @@ def planner_of(
         camera_of(stated.camera),
         catalogue,
         mare,
+        gap_ns(stated.uploads),
     )
 
 
@@ -521,12 +543,14 @@ def _coverage_conflict(connection: Connection, entry: WindowEntry) -> PlanConfli
 def _span_conflicts(
     connection: Connection, vehicle: int, window_id: int, entry: WindowEntry
 ) -> list[PlanConflict]:
-    spans = store.neighbours(connection, vehicle, entry)
+    mission = missions.mission_in_force(connection, entry.spacecraft_id)
+    gap = 0 if mission is None else gap_ns(mission.uploads)
+    spans = store.neighbours(connection, vehicle, entry, gap)
     predecessor = next((span for span in spans if span.id == entry.predecessor_id), None)
     if entry.predecessor_id is not None and predecessor is None:
         raise NotFound("window", entry.predecessor_id)
     mine = PlannedSpan(window_id, entry.start_utc_ns, entry.stop_utc_ns, "draft")
-    return span_conflicts(mine, predecessor, spans)
+    return span_conflicts(mine, predecessor, spans, gap)
 
 
 def ephemeris_for(

@@ -35,6 +35,8 @@ from ground_service.planning import service as planning
 from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between
 from ground_service.planning.filling import NS, Option, ResourceGrid, choose
 from ground_service.planning.model import WindowEntry, WindowRecord
+from ground_service.planning.preparation import gap_ns
+from ground_service.planning.progress import note_reason
 from ground_service.planning.request_model import (
     PlannedCandidate,
     RequestPlan,
@@ -197,8 +199,11 @@ def _advance(ground: Ground, now: int) -> tuple[int, int]:
             try:
                 planning.uplink_window(ground, window.id, actor=PLANNER)
                 released += 1
+            except PASSING:
+                raise
             except GroundError as error:
                 log.warning("window %d: %s", window.id, error)
+                note_reason(ground, window.id, f"its telecommands cannot be released: {error}")
     return approved, released
 
 
@@ -255,10 +260,10 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
     elif covered < end:
         reason = f"the reference ephemeris ends at {UtcTime(covered)}"
         end = covered
-    candidates = _candidates(ground, situation, start, end) if end > start else []
+    candidates, excluded = _candidates(ground, situation, start, end) if end > start else ([], None)
     chosen, rejected = _chosen(ground, situation, candidates, quota, now, end)
-    if not chosen and reason is None and not candidates:
-        reason = "no candidate window fulfils the constraints"
+    if not candidates and excluded is not None:
+        reason = excluded if reason is None else f"{excluded}; {reason}"
     return _stored(ground, situation, chosen, rejected, reason, now, end)
 
 
@@ -298,12 +303,17 @@ def _first_needed(request: RequestRecord, now: int) -> int:
     return min(now - DAY_NS, request.anchor_utc_ns + _period(request, now) * period_ns)
 
 
-def _candidates(ground: Ground, situation: _Situation, start: int, end: int) -> list[tuple[int, int]]:
-    """Return the spans that fulfil the constraints, day by day, each in the preferred ephemeris that covers it."""
-    terms = situation.request.terms
-    constraints = terms.constraints(daylight=situation.mission.camera.fov_deg is not None)
+def _candidates(
+    ground: Ground, situation: _Situation, start: int, end: int
+) -> tuple[list[tuple[int, int]], str | None]:
+    """Return the spans that fulfil the constraints, day by day, each in the preferred ephemeris that covers it.
+
+    Without any, the second value is what excludes them on the first day.
+    """
+    constraints = planning.observable(situation.request.terms.constraints(), situation.mission)
     resources = planning.resources_of(situation.mission)
     found: list[tuple[int, int]] = []
+    planners: list[tuple[Planner, int, int]] = []
     for day in range(start // DAY_NS, -(-end // DAY_NS)):
         begin, stop = day * DAY_NS, (day + 1) * DAY_NS
         for reference in situation.references:
@@ -312,8 +322,13 @@ def _candidates(ground: Ground, situation: _Situation, start: int, end: int) -> 
                 planner = planning.planner_of(ground, reference, situation.mission, resources)
                 key = (reference.sha256, situation.mission.revision)
                 found += _spans_of(_Keyed(key, planner), constraints, first, last)
+                planners.append((planner, max(first, start), min(last, end)))
                 break
-    return [span for span in found if start <= span[0] and span[1] <= end]
+    found = [span for span in found if start <= span[0] and span[1] <= end]
+    if found or not planners:
+        return found, None
+    planner, first, last = planners[0]
+    return [], planner.exclusion(constraints, first, last)
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,8 +371,9 @@ def _chosen(
         octets = data_octets(frames, resources.detections_per_frame, resources.estimators)
         option = Option(start, stop, octets, 1.0, _period(request, start))
         before = [one for one in passes or () if one + LEAD_NS <= start]
-        if any(one.start.utc_ns < stop and start < one.stop.utc_ns for one in situation.others):
-            rejected[option] = "overlaps a planned window"
+        gap = gap_ns(situation.mission.uploads)
+        if any(one.start.utc_ns < stop + gap and start < one.stop.utc_ns + gap for one in situation.others):
+            rejected[option] = "overlaps a planned window or its telecommands"
         elif passes is not None and not before:
             rejected[option] = "no contact before it to send its telecommands"
         else:
@@ -410,6 +426,7 @@ def _grid(ground: Ground, situation: _Situation, resources: Resources, now: int,
         storage_octets=resources.storage_octets,
         downlink_within_s=86_400.0 if terms.needs_contact else float("inf"),
         observe_s_per_day=None if hours is None else hours * 3600.0,
+        gap_ns=planner.gap_ns,
     )
 
 

@@ -180,14 +180,14 @@ def follower_of(connection: Connection, window_id: int) -> int | None:
     return None if row is None else int(row["id"])
 
 
-def neighbours(connection: Connection, vehicle: int, entry: WindowEntry) -> list[PlannedSpan]:
-    """Return the committed windows of a vehicle that overlap a request, and its predecessor."""
+def neighbours(connection: Connection, vehicle: int, entry: WindowEntry, gap_ns: int) -> list[PlannedSpan]:
+    """Return the committed windows of a vehicle that are nearer to a request than a gap, and its predecessor."""
     query = select(WINDOWS.c.id, WINDOWS.c.start_utc_ns, WINDOWS.c.stop_utc_ns, WINDOWS.c.state).where(
         WINDOWS.c.vehicle_id == vehicle,
         or_(
             WINDOWS.c.state.in_(COMMITTED)
-            & (WINDOWS.c.start_utc_ns < entry.stop_utc_ns)
-            & (WINDOWS.c.stop_utc_ns > entry.start_utc_ns),
+            & (WINDOWS.c.start_utc_ns < entry.stop_utc_ns + gap_ns)
+            & (WINDOWS.c.stop_utc_ns > entry.start_utc_ns - gap_ns),
             WINDOWS.c.id == entry.predecessor_id,
         ),
     )

@@ -100,17 +100,23 @@ class PlannedSpan:
 
 
 def span_conflicts(
-    window: PlannedSpan, predecessor: PlannedSpan | None, others: Sequence[PlannedSpan]
+    window: PlannedSpan, predecessor: PlannedSpan | None, others: Sequence[PlannedSpan], gap_ns: int = 0
 ) -> list[PlanConflict]:
-    """Overlaps with committed windows, and a predecessor that does not come before."""
-    found = [
-        PlanConflict("overlap", other.id, f"window {other.id} ({other.state}) covers part of the same time")
-        for other in others
-        if other.id != window.id
-        and other.state in COMMITTED
-        and other.start_utc_ns < window.stop_utc_ns
-        and window.start_utc_ns < other.stop_utc_ns
-    ]
+    """Return overlaps with committed windows, and a predecessor that does not come before.
+
+    The sequences of telecommands overlap if there is less than `gap_ns` between the windows.
+    """
+    found = []
+    for other in others:
+        between = max(other.start_utc_ns - window.stop_utc_ns, window.start_utc_ns - other.stop_utc_ns)
+        if other.id != window.id and other.state in COMMITTED and between < gap_ns:
+            what = f"window {other.id} ({other.state}) covers part of the same time"
+            if between >= 0:
+                what = (
+                    f"expected at least {gap_ns / 1e9:g} s between the window and window {other.id} "
+                    f"({other.state}) for their telecommands, found {between / 1e9:g} s"
+                )
+            found.append(PlanConflict("overlap", other.id, what))
     if predecessor is not None:
         if predecessor.stop_utc_ns > window.start_utc_ns or predecessor.id == window.id:
             found.append(

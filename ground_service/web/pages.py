@@ -18,11 +18,11 @@ from fastapi.responses import RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from ground_service.access.security import caller_of
-from ground_service.commanding.approval import DEFAULT_POLICY
 from ground_service.errors import NotAuthorised, NotFound
 from ground_service.evaluation.store import get_report
 from ground_service.ground import Ground
 from ground_service.http.common import Key
+from ground_service.missions.model import Approval
 from ground_service.passes.series import STATE_VALUES
 from ground_service.performance.store import get_monthly_report
 from ground_service.regression.service import report_of
@@ -267,7 +267,7 @@ def _telecommand(definition: PacketDefinition) -> dict[str, Any]:
         "description": definition.description,
         "service": definition.service,
         "subtype": definition.subtype,
-        "critical": definition.name in DEFAULT_POLICY.second_person_for,
+        "critical": Approval().needs_second_person(definition.name),
         "fields": [_field(field) for field in definition.fields],
         "repeats": [_field(field) for field in definition.group.fields] if definition.group else [],
         "group": definition.group.name if definition.group else None,

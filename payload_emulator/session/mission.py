@@ -32,6 +32,7 @@ from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import World, build_world, open_world
 from payload_emulator.sim.board.contact_plan import parse_outage
 from payload_emulator.sim.board.link import STATIONS, LinkSection
+from payload_emulator.sim.terrain.tiles import POLE_LIMIT_RAD
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.link import LinkSettings
@@ -59,15 +60,13 @@ evaluate = true
 
 [approval]
 windows = "automatic"
-one_person_for = [
-  "enable_schedule", "set_parameter", "set_time_report_rate",
-  "uplink_first", "uplink_middle", "uplink_last", "perform_function/set_mode",
-  "perform_function/start_observation", "perform_function/stop_observation",
-]
+one_person_for = ["uplink_first", "uplink_middle", "uplink_last", "perform_function/set_mode"]
 """
 """Automation and approval of a simulated spacecraft: windows that the ground plans are flown without a person."""
 
 _TRACK_STEP_S = 60.0
+_ALTITUDE_MARGIN = 1.3
+"""Altitudes of the mission beside those of the flight so far."""
 
 SPACECRAFT_NAME = "SelenITA"
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
@@ -151,6 +150,10 @@ def mission_text(world: World, data: DataFolder) -> str:
         "detector": _detector(scenario),
         "reference": _reference(scenario),
         "evidence": _evidence(world),
+        "observation": {
+            "latitude_limit_deg": _latitude_limit_deg(world),
+            "needs_daylight": scenario.light.mode != "paper",
+        },
         "requirements": _requirements(scenario),
     }
     lines = ["schema_version = 1", f"name = {_toml(scenario.name)}"]
@@ -159,6 +162,30 @@ def mission_text(world: World, data: DataFolder) -> str:
         if stated:
             lines += ["", f"[{name}]", *stated]
     return "\n".join(lines) + "\n"
+
+
+def _latitude_limit_deg(world: World) -> float | None:
+    """Return the largest latitude of the spacecraft from which all ground in view can be rendered; None: any."""
+    camera = world.scenario.camera
+    if camera.images == "reduced" or world.external is not None:
+        return None
+    highest_m = _ALTITUDE_MARGIN * float(spherical_from_mcmf(_track(world))[2].max())
+    # Central angle of a corner of the image at nadir; without ground there, that of the limb.
+    off_nadir = math.atan(
+        math.hypot(1.0, camera.height_px / camera.width_px) * math.tan(math.radians(camera.fov_deg / 2.0))
+    )
+    ratio = 1.0 + highest_m / MOON_RADIUS_M
+    sine = ratio * math.sin(off_nadir)
+    reach = math.asin(sine) - off_nadir if sine < 1.0 else math.acos(1.0 / ratio)
+    return math.floor(math.degrees(POLE_LIMIT_RAD - reach))
+
+
+def _track(world: World) -> FloatArray:
+    """Return the positions of the flight so far (n, 3), one a minute."""
+    times = np.arange(
+        world.truth.start_utc_ns, world.truth.stop_utc_ns, round(_TRACK_STEP_S * NS), dtype=np.int64
+    )
+    return world.truth.positions_mcmf(times)
 
 
 def _registration(world: World) -> dict[str, float | int]:

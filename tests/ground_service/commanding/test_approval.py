@@ -1,13 +1,9 @@
-"""The rule about second persons: from the effects of telecommands, raised or relaxed by a mission."""
+"""Second persons: from the effects of telecommands, raised or relaxed by a mission description."""
 
-import pytest
+from ground_service.missions.model import Approval
+from tmtc.effects import EFFECTS, Effect
 
-from ground_service.commanding.approval import DEFAULT_POLICY
-from tmtc.effects import EFFECTS, CommandEffect, Effect
-
-
-def needs(subject: str, policy=DEFAULT_POLICY) -> bool:
-    return policy.needs_second_person(EFFECTS[subject])
+needs = Approval().needs_second_person
 
 
 def test_whatever_is_not_routine_needs_a_second_person() -> None:
@@ -27,14 +23,11 @@ def test_whatever_is_not_routine_needs_a_second_person() -> None:
 
 
 def test_a_mission_can_raise_and_relax_the_rule() -> None:
-    policy = DEFAULT_POLICY.raised("replay_store").relaxed("perform_function/set_mode")
-    assert needs("replay_store", policy) and not needs("perform_function/set_mode", policy)
-    assert needs("set_parameter", policy)
-    for change in (policy.raised, policy.relaxed):
-        with pytest.raises(ValueError, match="found 'set_mode'"):
-            change("set_mode")
+    rules = Approval(second_person_for=("replay_store",), one_person_for=("perform_function/set_mode",))
+    assert rules.needs_second_person("replay_store")
+    assert not rules.needs_second_person("perform_function/set_mode")
+    assert rules.needs_second_person("set_parameter")
 
 
-def test_what_nobody_knows_needs_a_second_person_whatever_the_policy() -> None:
-    policy = DEFAULT_POLICY.relaxed(*EFFECTS)
-    assert policy.needs_second_person(CommandEffect("new_command", Effect.ROUTINE, ""))
+def test_an_unknown_telecommand_needs_a_second_person_whatever_the_mission_states() -> None:
+    assert Approval(one_person_for=tuple(EFFECTS)).needs_second_person("new_command")

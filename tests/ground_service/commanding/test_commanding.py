@@ -26,6 +26,7 @@ from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.model import Approval
 from ground_service.planning.model import WindowFilter
 from ground_service.planning.service import (
     WindowEntry,
@@ -329,8 +330,8 @@ def test_what_changes_the_state_of_the_payload_needs_a_second_person(
 
 
 def raise_rule(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = commanding.DEFAULT_POLICY.raised("perform_function/start_observation")
-    monkeypatch.setattr(commanding, "policy_of", lambda *_: policy)
+    rules = Approval(second_person_for=("perform_function/start_observation",))
+    monkeypatch.setattr(commanding, "approval_in_force", lambda *_: rules)
 
 
 def planned(ground: Ground, entered_by: str, approved_by: str) -> int:

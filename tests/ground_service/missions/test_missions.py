@@ -25,6 +25,7 @@ from ground_service.missions.model import (
 )
 from ground_service.missions.service import (
     add_mission,
+    check_mission_file,
     enter,
     mission_of_pass,
     read_mission,
@@ -329,6 +330,21 @@ def test_only_an_administrator_changes_which_telecommands_need_a_second_person(g
 def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line: str, message: str) -> None:
     faults = mission_faults(approval_text(line).decode())
     assert len(faults) == 1 and message in faults[0]
+
+
+def test_windows_approved_automatically_with_critical_telecommands_are_refused(
+    ground, tmp_path: Path
+) -> None:
+    extra = '\n[approval]\nwindows = "automatic"\n[uploads]\ntables = ["orientation"]\n'
+    found = "a second person needed for perform_function/set_mode, uplink_first, uplink_middle, uplink_last"
+    with pytest.raises(InvalidInput, match=found):
+        add_mission(ground, (TEXT + extra).encode())
+    (tmp_path / "m.toml").write_text(TEXT + extra)
+    mission, faults = check_mission_file(tmp_path / "m.toml")
+    assert mission is None and len(faults) == 1 and found in faults[0]
+    subjects = '["perform_function/set_mode", "uplink_first", "uplink_middle", "uplink_last"]'
+    released = extra.replace("[uploads]", f"one_person_for = {subjects}\n[uploads]")
+    assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
 
 
 def test_viewers_see_neither_passwords_nor_tokens_of_webhooks(tmp_path: Path) -> None:

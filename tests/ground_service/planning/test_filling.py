@@ -37,7 +37,9 @@ def window(start_h: float, hours: float, octets: int = 100, value: float = 1.0, 
 
 def test_windows_that_touch_do_not_overlap() -> None:
     assert violation(grid(), [window(1, 1), window(2, 1)]) is None
-    assert violation(grid(), [window(1, 1), window(1.99, 1)]) == "overlaps another window"
+    for one, gap in ((grid(), 1.99), (grid(gap_ns=HOUR // 10), 2.09)):
+        assert violation(one, [window(1, 1), window(gap, 1)]) == "overlaps another window or its telecommands"
+        assert violation(one, [window(1, 1), window(gap + 0.02, 1)]) is None
 
 
 def test_the_battery_is_that_of_a_balance_by_hand() -> None:

@@ -1,6 +1,9 @@
 """Candidate windows: every sample of a candidate fulfils the constraints, computed here a second time by hand."""
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -93,9 +96,39 @@ def test_long_spans_are_cut_and_short_ones_left_out() -> None:
     everything = search(plan, maximum_duration_s=1200.0)
     assert len(everything.candidates) == 15  # 17980 s in pieces of 1200 s at most
     assert everything.candidates[0].stop_utc_ns == everything.candidates[1].start_utc_ns
+    apart = search(replace(plan, gap_ns=81 * NS), maximum_duration_s=1200.0).candidates
+    assert [b.start_utc_ns - a.stop_utc_ns for a, b in pairwise(apart)] == [81 * NS] * 14
+    assert all(one.stop_utc_ns - one.start_utc_ns <= 1200 * NS for one in apart)
     none = search(plan, minimum_duration_s=86_400.0)
     assert none.candidates == ()
     assert {one.reason for one in none.rejected} == {"too short"}
+    assert "shorter than the minimum duration 86400 s" in none.reason
+
+
+def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_relaxation() -> None:
+    plan = planner(circle(eccentric_m=20e3))
+    north, low = (np.radians(60.0), np.radians(90.0)), (0.0, 35e3)
+    assert search(plan, latitude_rad=north).candidates
+    assert search(plan, altitude_m=low).candidates
+    found = search(plan, latitude_rad=north, altitude_m=low, sunlit=False)
+    assert found.candidates == () and found.reason is not None
+    reason, _, possible = found.reason.partition("; possible: ")
+    assert reason == (
+        "no window: excluded by altitude 0 to 35 km, latitude 60 to 90 deg with the minimum duration 300 s"
+    )
+    # The spacecraft is at 40 km over the pole and lower on one side of it.
+    (relaxed,) = re.findall(r"altitude 0 to 35 km relaxed by ([\d.]+) km", possible)
+    wider = (0.0, 35e3 + 1e3 * float(relaxed) + 100.0)
+    assert search(plan, latitude_rad=north, altitude_m=wider).candidates
+    assert not search(plan, latitude_rad=north, altitude_m=(0.0, wider[1] - 1e3)).candidates
+    high = search(plan, altitude_m=(80e3, 90e3), latitude_rad=north)
+    assert "excluded by altitude 80 to 90 km with" in high.reason
+    limited = search(plan, latitude_rad=north, limit_rad=np.radians(50.0))
+    assert (
+        "excluded by latitude 60 to 90 deg, latitude limit of the mission description 50 deg"
+        in limited.reason
+    )
+    assert "latitude 60 to 90 deg relaxed by" in limited.reason and "without" not in limited.reason
 
 
 def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> None:
@@ -187,6 +220,11 @@ def test_windows_conflict_where_they_overlap() -> None:
         PlannedSpan(6, 199, 400, "executed"),
     ]
     assert [one.window_id for one in span_conflicts(mine, None, others)] == [2, 6]
+    near = span_conflicts(mine, None, others, gap_ns=1)
+    assert [one.window_id for one in near] == [2, 3, 6]
+    assert near[1].detail == (
+        "expected at least 1e-09 s between the window and window 3 (approved) for their telecommands, found 0 s"
+    )
     assert span_conflicts(mine, PlannedSpan(7, 0, 100, "approved"), []) == []
     late = span_conflicts(mine, PlannedSpan(7, 0, 101, "failed"), [])
     assert [one.kind for one in late] == ["predecessor", "predecessor"]

@@ -6,6 +6,7 @@ import re
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,13 @@ from ground_service.clock import set_mission_clock
 from ground_service.commanding.model import TelecommandFilter
 from ground_service.commanding.service import get_command, list_telecommands
 from ground_service.ephemerides.service import add_ephemeris
-from ground_service.errors import InvalidInput, NotFound
+from ground_service.errors import InvalidInput, NotFound, PlanConflicts
 from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
-from ground_service.planning.model import WindowFilter
+from ground_service.planning.model import WindowEntry, WindowFilter
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
 from ground_service.planning.request_store import get_plan, get_request
@@ -276,6 +277,63 @@ def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem
     for one in windows:
         assert one.predicted.latitude_deg is not None
         assert -20.1 <= one.predicted.latitude_deg.min <= one.predicted.latitude_deg.max <= 20.1
+
+
+UPLOADS = "[uploads]\ntables = []\n"
+ONE_PERSON = AUTOMATIC + 'one_person_for = ["perform_function/set_mode"]\n'
+
+
+def test_sequences_of_windows_do_not_overlap(ground: Ground, oem: Path, now: Now) -> None:
+    prepare(ground, oem, ONE_PERSON + LINKS + UPLOADS)
+    request(ground, windows=9, minimum_duration_s=200.0, maximum_duration_s=400.0)
+    standing.plan_tick(ground, now.utc_ns)
+    windows = sorted(ground.read(list_windows, WindowFilter()).items, key=lambda one: one.start.utc_ns)
+    between = [(b.start.utc_ns - a.stop.utc_ns) / NS for a, b in pairwise(windows)]
+    # One sequence ends 20 s after its window, and the next begins 60 s before its own.
+    assert len(windows) == 9 and min(between) == 81.0
+    start = windows[0].stop.utc_ns + 80 * NS
+    with pytest.raises(PlanConflicts, match="expected at least 81 s between the window"):
+        planning.add_window(ground, WindowEntry("near", start, start + NS, 15.0, 76), actor="ann")
+
+
+def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem: Path, now: Now) -> None:
+    prepare(ground, oem, LINKS + UPLOADS)
+    request(ground, windows=1)
+    standing.plan_tick(ground, now.utc_ns)
+    (window,) = ground.read(list_windows, WindowFilter()).items
+    planning.change_window(ground, window.id, actor=standing.PLANNER, changes={}, decision="approved")
+    assert standing.plan_tick(ground, now.utc_ns)["released"] == 0
+    reason = ground.read(get_window, window.id).reason
+    assert reason is not None and reason.startswith(
+        "its telecommands cannot be released: telecommand perform_function: critical; expected"
+    )
+
+
+def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Now) -> None:
+    prepare(
+        ground, oem, AUTOMATIC + LINKS + "[observation]\nlatitude_limit_deg = 50\nneeds_daylight = false\n"
+    )
+    request(ground, windows=20, minimum_duration_s=200.0)
+    standing.plan_tick(ground, now.utc_ns)
+    windows = ground.read(list_windows, WindowFilter()).items
+    spans = [one.predicted.latitude_deg for one in windows]
+    assert windows and all(span is not None and span.min > -50.1 and span.max < 50.1 for span in spans)
+    sun = [one.predicted.sun_elevation_deg for one in windows]
+    assert any(span is not None and span.max < 0.0 for span in sun)  # the scenario draws its own light
+    region = {"latitude_deg": {"min": 52.0, "max": 90.0}}
+    key = request(ground, regions=[region], minimum_duration_s=60.0)
+    standing.plan_tick(ground, now.utc_ns)
+    reason = ground.read(get_plan, key).reason
+    assert (
+        reason is not None
+        and "excluded by latitude limit of the mission description 50 deg, regions" in reason
+    )
+    start = windows[0].start.utc_ns + HOUR // 2
+    entry = WindowEntry("pole", start, start + HOUR, 15.0, 76)
+    with pytest.raises(
+        PlanConflicts, match="expected latitudes within the 50 deg of the mission description"
+    ):
+        planning.add_window(ground, entry, actor="ann")
 
 
 def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Now) -> None:
