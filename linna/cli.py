@@ -43,7 +43,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "performance": ("performance", "recall, drift and error over many passes, and monthly reports"),
     "export": ("export", "write a pass in the formats of other tools: ephemerides, SPICE, maps, tables"),
     "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
-    "plan": ("plan", "search, enter, approve, uplink and exchange observation windows"),
+    "plan": ("plan", "search, enter, approve and uplink observation windows"),
     "trajectory": (
         "trajectory",
         "navigation solutions of a pass as TUM files, with absolute and relative errors",

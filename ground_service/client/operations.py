@@ -413,10 +413,6 @@ class Operations(Connection):
     def uplink_window(self, window_id: int) -> list[commanding.Telecommand]:
         """Release the time-tagged telecommands of an approved window; `POST uplink` then gives their octets."""
 
-    @operation("GET /plan")
-    def export_plan(self) -> planning.Plan:
-        """Export all windows that have not failed, for import into another service."""
-
     @operation("GET /plan/forecast")
     def get_forecast(
         self,
@@ -432,10 +428,6 @@ class Operations(Connection):
     @operation("GET /plan/crater-density")
     def get_crater_density(self, spacecraft_id: int) -> planning.CraterDensity:
         """Return the density of craters of 5 to 30 km in the catalogue of the mission description."""
-
-    @operation("POST /plan", body="plan")
-    def import_plan(self, plan: Document) -> planning.Imported:
-        """Import all windows of a plan as drafts, or none of them; existing windows do not change."""
 
     # links
 

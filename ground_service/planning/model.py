@@ -452,43 +452,6 @@ class WindowRecord(Window):
         )
 
 
-class PlanWindow(Given):
-    """A window in a plan; `key` names it within the plan, `after` the one that comes before it."""
-
-    key: str = Field(min_length=1, max_length=64, pattern=LINE_PATTERN_JSON, examples=["w1"])
-    after: str | None = Field(default=None, max_length=64, pattern=LINE_PATTERN_JSON)
-    name: Name
-    start: Time
-    stop: Time
-    cadence_s: Finite = Field(ge=0.1, le=3600.0)
-    spacecraft_id: SpacecraftNumber
-    instance: InstanceName = "flight"
-
-    def entry(self) -> WindowEntry:
-        """Return the requested window, without its predecessor."""
-        return WindowEntry(
-            name=self.name,
-            start_utc_ns=self.start.utc_ns,
-            stop_utc_ns=self.stop.utc_ns,
-            cadence_s=self.cadence_s,
-            spacecraft_id=self.spacecraft_id,
-            instance=self.instance,
-        )
-
-
-class Plan(Given):
-    """Windows for the exchange between services."""
-
-    schema_version: Literal[1] = 1
-    windows: list[PlanWindow] = Field(max_length=1000)
-
-
-class Imported(Entity):
-    """Ids of the windows of an imported plan, by their keys."""
-
-    windows: dict[str, int]
-
-
 class WindowFilter(Paging):
     """Windows to list."""
 

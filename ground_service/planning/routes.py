@@ -22,11 +22,9 @@ from ground_service.http.model import PageOf
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime
-from ground_service.planning import exchange, forecast, service, store
+from ground_service.planning import forecast, service, store
 from ground_service.planning.model import (
     CraterDensity,
-    Imported,
-    Plan,
     PlanForecast,
     SearchResult,
     Window,
@@ -123,12 +121,6 @@ def uplink_window(ground: GroundOf, caller: Operator, window_id: PassId) -> Page
     return PageOf.all_of([commanding.get_command(ground, key).telecommand for key in ids])
 
 
-@planning.get("/plan")
-def export_plan(ground: GroundOf, _: Viewer) -> Plan:
-    """Export all windows that have not failed, for import into another service."""
-    return exchange.export_plan(ground)
-
-
 @planning.get("/plan/forecast", responses=problems(404))
 def get_forecast(
     ground: GroundOf,
@@ -156,12 +148,6 @@ def get_crater_density(
 ) -> CraterDensity:
     """Return the density of craters of 5 to 30 km in the catalogue of the mission description."""
     return forecast.crater_density(ground, spacecraft_id)
-
-
-@planning.post("/plan", status_code=201, responses=problems(404, 409))
-def import_plan(ground: GroundOf, caller: Operator, plan: Plan) -> Imported:
-    """Import all windows of a plan as drafts, or none of them; existing windows do not change."""
-    return Imported(windows=exchange.import_plan(ground, plan.windows, actor=caller.name))
 
 
 def _tag(window: Window) -> str:

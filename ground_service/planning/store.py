@@ -24,7 +24,6 @@ from ground_service.planning.model import (
 )
 from ground_service.planning.window_states import COMMITTED, PlannedSpan
 from ground_service.store import repository, telemetry
-from ground_service.store.counters import lock_spacecraft
 from ground_service.store.repository import page
 from ground_service.store.states import change_if
 
@@ -100,13 +99,6 @@ def note_uploads(connection: Connection, window_id: int, uploads: WindowUploads)
         repository.change(connection, repository.PASSES, row["pass_id"], manifest={**known, **stated})
 
 
-def lock_plan(connection: Connection, vehicle: int) -> None:
-    """Lock the plan of a vehicle until the transaction ends, and keep the vehicle from being deleted."""
-    key = VEHICLES.c.id
-    connection.execute(select(key).where(key == vehicle).with_for_update(read=True, key_share=True))
-    lock_spacecraft(connection, vehicle)
-
-
 def delete_window(connection: Connection, window_id: int) -> None:
     """Delete a window."""
     connection.execute(WINDOWS.delete().where(WINDOWS.c.id == window_id))
@@ -126,12 +118,6 @@ def list_windows(connection: Connection, asked: WindowFilter) -> PageOf[Window]:
     """List the planned windows, newest first."""
     rows, total = page(connection, _joined(), asked, WINDOWS.c.created_utc_ns.desc(), WINDOWS.c.id.desc())
     return asked.page(_windows(connection, rows, Window), total)
-
-
-def planned_windows(connection: Connection) -> list[Window]:
-    """Return all windows that have not failed, in order of time."""
-    query = _joined().where(WINDOWS.c.state != "failed").order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
-    return _windows(connection, _rows(connection, query), Window)
 
 
 def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
@@ -159,19 +145,6 @@ def records_where(connection: Connection, *conditions: Any) -> list[WindowRecord
     """Return the windows that fulfil conditions on their columns, in order of time."""
     query = _joined().where(*conditions).order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
     return _windows(connection, connection.execute(query).mappings().all(), WindowRecord)
-
-
-def find_same(connection: Connection, vehicle: int, entry: WindowEntry) -> int | None:
-    """Return the id of a window of a vehicle with this name and span; None without any."""
-    row = repository.find(
-        connection,
-        WINDOWS,
-        vehicle_id=vehicle,
-        name=entry.name,
-        start_utc_ns=entry.start_utc_ns,
-        stop_utc_ns=entry.stop_utc_ns,
-    )
-    return None if row is None else int(row["id"])
 
 
 def follower_of(connection: Connection, window_id: int) -> int | None:

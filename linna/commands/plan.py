@@ -1,14 +1,12 @@
-"""`linna plan`: search, planning, approval, uplink and exchange of observation windows, and standing requests."""
+"""`linna plan`: search, planning, approval and uplink of observation windows, and standing requests."""
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._table import Command, Commands, Group, Option, add_commands, as_json
-from linna.errors import UsageError
 
 if TYPE_CHECKING:
     from ground_service.client import Client
@@ -94,23 +92,6 @@ def _uplink(service: Client, window_id: int, *, out: Path | None = None) -> dict
         with out.open("wb") as file:
             file.write(service.take_uplink(window.spacecraft_id, instance=window.instance).octets)
     return {"window_id": window_id, "telecommands": [as_json(one) for one in released]}
-
-
-def _export(service: Client, *, out: Path) -> dict[str, Any]:
-    plan = as_json(service.export_plan())
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
-    return {"file": str(out), "windows": len(plan["windows"])}
-
-
-def _import(service: Client, file: Path) -> dict[str, Any]:
-    try:
-        plan = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        raise UsageError(f"{file}: expected a plan as JSON, found other text") from None
-    if not isinstance(plan, dict):
-        raise UsageError(f"{file}: expected a plan as a JSON object, found {type(plan).__name__}")
-    return as_json(service.import_plan(plan))
 
 
 def _add_request(
@@ -287,15 +268,6 @@ COMMANDS: Commands = {
         options={"out": "write all released telecommands as CLTUs; they count as sent"},
     ),
     "request": Group("standing requests, which the planner keeps in the plan", REQUESTS),
-    "export": Command(
-        _export, "write the plan as JSON", lambda made: f"{made['file']}: {made['windows']} windows"
-    ),
-    "import": Command(
-        _import,
-        "enter the windows of a plan as drafts, all or none",
-        lambda made: "\n".join(f"{key}: window {number}" for key, number in made["windows"].items()),
-        options={"file": Option(metavar="file")},
-    ),
 }
 
 

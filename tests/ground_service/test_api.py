@@ -332,8 +332,6 @@ MATRIX = [
     ("PATCH", "/windows/1", "operator"),
     ("DELETE", "/windows/1", "operator"),
     ("POST", "/windows/1/uplink", "operator"),
-    ("GET", "/plan", "viewer"),
-    ("POST", "/plan", "operator"),
     ("GET", "/builds", "viewer"),
     ("POST", "/builds", "operator"),
     ("POST", "/builds/current", "operator"),
@@ -531,7 +529,7 @@ def test_requests_are_logged_with_an_id_that_the_answer_carries(
 
 def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) -> None:
     for body in (b"[" * 500_000, b"1" * 500_000):
-        answer = client.post(f"{V1}/plan", content=body, headers={"Content-Type": "application/json"})
+        answer = client.post(f"{V1}/windows", content=body, headers={"Content-Type": "application/json"})
         assert is_problem(answer, 400)
         assert "expected JSON of ordinary depth" in answer.json()["detail"]
 

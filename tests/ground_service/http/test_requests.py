@@ -112,7 +112,7 @@ def test_known_query_keys_are_taken(client: TestClient) -> None:
     ],
 )
 def test_json_with_no_or_two_meanings_is_refused(client: TestClient, body: bytes, words: str) -> None:
-    for path in ("/windows", "/telecommands", "/passes", "/plan"):
+    for path in ("/windows", "/telecommands", "/passes", "/requests"):
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)
 
 

@@ -1,7 +1,7 @@
 """Windows over the interface: searched, entered, decided on, uplinked, followed by telemetry, exchanged."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -234,38 +234,6 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
         stream = encode_cadus([packet], spacecraft_id=76)
         assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
     assert client.get(f"{V1}/windows/{key}").json()["state"] == expected
-
-
-def test_a_plan_goes_from_one_service_to_another(
-    client: TestClient, synthetic_pass: Any, tmp_path_factory: Callable[..., Any]
-) -> None:
-    first = approved(client, 0, 100)
-    approved(client, 100, 200, predecessor_id=first, name="second")
-    plan = client.get(f"{V1}/plan").json()
-    assert client.post(f"{V1}/plan", json=plan).json()["windows"] == {"w1": 1, "w2": 2}  # already there
-    home = tmp_path_factory.mktemp("other")
-    with TestClient(create_app(Settings(home=home), inline_jobs=True)) as other:
-        made = other.post(f"{V1}/plan", json=plan)
-        assert made.status_code == 201, made.text
-        second = other.get(f"{V1}/windows/{made.json()['windows']['w2']}").json()
-        assert (second["name"], second["state"]) == ("second", "draft")
-        assert second["predecessor_id"] == made.json()["windows"]["w1"]
-        # all or nothing: the last of these follows a window that ends after it begins
-        plan["windows"] = [
-            {**plan["windows"][0], "key": "a", "name": "new", "start": at(300), "stop": at(400)},
-            {
-                **plan["windows"][0],
-                "key": "b",
-                "name": "late",
-                "start": at(350),
-                "stop": at(450),
-                "after": "a",
-            },
-        ]
-        assert other.post(f"{V1}/plan", json=plan).status_code == 409
-        assert other.get(f"{V1}/windows").json()["total"] == 2
-        plan["windows"][0]["after"] = "b"
-        assert other.post(f"{V1}/plan", json=plan).status_code == 422
 
 
 @pytest.mark.parametrize(
