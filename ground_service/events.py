@@ -65,12 +65,13 @@ class CorrelationChanged(Event):
 
 
 class EphemerisAdded(Event):
-    """A reference ephemeris was added."""
+    """A reference ephemeris was added or withdrawn."""
 
     event_kind = "ephemeris"
     id: int
     start_utc_ns: int
     stop_utc_ns: int
+    withdrawn: bool = False
 
 
 class CommandsSent(Event):

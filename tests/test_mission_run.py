@@ -18,7 +18,8 @@ from ground_service.ground import open_ground
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.session.regions import Box, in_boxes, observed_boxes
+from payload_emulator.session.recipe import Box, inside_box
+from payload_emulator.session.regions import observed_boxes
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.checkpoints import Checkpoints
@@ -235,15 +236,15 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
         *((latitude, 35.0, latitude < 0.0) for latitude in (-5.0, 5.0)),
     ]
     equator = observed_boxes(flat_terrain(listed, []), 13.0)
-    assert equator == [Box(-13.0, 13.0, 0.0, 15.0), Box(32.0, 58.0, 15.0, 30.0)]
+    assert equator == [Box(0.0, 15.0, -13.0, 13.0), Box(15.0, 30.0, 32.0, 58.0)]
     # Ground with height rasters comes first, also further away from the equator.
     assert observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0)[0] == Box(
-        2.0, 28.0, 0.0, 15.0
+        0.0, 15.0, 2.0, 28.0
     )
     # Part of the height is not enough.
     assert observed_boxes(flat_terrain(listed, [(0.0, 0.0)]), 13.0) == equator
     everywhere = SimpleNamespace(is_real=False)
-    assert observed_boxes(cast(Any, everywhere), 13.0) == [Box(-13.0, 13.0, -180.0, 180.0)]
-    widened = Box(-13.0, 13.0, -5.0, 15.0).widened(5.0)
+    assert observed_boxes(cast(Any, everywhere), 13.0) == [Box(-180.0, 180.0, -13.0, 13.0)]
+    widened = Box(-5.0, 15.0, -13.0, 13.0).widened(5.0)
     places = np.array([0.0, 17.0, 19.0]), np.array([352.0, 19.0, 0.0])
-    assert in_boxes(*places, [widened]).tolist() == [True, True, False]
+    assert inside_box(widened, *places).tolist() == [True, True, False]

@@ -317,6 +317,10 @@ class Operations(Connection):
     def list_ephemerides(self) -> Listing[ephemerides.Ephemeris]:
         """List the reference ephemerides, newest first."""
 
+    @operation("DELETE /ephemerides/{ephemeris_id}")
+    def withdraw_ephemeris(self, ephemeris_id: int) -> None:
+        """Withdraw a reference ephemeris that no pass or window names; its file and the audit entries are kept."""
+
     # jobs
 
     @operation("GET /jobs", reads="jobs.store.list_jobs")

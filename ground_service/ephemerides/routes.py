@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query
+from fastapi import Query, Response
 
 from ground_service.access.security import Operator, UploadOf, add_list
 from ground_service.ephemerides import service, store
 from ground_service.ephemerides.model import Ephemeris
-from ground_service.http.common import API_PREFIX, GroundOf, Name, upload_body
-from ground_service.http.requests import operations
+from ground_service.http.common import API_PREFIX, GroundOf, Name, RowId, upload_body
+from ground_service.http.requests import operations, problems
 
 EPHEMERIS_FILE = "CCSDS OEM (text or XML), STK .e or Horizons CSV file; also as .gz or .zip"
 UPLOAD_PATHS = (f"{API_PREFIX}/ephemerides",)
@@ -40,3 +40,10 @@ async def add_ephemeris(
 
 
 add_list(ephemerides, "/ephemerides", store.list_ephemerides)
+
+
+@ephemerides.delete("/ephemerides/{ephemeris_id}", status_code=204, responses=problems(404, 409))
+def withdraw_ephemeris(ground: GroundOf, caller: Operator, ephemeris_id: RowId) -> Response:
+    """Withdraw a reference ephemeris that no pass or window names; its file and the audit entries are kept."""
+    service.withdraw_ephemeris(ground, ephemeris_id, actor=caller.name)
+    return Response(status_code=204)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
+from sqlalchemy import Connection
+
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.ephemerides import store
@@ -12,6 +14,7 @@ from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.events import EphemerisAdded, publish
 from ground_service.ground import Ground
+from ground_service.missions.store import missions_in_force
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
@@ -28,7 +31,7 @@ def add_ephemeris(
     Raises
     ------
     InvalidInput
-        If the file cannot be read as an ephemeris.
+        If the file cannot be read as an ephemeris, or is that of an object that no mission description names.
     """
     try:
         ephemeris = load_ephemeris(stored.path)
@@ -38,6 +41,7 @@ def add_ephemeris(
     now = utc_now_ns()
     with ground.database.writing() as connection:
         hold(connection, f"ephemeris {stored.sha256}")
+        _check_object(connection, ephemeris.segments[0].object_name)
         register_file(connection, stored, "ephemeris", name, now)
         known = store.find_ephemeris(connection, sha256=stored.sha256, precedence=precedence, name=name)
         if known is not None:
@@ -53,6 +57,34 @@ def add_ephemeris(
             ),
         )
         return added
+
+
+def _check_object(connection: Connection, name: str) -> None:
+    known = [one.spacecraft for one in missions_in_force(connection).values()]
+    if known and not any(one.is_object(name) for one in known):
+        names = ", ".join(one.name or "" for one in known)
+        expected = f"a spacecraft with a mission description ({names}, or its spacecraft.object_names)"
+        raise InvalidInput("ephemeris", "OBJECT_NAME", expected, name)
+
+
+def withdraw_ephemeris(ground: Ground, ephemeris_id: int, *, actor: str) -> None:
+    """Withdraw a reference ephemeris: plans and reports no longer use it; the audit log and its file are kept.
+
+    Raises
+    ------
+    Conflict
+        A pass or a window names it.
+    """
+    with ground.database.writing() as connection:
+        found = store.withdraw_ephemeris(connection, ephemeris_id)
+        detail = found.model_dump(mode="json", include={"sha256", "object_name", "precedence"})
+        audit(connection, actor, "withdraw ephemeris", found.name, {"id": ephemeris_id, **detail})
+        publish(
+            connection,
+            EphemerisAdded(
+                id=found.id, start_utc_ns=found.start.utc_ns, stop_utc_ns=found.stop.utc_ns, withdrawn=True
+            ),
+        )
 
 
 def open_ephemeris(ground: Ground, reference: Ephemeris) -> States:

@@ -8,7 +8,9 @@ from typing import Any
 from sqlalchemy import Connection, select
 
 from ground_service.ephemerides.model import Ephemeris
+from ground_service.errors import Conflict
 from ground_service.http.model import PageOf, Paging
+from ground_service.missions.store import mission_in_force
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 from lunar import ephemeris
@@ -59,15 +61,38 @@ def list_ephemerides(connection: Connection, asked: Paging) -> PageOf[Ephemeris]
     return asked.page(map(_ephemeris, rows), total)
 
 
-def covering_ephemerides(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[Ephemeris]:
-    """Return the ephemerides that overlap an interval, by precedence, then the newest first."""
+def covering_ephemerides(
+    connection: Connection, start_utc_ns: int, stop_utc_ns: int, spacecraft_id: int | None
+) -> list[Ephemeris]:
+    """Return the ephemerides of a spacecraft that overlap an interval, by precedence, then the newest first."""
     table = EPHEMERIDES.c
     query = (
         select(EPHEMERIDES)
         .where(table.start_utc_ns <= stop_utc_ns, table.stop_utc_ns >= start_utc_ns)
         .order_by(table.precedence.desc(), table.id.desc())
     )
-    return [_ephemeris(row) for row in connection.execute(query).mappings()]
+    mission = mission_in_force(connection, spacecraft_id)
+    rows = connection.execute(query).mappings()
+    return [
+        _ephemeris(row) for row in rows if mission is None or mission.spacecraft.is_object(row["object_name"])
+    ]
+
+
+def withdraw_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
+    """Delete the entry of an ephemeris, whose file is kept, and return it.
+
+    Raises
+    ------
+    Conflict
+        A pass or a window names it.
+    """
+    found = get_ephemeris(connection, ephemeris_id)
+    for table, what in ((repository.PASSES, "pass"), (repository.WINDOWS, "window")):
+        user = repository.find(connection, table, ephemeris_id=ephemeris_id)
+        if user is not None:
+            raise Conflict(f"ephemeris {ephemeris_id}: is that of {what} {user['id']}")
+    connection.execute(EPHEMERIDES.delete().where(EPHEMERIDES.c.id == ephemeris_id))
+    return found
 
 
 def _ephemeris(row: Mapping[Any, Any]) -> Ephemeris:

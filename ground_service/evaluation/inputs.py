@@ -401,7 +401,8 @@ def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None
 def reference_of(connection: Connection, record: PassRecord) -> EphemerisEntry | None:
     if record.ephemeris_id is not None:
         return get_ephemeris(connection, record.ephemeris_id)
-    covering = covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns)
+    spacecraft = get_vehicle(connection, record.vehicle_id, "spacecraft").ccsds_id
+    covering = covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns, spacecraft)
     return covering[0] if covering else None
 
 

@@ -165,7 +165,9 @@ def predict(
     if station is None:
         return (), "the mission description states no place of the station"
     with ground.database.reading() as connection:
-        references = ephemerides.covering_ephemerides(connection, start_utc_ns, stop_utc_ns)
+        references = ephemerides.covering_ephemerides(
+            connection, start_utc_ns, stop_utc_ns, declared.spacecraft_id
+        )
     if not references:
         return (), "no reference ephemeris covers the time"
     outages = outages_of(declared.stations)

@@ -50,10 +50,16 @@ CommandSubject = Annotated[str, AfterValidator(_known_subject)]
 
 
 class Spacecraft(Section):
-    """Spacecraft identification."""
+    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), besides `name`."""
 
     id: Annotated[int, Field(ge=0, le=1023)] | None = None
     name: str | None = None
+    object_names: Annotated[tuple[str, ...], Array] | None = None
+
+    def is_object(self, name: str) -> bool:
+        """Return whether an ephemeris of an object is one of this spacecraft; any is if no name is stated."""
+        known = [one.casefold() for one in (self.name, *(self.object_names or ())) if one]
+        return not known or name.casefold() in known
 
 
 class DictionarySection(Section):

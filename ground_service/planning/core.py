@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ground_service.evaluation.detection.recall import expected_craters
-from ground_service.links.core import predict_contacts
+from ground_service.links.core import PredictedContact, predict_contacts
 from ground_service.missions.stations import STATIONS
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
@@ -92,15 +92,6 @@ class Resources:
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
-    """A span in which a station sees the spacecraft."""
-
-    station: str
-    start_utc_ns: int
-    stop_utc_ns: int
-
-
-@dataclass(frozen=True, slots=True)
 class Commitment:
     """A window that is planned already: its span and the data it will make."""
 
@@ -143,7 +134,7 @@ class SearchResult:
     """Candidates in order of time, the contacts that were counted with, and why spans were left out."""
 
     candidates: tuple[Candidate, ...]
-    contacts: tuple[Contact, ...]
+    contacts: tuple[PredictedContact, ...]
     rejected: tuple[RejectedSpan, ...] = ()
     reason: str | None = None
 
@@ -254,8 +245,7 @@ class Planner:
         seconds = np.zeros(steps)
         if stop > start_utc_ns:
             contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop, outages)
-            spans = [Contact(one.station, one.start_utc_ns, one.stop_utc_ns) for one in contacts]
-            for begin, end in _union(spans):
+            for begin, end in _union(contacts):
                 inside = np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin)
                 seconds += np.maximum(inside, 0) / NS
         return np.asarray(seconds * self.resources.downlink_bit_s / 8.0)
@@ -278,10 +268,9 @@ class Planner:
             Constraints(), start_utc_ns, stop_utc_ns, cadence_s, contacts, battery, commitments
         )
 
-    def contacts(self, start_utc_ns: int, stop_utc_ns: int) -> tuple[Contact, ...]:
+    def contacts(self, start_utc_ns: int, stop_utc_ns: int) -> tuple[PredictedContact, ...]:
         """When a station sees the spacecraft, in order of time."""
-        found = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
-        return tuple(Contact(one.station, one.start_utc_ns, one.stop_utc_ns) for one in found)
+        return predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
 
     def conditions(self, utc_ns: IntArray) -> Conditions:
         """Return the conditions below the spacecraft at epochs (n,)."""
@@ -365,7 +354,7 @@ class Planner:
         start: int,
         stop: int,
         cadence_s: float,
-        contacts: Sequence[Contact],
+        contacts: Sequence[PredictedContact],
         battery: tuple[IntArray, FloatArray],
         commitments: Sequence[Commitment],
     ) -> Candidate:
@@ -436,7 +425,10 @@ def data_octets(frames: int, detections_per_frame: float, estimators: int) -> in
 
 
 def storage_peak(
-    commitments: Sequence[Commitment], contacts: Sequence[Contact], downlink_bit_s: float, mine: Commitment
+    commitments: Sequence[Commitment],
+    contacts: Sequence[PredictedContact],
+    downlink_bit_s: float,
+    mine: Commitment,
 ) -> tuple[int, int | None]:
     """Most octets ever stored on board, and when those of `mine` are down (None: not within the contacts).
 
@@ -472,7 +464,7 @@ def storage_peak(
     return peak, next(end for end, one in finished if one is mine)
 
 
-def _union(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
+def _union(contacts: Sequence[PredictedContact]) -> list[tuple[int, int]]:
     """Spans in which at least one station sees the spacecraft."""
     spans: list[tuple[int, int]] = []
     for contact in sorted(contacts, key=lambda one: one.start_utc_ns):

@@ -82,6 +82,14 @@ class ResourceGrid:
         step = (option.stop_utc_ns - self.start_utc_ns) // self.step_ns
         return int(min(max(step, 0), len(self.gain_wh) - 1))
 
+    def flows(self, chosen: Sequence[Option]) -> tuple[FloatArray, FloatArray]:
+        """Return the change of the battery and the octets that arrive in each step (n,) with a set of windows."""
+        change, arrivals = self.gain_wh.copy(), np.zeros(len(self.gain_wh))
+        for option in chosen:
+            change -= self.energy_wh(option)
+            arrivals[self.arrival(option)] += option.octets
+        return change, arrivals
+
     @property
     def later_octets(self) -> FloatArray:
         """Octets that contacts can take within `downlink_within_s` after each step (n,); infinite where unknown."""
@@ -100,11 +108,7 @@ def violation(grid: ResourceGrid, chosen: Sequence[Option]) -> str | None:
             return "overlaps another window or its telecommands"
     if (reason := _duty_violation(grid, ordered)) is not None:
         return reason
-    change = grid.gain_wh.copy()
-    arrivals = np.zeros(len(change))
-    for option in ordered:
-        change -= grid.energy_wh(option)
-        arrivals[grid.arrival(option)] += option.octets
+    change, arrivals = grid.flows(ordered)
     return _battery_violation(grid, change) or _storage_violation(grid, arrivals)
 
 
@@ -119,11 +123,7 @@ class ResourceCurves:
 
 def curves(grid: ResourceGrid, chosen: Sequence[Option]) -> ResourceCurves:
     """Return battery, storage and downlink with a set of windows, whether or not it keeps the limits."""
-    change = grid.gain_wh.copy()
-    arrivals = np.zeros(len(change))
-    for option in chosen:
-        change -= grid.energy_wh(option)
-        arrivals[grid.arrival(option)] += option.octets
+    change, arrivals = grid.flows(chosen)
     battery, stored, sent = np.empty(len(change)), np.empty(len(change)), np.empty(len(change))
     charge, held = grid.battery_wh, 0.0
     for i, (gain, arrived, can) in enumerate(

@@ -64,7 +64,9 @@ def get_forecast(
             connection, spacecraft_id, instance, start_utc_ns - HISTORY_NS, stop_utc_ns
         )
         try:
-            reference = service.ephemeris_for(connection, ephemeris_id, start_utc_ns, stop_utc_ns)
+            reference = service.ephemeris_for(
+                connection, ephemeris_id, start_utc_ns, stop_utc_ns, spacecraft_id
+            )
         except NotFound:
             if ephemeris_id is not None:
                 raise
@@ -88,7 +90,7 @@ def get_forecast(
     )
     if reference is None or count < 1:
         return empty
-    planner = service.planner_of(ground, reference, mission, service.resources_of(mission))
+    planner = service.planner_of(ground, reference, mission)
     return _forecast(empty, planner, mission, reference, windows, begin, count, start_utc_ns, stop_utc_ns)
 
 

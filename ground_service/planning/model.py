@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import GivenTime, UtcTime
-from ground_service.missions.stations import STATIONS
 from ground_service.planning import core
-from ground_service.planning.core import Constraints, Resources
+from ground_service.planning.core import Constraints
 from ground_service.text import LINE_PATTERN_JSON
-from lunar.visibility import GroundStation
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
@@ -39,7 +37,6 @@ class WindowEntry:
     instance: str = "flight"
     predecessor_id: int | None = None
     ephemeris_id: int | None = None
-    resources: Resources = field(default_factory=Resources)
 
 
 class Limits(Given):
@@ -57,54 +54,6 @@ class Limits(Given):
     def scaled(self, factor: float) -> tuple[float, float]:
         """Return both values times a factor."""
         return self.min * factor, self.max * factor
-
-
-class Station(Given):
-    """A ground station."""
-
-    name: Name = Field(examples=["Canberra"])
-    latitude_deg: Finite = Field(ge=-90.0, le=90.0, examples=[-35.4])
-    longitude_deg: Finite = Field(ge=-360.0, le=360.0, examples=[149.0])
-    height_m: Finite = Field(default=0.0, ge=-500.0, le=9000.0)
-    minimum_elevation_deg: Finite = Field(default=10.0, ge=0.0, le=90.0)
-
-
-class ResourcesIn(Given):
-    """Resources of the spacecraft and of the ground."""
-
-    storage_mib: Finite = Field(default=64.0, gt=0.0, le=1e6)
-    downlink_kbit_s: Finite = Field(default=16.0, ge=0.0, le=1e6)
-    battery_wh: Finite = Field(default=75.0, gt=0.0, le=1e5)
-    generation_w: Finite = Field(default=30.0, ge=0.0, le=1e4)
-    idle_w: Finite = Field(default=12.0, ge=0.0, le=1e4)
-    observing_w: Finite = Field(default=8.0, ge=0.0, le=1e4, description="On top of idle_w")
-    stations: list[Station] | None = Field(
-        default=None, max_length=20, description="Default: Goldstone, Canberra, Madrid"
-    )
-
-    def value(self) -> Resources:
-        """Return the value for the planner."""
-        stations: tuple[GroundStation, ...] = STATIONS
-        if self.stations is not None:
-            stations = tuple(
-                GroundStation(
-                    one.name,
-                    math.radians(one.latitude_deg),
-                    math.radians(one.longitude_deg),
-                    one.height_m,
-                    math.radians(one.minimum_elevation_deg),
-                )
-                for one in self.stations
-            )
-        return Resources(
-            storage_octets=round(self.storage_mib * (1 << 20)),
-            downlink_bit_s=self.downlink_kbit_s * 1e3,
-            battery_wh=self.battery_wh,
-            generation_w=self.generation_w,
-            idle_w=self.idle_w,
-            observing_w=self.observing_w,
-            stations=stations,
-        )
 
 
 class WindowSearch(Given):
@@ -133,7 +82,6 @@ class WindowSearch(Given):
     maximum_duration_s: Finite = Field(default=2400.0, ge=30.0, le=86_400.0)
     minimum_battery: Finite | None = Field(default=None, ge=0.0, le=1.0, description="Share of its capacity")
     needs_contact: bool = Field(default=False, description="Its data must be downlinked within the span")
-    resources: ResourcesIn = Field(default_factory=ResourcesIn)
 
     def constraints(self) -> Constraints:
         """Return the value for the planner."""
@@ -295,7 +243,6 @@ class WindowIn(Given):
     instance: InstanceName = "flight"
     predecessor_id: int | None = Field(default=None, ge=1, le=2**31 - 1)
     ephemeris_id: int | None = Field(default=None, ge=1, le=2**31 - 1)
-    resources: ResourcesIn = Field(default_factory=ResourcesIn)
 
     def entry(self) -> WindowEntry:
         """Return the requested window."""
@@ -308,7 +255,6 @@ class WindowIn(Given):
             instance=self.instance,
             predecessor_id=self.predecessor_id,
             ephemeris_id=self.ephemeris_id,
-            resources=self.resources.value(),
         )
 
 
@@ -335,24 +281,13 @@ class WindowChange(Given):
         }
 
 
-class PlannedResources(Entity):
-    """Resources that a window was assessed with."""
-
-    storage_octets: int
-    downlink_bit_s: float
-    battery_wh: float
-    generation_w: float
-    idle_w: float
-    observing_w: float
-    estimators: int
-    detections_per_frame: float
-
-
 class WindowPrediction(Entity):
     """Prediction of a window; the conditions are unknown if no reference ephemeris covers it."""
 
+    # Rows of earlier versions also state resources.
+    model_config = ConfigDict(extra="ignore")
+
     frames: int | None = None
-    resources: PlannedResources | None = None
     start: UtcTime | None = None
     stop: UtcTime | None = None
     altitude_km: Span | None = None
@@ -438,7 +373,6 @@ class WindowRecord(Window):
 
     def entry(self) -> WindowEntry:
         """Return the request of the window."""
-        resources = self.predicted.resources
         return WindowEntry(
             name=self.name,
             start_utc_ns=self.start.utc_ns,
@@ -448,7 +382,6 @@ class WindowRecord(Window):
             instance=self.instance,
             predecessor_id=self.predecessor_id,
             ephemeris_id=self.ephemeris_id,
-            resources=Resources() if resources is None else Resources(**resources.model_dump()),
         )
 
 

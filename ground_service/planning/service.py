@@ -41,7 +41,6 @@ from ground_service.planning.core import (
 from ground_service.planning.model import (
     AssessedWindow,
     Contact,
-    PlannedResources,
     SearchResult,
     Window,
     WindowEntry,
@@ -100,7 +99,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     start = None if given.start is None else given.start.utc_ns
     stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
-        reference = ephemeris_for(connection, given.ephemeris_id, start, stop)
+        reference = ephemeris_for(connection, given.ephemeris_id, start, stop, given.spacecraft_id)
         mission = missions.mission_in_force(connection, given.spacecraft_id)
         constraints = observable(given.constraints(), mission)
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
@@ -120,7 +119,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     mare = _mare(ground.data) if constraints.mare is not None else None
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
-    planner = planner_of(ground, reference, mission, given.resources.value(), catalogue, mare)
+    planner = planner_of(ground, reference, mission, catalogue, mare)
     found = planner.search(
         constraints, start, stop, given.cadence_s, step_s=given.step_s, commitments=commitments
     )
@@ -133,16 +132,8 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
         ephemeris_id=reference.id,
         data=names,
         candidates=[model.Candidate.from_core(one) for one in found.candidates],
-        contacts=[
-            Contact(station=one.station, start=UtcTime(one.start_utc_ns), stop=UtcTime(one.stop_utc_ns))
-            for one in found.contacts
-        ],
-        rejected=[
-            model.RejectedSpan(
-                start=UtcTime(one.start_utc_ns), stop=UtcTime(one.stop_utc_ns), reason=one.reason
-            )
-            for one in found.rejected
-        ],
+        contacts=[Contact.of(asdict(one)) for one in found.contacts],
+        rejected=[model.RejectedSpan.of(asdict(one)) for one in found.rejected],
         reason=found.reason,
     )
 
@@ -364,7 +355,9 @@ def _preparation(
     if mission is None or mission.uploads is None:
         return []
     start, stop = window.start.utc_ns, window.stop.utc_ns
-    found = ephemerides.covering_ephemerides(connection, start - MARGIN_NS, stop + MARGIN_NS)
+    found = ephemerides.covering_ephemerides(
+        connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id
+    )
     whole = [
         one for one in found if one.start.utc_ns <= start - MARGIN_NS and stop + MARGIN_NS <= one.stop.utc_ns
     ]
@@ -403,7 +396,8 @@ def _assessed(
     commitments = store.commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
     prediction = _prediction(ground, connection, entry, commitments)
     frames = frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
-    octets = data_octets(frames, entry.resources.detections_per_frame, entry.resources.estimators)
+    resources = resources_of(mission)
+    octets = data_octets(frames, resources.detections_per_frame, resources.estimators)
     limit = None if mission is None else mission.observation.latitude_limit_deg
     if prediction is not None:
         peak = prediction.storage_peak_octets
@@ -429,21 +423,20 @@ def _assessed(
         if (conflict := _coverage_conflict(connection, entry)) is not None:
             conflicts.append(conflict)
         mine = Commitment(entry.start_utc_ns, entry.stop_utc_ns, octets)
-        peak, _ = storage_peak([*commitments, mine], (), entry.resources.downlink_bit_s, mine)
-    if peak > entry.resources.storage_octets:
+        peak, _ = storage_peak([*commitments, mine], (), resources.downlink_bit_s, mine)
+    if peak > resources.storage_octets:
         conflicts.append(
             PlanConflict(
                 "storage",
                 None,
-                f"{peak} octets would be stored on board, expected at most {entry.resources.storage_octets}",
+                f"{peak} octets would be stored on board, expected at most {resources.storage_octets}",
             )
         )
     if conflicts:
         what = f"window {window_id}" if window_id else "window"
         raise PlanConflicts(f"{what} as {decision}", conflicts)
     conditions = {} if prediction is None else dict(model.Candidate.from_core(prediction))
-    resources = PlannedResources.model_validate(entry.resources, from_attributes=True)
-    predicted = WindowPrediction.model_validate({"frames": frames, "resources": resources} | conditions)
+    predicted = WindowPrediction.model_validate({"frames": frames} | conditions)
     return AssessedWindow(entry, octets, predicted)
 
 
@@ -451,7 +444,6 @@ def planner_of(
     ground: Ground,
     reference: Ephemeris,
     mission: Mission | None,
-    resources: Resources,
     catalogue: CraterCatalogue | None = None,
     mare: Any = None,
 ) -> Planner:
@@ -461,7 +453,7 @@ def planner_of(
     return Planner(
         open_ephemeris(ground, reference),
         orientation,
-        resources,
+        resources_of(mission),
         camera_of(stated.camera),
         catalogue,
         mare,
@@ -469,8 +461,10 @@ def planner_of(
     )
 
 
-def resources_of(mission: Mission) -> Resources:
+def resources_of(mission: Mission | None) -> Resources:
     """Return the resources that a mission description states, with defaults for the others."""
+    if mission is None:
+        return Resources()
     stated, default = mission.resources, asdict(Resources())
     rates = [
         one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None
@@ -498,12 +492,14 @@ def _prediction(
     candidates = (
         [ephemerides.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
-        else ephemerides.covering_ephemerides(connection, entry.start_utc_ns, entry.stop_utc_ns)
+        else ephemerides.covering_ephemerides(
+            connection, entry.start_utc_ns, entry.stop_utc_ns, entry.spacecraft_id
+        )
     )
     for one in candidates:
         start, stop = one.start.utc_ns, one.stop.utc_ns
         if start <= entry.start_utc_ns and entry.stop_utc_ns <= stop:
-            planner = planner_of(ground, one, mission, entry.resources)
+            planner = planner_of(ground, one, mission)
             try:
                 return planner.predict(
                     entry.start_utc_ns,
@@ -554,13 +550,17 @@ def _span_conflicts(
 
 
 def ephemeris_for(
-    connection: Connection, ephemeris_id: int | None, start: int | None, stop: int | None
+    connection: Connection,
+    ephemeris_id: int | None,
+    start: int | None,
+    stop: int | None,
+    spacecraft_id: int | None,
 ) -> Ephemeris:
     if ephemeris_id is not None:
         return ephemerides.get_ephemeris(connection, ephemeris_id)
     first = start if start is not None else -(2**62)
     last = stop if stop is not None else 2**62
-    found = ephemerides.covering_ephemerides(connection, first, last)
+    found = ephemerides.covering_ephemerides(connection, first, last, spacecraft_id)
     if not found:
         raise NotFound("ephemeris", "over the span of the search")
 

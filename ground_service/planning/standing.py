@@ -241,7 +241,7 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
         situation = _Situation(
             request,
             Mission(name="not stated") if mission is None else mission,
-            tuple(ephemerides.covering_ephemerides(connection, now, end)),
+            tuple(ephemerides.covering_ephemerides(connection, now, end, request.spacecraft_id)),
             tuple(one for one in windows if one.request_id == request_id),
             tuple(one for one in windows if one.state in COMMITTED or one.state == "draft"),
         )
@@ -311,7 +311,6 @@ def _candidates(
     Without any, the second value is what excludes them on the first day.
     """
     constraints = planning.observable(situation.request.terms.constraints(), situation.mission)
-    resources = planning.resources_of(situation.mission)
     found: list[tuple[int, int]] = []
     planners: list[tuple[Planner, int, int]] = []
     for day in range(start // DAY_NS, -(-end // DAY_NS)):
@@ -319,7 +318,7 @@ def _candidates(
         for reference in situation.references:
             first, last = max(begin, reference.start.utc_ns), min(stop, reference.stop.utc_ns)
             if first <= max(begin, start) and last >= min(stop, end) and last > first:
-                planner = planning.planner_of(ground, reference, situation.mission, resources)
+                planner = planning.planner_of(ground, reference, situation.mission)
                 key = (reference.sha256, situation.mission.revision)
                 found += _spans_of(_Keyed(key, planner), constraints, first, last)
                 planners.append((planner, max(first, start), min(last, end)))
@@ -407,7 +406,7 @@ def _grid(ground: Ground, situation: _Situation, resources: Resources, now: int,
     reference = max(situation.references, key=lambda one: one.stop.utc_ns)
     start = max(now - HISTORY_NS, reference.start.utc_ns)
     stop = min(end + DAY_NS, reference.stop.utc_ns)
-    planner = planning.planner_of(ground, reference, situation.mission, resources)
+    planner = planning.planner_of(ground, reference, situation.mission)
     n = max(int((stop - start) // round(STEP_S * NS)), 1)
     epochs = start + (np.arange(n, dtype=np.int64) * 2 + 1) * round(STEP_S * NS / 2)
     gain_w = planner.sunlit(np.minimum(epochs, stop)) * resources.generation_w - resources.idle_w
@@ -441,7 +440,6 @@ def _stored(
 ) -> int:
     """Enter the chosen windows and the plan in one transaction, unless another process did; return their number."""
     request = situation.request
-    resources = planning.resources_of(situation.mission)
     with ground.database.writing() as connection:
         lock_spacecraft(connection, request.vehicle_id)
         if not store.claim_plan(connection, request):
@@ -456,7 +454,6 @@ def _stored(
                 cadence_s=request.terms.cadence_s,
                 spacecraft_id=request.spacecraft_id,
                 instance=request.instance,
-                resources=resources,
             )
             try:
                 window = planning.insert_window(ground, connection, entry, actor=PLANNER)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, func, or_, select
-from sqlalchemy.engine import RowMapping
 from sqlalchemy.sql import Select
 
 from ground_service.commanding.store import ids_of_windows
@@ -122,10 +121,8 @@ def list_windows(connection: Connection, asked: WindowFilter) -> PageOf[Window]:
 
 def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
     """Return the approved windows of a vehicle that are not processed, in order of time."""
-    query = _joined().where(
-        WINDOWS.c.vehicle_id == vehicle, WINDOWS.c.decision == "approved", WINDOWS.c.state != "processed"
-    )
-    return _windows(connection, _rows(connection, query.order_by(WINDOWS.c.start_utc_ns)), WindowRecord)
+    mine = WINDOWS.c.vehicle_id == vehicle
+    return records_where(connection, mine, WINDOWS.c.decision == "approved", WINDOWS.c.state != "processed")
 
 
 def is_replaced(connection: Connection, window: WindowRecord) -> bool:
@@ -186,20 +183,16 @@ def commitments(
 
 def windows_between(
     connection: Connection, spacecraft_id: int, instance: str, start_utc_ns: int, stop_utc_ns: int
-) -> list[Window]:
+) -> list[WindowRecord]:
     """Return the windows of a spacecraft, except failed ones, that overlap an interval, in order of time."""
-    query = (
-        _joined()
-        .where(
-            VEHICLES.c.ccsds_id == spacecraft_id,
-            VEHICLES.c.instance == instance,
-            WINDOWS.c.state != "failed",
-            WINDOWS.c.stop_utc_ns > start_utc_ns,
-            WINDOWS.c.start_utc_ns < stop_utc_ns,
-        )
-        .order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
+    return records_where(
+        connection,
+        VEHICLES.c.ccsds_id == spacecraft_id,
+        VEHICLES.c.instance == instance,
+        WINDOWS.c.state != "failed",
+        WINDOWS.c.stop_utc_ns > start_utc_ns,
+        WINDOWS.c.start_utc_ns < stop_utc_ns,
     )
-    return _windows(connection, _rows(connection, query), Window)
 
 
 def add_pass(connection: Connection, window: WindowRecord, mission_id: int | None, now_utc_ns: int) -> int:
@@ -289,14 +282,11 @@ def _joined() -> Select[Any]:
 
 
 def _one(connection: Connection, window_id: int, kind: type[AnyWindow]) -> AnyWindow:
-    found = _windows(connection, _rows(connection, _joined().where(WINDOWS.c.id == window_id)), kind)
+    rows = connection.execute(_joined().where(WINDOWS.c.id == window_id)).mappings().all()
+    found = _windows(connection, rows, kind)
     if not found:
         raise NotFound("window", window_id)
     return found[0]
-
-
-def _rows(connection: Connection, query: Select[Any]) -> Sequence[RowMapping]:
-    return connection.execute(query).mappings().all()
 
 
 def _windows(

@@ -29,7 +29,7 @@ from ground_service.ingest.store import RECEPTIONS_LIMIT
 from ground_service.missions.places import stations_of
 from ground_service.missions.stations import STATIONS
 from ground_service.missions.store import mission_of_vehicle
-from ground_service.store.vehicles import lock_vehicle, vehicle_id
+from ground_service.store.vehicles import get_vehicle, lock_vehicle, vehicle_id
 from ground_service.timekeeping import store
 from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_correlation, utc_ns_of_ticks
 from ground_service.timekeeping.model import Correlation, TimeReport
@@ -300,7 +300,8 @@ def _light_time_ns(
 def _references(connection: Connection, vehicle: int, earth_utc_ns: IntArray) -> list[Ephemeris]:
     """Reference ephemerides to take light times from: those of the vehicle's passes first, then by precedence."""
     mine = store.ephemerides_of_passes(connection, vehicle)
-    rows = covering_ephemerides(connection, int(earth_utc_ns.min()), int(earth_utc_ns.max()))
+    spacecraft = get_vehicle(connection, vehicle, "spacecraft").ccsds_id
+    rows = covering_ephemerides(connection, int(earth_utc_ns.min()), int(earth_utc_ns.max()), spacecraft)
     if mine:
         rows = [row for row in rows if row.id in mine]
     return rows

@@ -214,6 +214,7 @@ REQUESTS: Commands = {
     ),
 }
 COMMANDS: Commands = {
+    "withdraw": Command("withdraw_ephemeris", "withdraw a reference ephemeris", lambda _: "withdrawn"),
     "ephemeris": Command(
         "add_ephemeris",
         "add a reference ephemeris (OEM, STK .e, Horizons CSV)",

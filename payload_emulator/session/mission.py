@@ -24,7 +24,7 @@ from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.loading import detector_parameters, filter_field, network_octets
-from payload_emulator.session.recipe import Box, Source, load_recipe
+from payload_emulator.session.recipe import Source, inside_box, load_recipe
 from payload_emulator.session.recording import StepInput
 from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario, format_scenario
 from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL, SPACECRAFT_ID
@@ -353,8 +353,12 @@ def seen_in_training(latitude_deg: FloatArray, longitude_deg: FloatArray) -> Boo
     """Return whether real ground (n,) lies is in the training or validation data of the shipped detector."""
     seen = np.zeros(np.shape(latitude_deg), dtype=np.bool_)
     for source in _seen_sources():
-        inside = _in_any(source.boxes, latitude_deg, longitude_deg, 0.0)
-        seen |= inside & ~_in_any(source.avoid, latitude_deg, longitude_deg, source.buffer_km)
+        inside = np.zeros_like(seen)
+        for box in source.boxes:
+            inside |= inside_box(box, latitude_deg, longitude_deg)
+        for box in source.avoid:
+            inside &= ~inside_box(box, latitude_deg, longitude_deg, source.buffer_km)
+        seen |= inside
     return seen
 
 
@@ -362,22 +366,6 @@ def seen_in_training(latitude_deg: FloatArray, longitude_deg: FloatArray) -> Boo
 def _seen_sources() -> tuple[Source, ...]:
     sources = load_recipe(DETECTOR_RECIPE).sources
     return tuple(one for one in sources if one.terrain == "real" and one.split in SEEN_SPLITS)
-
-
-def _in_any(
-    boxes: Sequence[Box], latitude_deg: FloatArray, longitude_deg: FloatArray, margin_km: float
-) -> BoolArray:
-    inside = np.zeros(np.shape(latitude_deg), dtype=np.bool_)
-    margin_deg = math.degrees(margin_km * 1e3 / MOON_RADIUS_M)
-    along_deg = margin_deg / np.maximum(np.cos(np.radians(latitude_deg)), 1e-3)
-    for box in boxes:
-        east = (longitude_deg - box.west_deg + along_deg) % 360.0
-        inside |= (
-            (latitude_deg >= box.south_deg - margin_deg)
-            & (latitude_deg <= box.north_deg + margin_deg)
-            & (east <= box.east_deg - box.west_deg + 2.0 * along_deg)
-        )
-    return inside
 
 
 def level_of(world: str, unseen: float | None) -> str:

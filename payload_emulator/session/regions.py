@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 
-from lunar.arrays import BoolArray, FloatArray
+from lunar.arrays import BoolArray
 from lunar.catalogue import CraterCatalogue
+from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.session.world import World
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 
@@ -31,46 +31,6 @@ WINDOW_LATITUDE_DEG = 20.0
 """Half the band of latitudes that a pass crosses in 12 minutes."""
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
-    """Places between two latitudes, and from `west_deg` to the east to `east_deg`."""
-
-    south_deg: float
-    north_deg: float
-    west_deg: float
-    east_deg: float
-
-    def widened(self, margin_deg: float) -> Box:
-        """Return the box with a margin on all sides."""
-        width = min(self.east_deg - self.west_deg + 2.0 * margin_deg, 360.0)
-        return Box(
-            max(self.south_deg - margin_deg, -90.0),
-            min(self.north_deg + margin_deg, 90.0),
-            self.west_deg - margin_deg,
-            self.west_deg - margin_deg + width,
-        )
-
-    def region(self) -> dict[str, Any]:
-        """Return the box as a region of a standing request."""
-        return {
-            "latitude_deg": {"min": self.south_deg, "max": self.north_deg},
-            "west_deg": self.west_deg,
-            "east_deg": self.east_deg,
-        }
-
-
-def in_boxes(latitude_deg: FloatArray, longitude_deg: FloatArray, boxes: Sequence[Box]) -> BoolArray:
-    """Return whether places (n,) are in any of the boxes."""
-    inside = np.zeros(len(latitude_deg), dtype=np.bool_)
-    for one in boxes:
-        inside |= (
-            (latitude_deg >= one.south_deg)
-            & (latitude_deg <= one.north_deg)
-            & ((longitude_deg - one.west_deg) % 360.0 <= one.east_deg - one.west_deg)
-        )
-    return inside
-
-
 def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box]:
     """Return the boxes of the windows, each twice `latitude_limit_deg` high.
 
@@ -79,7 +39,7 @@ def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box
     catalogue does; of several the nearest to the equator. Longitudes without a catalogued place have none.
     """
     if not terrain.is_real:
-        return [Box(-latitude_limit_deg, latitude_limit_deg, -180.0, 180.0)]
+        return [Box(-180.0, 180.0, -latitude_limit_deg, latitude_limit_deg)]
     rows = max(math.ceil(2.0 * latitude_limit_deg / CELL_DEG), 1)
     catalogued, covered = _catalogued(terrain), _covered(terrain)
     columns = [
@@ -89,9 +49,7 @@ def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box
     for band, group in groupby(enumerate(columns), key=lambda one: one[1]):
         numbers = [number for number, _ in group]
         if band is not None:
-            boxes.append(
-                Box(band[0], band[1], float(CELL_DEG * numbers[0]), float(CELL_DEG * (numbers[-1] + 1)))
-            )
+            boxes.append(Box(float(CELL_DEG * numbers[0]), float(CELL_DEG * (numbers[-1] + 1)), *band))
     if len(boxes) > 1 and boxes[0].west_deg == 0.0 and boxes[-1].east_deg == 360.0:
         first, last = boxes[0], boxes[-1]
         if (first.south_deg, first.north_deg) == (last.south_deg, last.north_deg):
@@ -149,8 +107,9 @@ def observed_craters(world: World, latitude_limit_deg: float = WINDOW_LATITUDE_D
     """Return the craters around the observed boxes, with the heights of their rims where an estimator needs them."""
     navigation, listed = world.scenario.navigation, world.terrain.catalogue
     near = [one.widened(CATALOGUE_MARGIN_DEG) for one in observed_boxes(world.terrain, latitude_limit_deg)]
+    places = np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad)
     chosen = np.flatnonzero(
-        in_boxes(np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad), near)
+        np.any([inside_box(one, *places) for one in near], axis=0)
         & (listed.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km)
         & (listed.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km)
     )

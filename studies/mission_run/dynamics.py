@@ -15,7 +15,8 @@ from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
 from payload_emulator.session.live import pruned
-from payload_emulator.session.regions import Box, observed_boxes, observed_craters
+from payload_emulator.session.recipe import Box
+from payload_emulator.session.regions import observed_boxes, observed_craters
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world import (
     CHUNK_S,

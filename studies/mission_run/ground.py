@@ -34,7 +34,7 @@ from ground_service.worker.actions import has_repetitions, repeat_due
 from ground_service.worker.follow_up import CONSUMER, KINDS
 from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
-from payload_emulator.session.regions import Box
+from payload_emulator.session.recipe import Box
 
 USER = "mission-run"
 FLIGHT_DYNAMICS = "flight-dynamics"
@@ -230,7 +230,14 @@ class PlanTerms:
             "horizon_days": 1.0,
             "start": self.start,
             "stop": self.stop,
-            "regions": [one.region() for one in self.boxes],
+            "regions": [
+                {
+                    "latitude_deg": {"min": one.south_deg, "max": one.north_deg},
+                    "west_deg": one.west_deg,
+                    "east_deg": one.east_deg,
+                }
+                for one in self.boxes
+            ],
             "minimum_duration_s": 0.8 * self.duration_s,
             "maximum_duration_s": 1.25 * self.duration_s,
             "cadence_s": self.cadence_s,

@@ -335,6 +335,7 @@ MATRIX = [
     ("GET", "/builds", "viewer"),
     ("POST", "/builds", "operator"),
     ("POST", "/builds/current", "operator"),
+    ("DELETE", "/ephemerides/1", "operator"),
     ("GET", "/regression-archives", "viewer"),
     ("POST", "/regression-archives", "operator"),
     ("PATCH", f"/regression-archives/{'0' * 64}", "operator"),

@@ -34,8 +34,7 @@ from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.vision.preprocess import gray_levels
-from payload_emulator.session.recipe import Box
-from payload_emulator.training.data.shots import inside_box
+from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.training.data.targets import Tier
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.data.visibility import HIDDEN, VISIBLE, visibility

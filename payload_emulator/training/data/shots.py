@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from lunar.arrays import BoolArray, FloatArray
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Box, Source
+from payload_emulator.session.recipe import Box, Source, inside_box
 
 _ATTEMPTS = 4000
 _LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame
@@ -200,19 +200,6 @@ def allowed(source: Source, box: Box, latitude_deg: FloatArray, longitude_deg: F
     return not any(
         inside_box(other, latitude_deg, longitude_deg, source.buffer_km).any() for other in source.avoid
     )
-
-
-def inside_box(box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray, buffer_km: float) -> BoolArray:
-    """Which places lie in a box or within `buffer_km` of it."""
-    margin = math.degrees(buffer_km * 1000.0 / MOON_RADIUS_M)
-    widen = margin / np.cos(np.radians(np.minimum(np.abs(latitude_deg) + margin, 85.0)))
-    middle = 0.5 * (box.west_deg + box.east_deg)
-    offset = np.mod(longitude_deg - middle + 180.0, 360.0) - 180.0
-    across = np.abs(offset) <= 0.5 * (box.east_deg - box.west_deg) + widen
-    inside: BoolArray = (
-        across & (latitude_deg >= box.south_deg - margin) & (latitude_deg <= box.north_deg + margin)
-    )
-    return inside
 
 
 def edge_pixels(camera: PinholeCamera) -> FloatArray:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ground_service.links.core import PredictedContact
 from ground_service.planning.core import (
     Commitment,
     Constraints,
-    Contact,
     Planner,
     Resources,
     data_octets,
@@ -183,14 +183,14 @@ def test_the_battery_falls_with_the_load() -> None:
 def test_data_leave_the_store_in_the_order_they_came() -> None:
     first, second = Commitment(0, 100 * NS, 1000), Commitment(200 * NS, 300 * NS, 500)
     contacts = [
-        Contact("a", 400 * NS, 460 * NS),
-        Contact("b", 450 * NS, 500 * NS),
-        Contact("a", 900 * NS, 960 * NS),
+        PredictedContact("a", 400 * NS, 460 * NS),
+        PredictedContact("b", 450 * NS, 500 * NS),
+        PredictedContact("a", 900 * NS, 960 * NS),
     ]
     # 1000 octets at 80 bit/s take the 100 s of the two contacts that overlap; the next 50 s carry the other 500.
     peak, by = storage_peak([first, second], contacts, 80.0, second)
     assert (peak, by) == (1500, 950 * NS)
-    peak, by = storage_peak([first, second], [Contact("a", 100 * NS, 200 * NS)], 80.0, second)
+    peak, by = storage_peak([first, second], [PredictedContact("a", 100 * NS, 200 * NS)], 80.0, second)
     assert (peak, by) == (1000, None)
     assert storage_peak([first], contacts, 0.0, first) == (1000, None)
 

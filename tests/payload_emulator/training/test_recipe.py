@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Box, Source, load_recipe, procedural_recipe
+from payload_emulator.session.recipe import Box, Source, inside_box, load_recipe, procedural_recipe
 from payload_emulator.training.data.build import plan_shards
-from payload_emulator.training.data.shots import allowed, inside_box
+from payload_emulator.training.data.shots import allowed
 
 ROOT = Path(__file__).parents[3]
 
