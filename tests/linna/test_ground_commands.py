@@ -18,16 +18,15 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from linna.cli import GROUPS, run
 from linna.parser import LinnaParser
-from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
-from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
+from lunar.timescales import format_utc, ticks_from_utc_ns
+from tests.ground_service.conftest import START, circular_states
 from tests.serving import served
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 NS = 1_000_000_000
-START = parse_utc("2029-08-07T06:00:00Z")
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +35,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import numpy as np
 
     path = tmp_path_factory.mktemp("oem") / "reference.oem"
-    radius = MOON_RADIUS_M + 40e3
-    rate = np.sqrt(GM_MOON_M3_S2 / radius**3)
     utc_ns = START + np.arange(0, 7200, 60, dtype=np.int64) * NS
-    angle = (rate * (utc_ns - START) / NS)[:, None]
-    x, z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    position = radius * (np.cos(angle) * x + np.sin(angle) * z)
-    velocity = radius * rate * (np.cos(angle) * z - np.sin(angle) * x)
-    save_oem(ephemeris_from_states(utc_ns, position, velocity), path)
+    save_oem(ephemeris_from_states(utc_ns, *circular_states(utc_ns)), path)
     return path
 
 
@@ -206,6 +199,7 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             do("mission", "show", revision)
             ask("mission", "show", "0" * 64)
             do("plan", "ephemeris", reference)
+            ask("plan", "withdraw", 99)
             ask("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 900)
             window = [
                 "--start",

@@ -7,41 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.tmtc.test_downlink import make_packets
 from tmtc.crc import append_crc, crc16
 from tmtc.dictionary import DICTIONARY
-from tmtc.packets import PacketSequencer, idle_packet, pack_packet
+from tmtc.packets import idle_packet, pack_packet
 from tmtc.stream import cut_packets
 
-
-def make_packets(count: int, seed: int = 5) -> list[bytes]:
-    """Housekeeping-like packets of one length and packets of detections of many lengths."""
-    rng = np.random.default_rng(seed)
-    sequencer = PacketSequencer()
-    packets = []
-    for k in range(count):
-        if k % 3 == 2:
-            event = {"event_id": "boot", "frame_number": k, "value_1": rng.normal(), "value_2": 0.0}
-            packets.append(
-                DICTIONARY.pack("event_low", event, ticks=k << 16, sequence_count=sequencer.next(0xA4))
-            )
-            continue
-        n = int(rng.integers(0, 12))
-        items = {
-            "u_px": rng.uniform(0, 511, n),
-            "v_px": rng.uniform(0, 511, n),
-            "diameter_px": rng.uniform(5, 80, n),
-            "score": rng.uniform(0, 1, n),
-            "size_class": rng.integers(-1, 4, n),
-            "sigma_px": rng.uniform(0, 2, n),
-        }
-        values = {"frame_number": k, "image_ticks": k << 16, "image_quality": 0, "items": items}
-        packets.append(
-            DICTIONARY.pack("detections", values, ticks=k << 16, sequence_count=sequencer.next(0xA1))
-        )
-    return packets
-
-
-PACKETS = make_packets(1000)
+PACKETS = make_packets(480)[:1000]
 WHOLE = b"".join(PACKETS)
 AT_500 = sum(map(len, PACKETS[:500]))
 

@@ -16,13 +16,13 @@ from ground_service.evaluation.navigation.smoother import (
     _legs,
     smooth,
 )
-from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation, rtn_from_inertial
 from lunar.gravity import GravityField, builtin_gravity
 from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter import CommonErrors
+from tests.payload_emulator.flight.test_dynamics import start_state
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 STEP_S, STATES = 60.0, 30
@@ -31,15 +31,6 @@ FORCES = ForceModel(builtin_gravity(), IauOrientation(), 8)
 # Nothing but the forces moves the spacecraft: then the smoother has a batch solution to agree with.
 QUIET = SmootherModel(FORCES, (1e-18, 1e-18, 1e-18), (1e-15, 1e-15, 1e-15), 900.0)
 TIMES = EPOCH + np.arange(STATES) * round(STEP_S) * 10**9
-
-
-def start_state() -> np.ndarray:
-    position, velocity = icrf_state_from_elements(
-        Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882])),
-        float(tdb_s_from_utc_ns(EPOCH)),
-        builtin_gravity().gm_m3_s2,
-    )
-    return np.concatenate([position, velocity])
 
 
 def carried(state: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +46,7 @@ class Session:
 
     def __init__(self, seed: int, kick: np.ndarray | None = None, kick_at: int = -1) -> None:
         rng = np.random.default_rng(seed)
-        truth = [start_state()]
+        truth = [start_state()[:6]]
         for k in range(STATES - 1):
             if k == kick_at and kick is not None:
                 truth[-1] = truth[-1] + np.concatenate([np.zeros(3), kick])
@@ -340,7 +331,7 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
     """A share 1 - exp(-2 angle / 30 degrees) of its variance is new after a step; 10, 15 and 15 m."""
     model = smoother_model(builtin_gravity(), IauOrientation(), ())
     without = replace(model, map_sigma_rtn_m=(0.0, 0.0, 0.0))
-    state, at, after = start_state(), np.array([EPOCH]), np.array([EPOCH + 60 * 10**9])
+    state, at, after = start_state()[:6], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9])
     nine = np.concatenate([state, np.zeros(3)])[None]
     (carried, _, noise), (_, _, plain) = _carried(nine, at, after, model), _carried(nine, at, after, without)
     before, behind = state[:3], carried[0, :3]

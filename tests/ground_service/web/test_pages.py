@@ -1,8 +1,6 @@
 """Pages and their files as they go over the wire."""
 
 import re
-import urllib.error
-import urllib.request
 
 import cv2
 import numpy as np
@@ -12,18 +10,9 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.surface import WIDTH_PX
 from ground_service.web.basemap import basemap_jpeg
 from ground_service.web.pages import PAGES, POLICY
+from tests.ground_service.web.test_displays import ask
 
 PATHS = [page.path.replace("{pass_id}", "1").replace("{revision}", "0" * 16) for page in PAGES]
-
-
-def ask(url):
-    """Status, body and headers of a GET."""
-    try:
-        with urllib.request.urlopen(url, timeout=20) as answer:
-            return answer.status, answer.read(), answer.headers
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read(), error.headers
 
 
 @pytest.mark.parametrize("path", PATHS)

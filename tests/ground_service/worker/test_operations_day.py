@@ -18,7 +18,6 @@ import pytest
 
 from ground_service.settings import Settings
 from linna.cli import run
-from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, ticks_from_utc_ns
@@ -26,12 +25,12 @@ from payload_emulator.flight.payload import FlightParameters, FlightTables, Payl
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft import new_board
+from tests.ground_service.conftest import START, circular_states
 from tests.serving import served
 from tmtc.downlink import encode_cadus
 from tmtc.uplink import UplinkDecoder
 
 NS = 1_000_000_000
-START = parse_utc("2029-08-07T06:00:00Z")
 SPACECRAFT = 76
 STEP_S = 15.0
 
@@ -97,14 +96,8 @@ def workers(settings: Settings, folder: Path, count: int) -> Iterator[None]:
 
 def reference_ephemeris(path: Path) -> Path:
     """Four hours of a polar circle at 40 km."""
-    radius = MOON_RADIUS_M + 40e3
-    rate = np.sqrt(GM_MOON_M3_S2 / radius**3)
     utc_ns = START + np.arange(0, 4 * 3600, 60, dtype=np.int64) * NS
-    angle = (rate * (utc_ns - START) / NS)[:, None]
-    x, z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    position = radius * (np.cos(angle) * x + np.sin(angle) * z)
-    velocity = radius * rate * (np.cos(angle) * z - np.sin(angle) * x)
-    save_oem(ephemeris_from_states(utc_ns, position, velocity), path)
+    save_oem(ephemeris_from_states(utc_ns, *circular_states(utc_ns)), path)
     return path
 
 

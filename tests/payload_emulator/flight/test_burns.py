@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, flown
+from tests.payload_emulator.flight.test_dynamics import start_state
 from tmtc.errors import TableError
 from tmtc.tables import (
     BurnTable,
@@ -44,15 +44,6 @@ def model() -> OrbitModel:
     return OrbitModel(gravity, table, 8, ProcessNoise((1e-12,) * 3, (1e-12,) * 3, 900.0))
 
 
-def start() -> np.ndarray:
-    position, velocity = icrf_state_from_elements(
-        Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882])),
-        float(tdb_s_from_utc_ns(EPOCH)),
-        builtin_gravity().gm_m3_s2,
-    )
-    return np.concatenate([position, velocity, np.zeros(3)])
-
-
 def test_a_table_of_burns_comes_back_in_order_of_time() -> None:
     two = BurnTable(np.array([START + 9, START]), np.stack([KICK, -KICK]), np.array([0.1, 0.2]))
     found = unpack_burn_table(pack_burn_table(two))
@@ -76,7 +67,7 @@ def test_burns_at_one_time_negative_sigmas_and_nan_are_refused(table: BurnTable)
 
 
 def test_a_burn_is_flown_at_its_time_and_not_before(model: OrbitModel) -> None:
-    state, stop = start(), START + 900 * SECOND
+    state, stop = start_state(), START + 900 * SECOND
     half = model.propagate(state, START, START + 600 * SECOND)
     assert half is not None
     kicked = half.state.copy()
@@ -93,7 +84,9 @@ def test_a_burn_is_flown_at_its_time_and_not_before(model: OrbitModel) -> None:
 
 def test_a_burn_adds_its_change_and_its_own_uncertainty_and_nothing_else() -> None:
     errors = kalman.CommonErrors()
-    state = kalman.initial_filter_state(START, start()[:3], start()[3:6], 10.0, 0.01, (1e-9,) * 3, errors)
+    state = kalman.initial_filter_state(
+        START, start_state()[:3], start_state()[3:6], 10.0, 0.01, (1e-9,) * 3, errors
+    )
     after = kalman.burn(state, KICK, 0.05)
     np.testing.assert_allclose(after.mean - state.mean, np.r_[0, 0, 0, KICK, np.zeros(12)], atol=1e-12)
     added = after.covariance - state.covariance
@@ -104,7 +97,9 @@ def test_a_burn_adds_its_change_and_its_own_uncertainty_and_nothing_else() -> No
 
 def test_widening_adds_to_place_and_velocity_only() -> None:
     errors = kalman.CommonErrors()
-    state = kalman.initial_filter_state(START, start()[:3], start()[3:6], 10.0, 0.01, (1e-9,) * 3, errors)
+    state = kalman.initial_filter_state(
+        START, start_state()[:3], start_state()[3:6], 10.0, 0.01, (1e-9,) * 3, errors
+    )
     wide = kalman.widened(state, 1_000.0, 1.0)
     np.testing.assert_allclose(
         np.sqrt(np.diag(wide.covariance)[:6]), [1_000.05] * 3 + [1.00005] * 3, rtol=1e-6
