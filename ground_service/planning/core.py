@@ -183,7 +183,7 @@ class Planner:
         EphemerisCoverageError
             If the ephemeris does not cover the span.
         """
-        contacts = self.contacts(start_utc_ns, stop_utc_ns)
+        contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
         battery = self._battery(start_utc_ns, stop_utc_ns, step_s)
         rejected = []
         candidates = []
@@ -262,15 +262,11 @@ class Planner:
     ) -> Candidate:
         """What a given window would be like: the battery is full at `since`, contacts are counted up to `until`."""
         horizon = min(until_utc_ns, stop_utc_ns + round(CONTACT_HORIZON_S) * NS)
-        contacts = self.contacts(start_utc_ns, horizon)
+        contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, horizon)
         battery = self._battery(since_utc_ns, stop_utc_ns, 30.0)
         return self._candidate(
             Constraints(), start_utc_ns, stop_utc_ns, cadence_s, contacts, battery, commitments
         )
-
-    def contacts(self, start_utc_ns: int, stop_utc_ns: int) -> tuple[PredictedContact, ...]:
-        """When a station sees the spacecraft, in order of time."""
-        return predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
 
     def conditions(self, utc_ns: IntArray) -> Conditions:
         """Return the conditions below the spacecraft at epochs (n,)."""

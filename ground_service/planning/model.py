@@ -246,16 +246,8 @@ class WindowIn(Given):
 
     def entry(self) -> WindowEntry:
         """Return the requested window."""
-        return WindowEntry(
-            name=self.name,
-            start_utc_ns=self.start.utc_ns,
-            stop_utc_ns=self.stop.utc_ns,
-            cadence_s=self.cadence_s,
-            spacecraft_id=self.spacecraft_id,
-            instance=self.instance,
-            predecessor_id=self.predecessor_id,
-            ephemeris_id=self.ephemeris_id,
-        )
+        stated = self.model_dump(exclude={"start", "stop"})
+        return WindowEntry(start_utc_ns=self.start.utc_ns, stop_utc_ns=self.stop.utc_ns, **stated)
 
 
 class WindowChange(Given):
@@ -373,16 +365,8 @@ class WindowRecord(Window):
 
     def entry(self) -> WindowEntry:
         """Return the request of the window."""
-        return WindowEntry(
-            name=self.name,
-            start_utc_ns=self.start.utc_ns,
-            stop_utc_ns=self.stop.utc_ns,
-            cadence_s=self.cadence_s,
-            spacecraft_id=self.spacecraft_id,
-            instance=self.instance,
-            predecessor_id=self.predecessor_id,
-            ephemeris_id=self.ephemeris_id,
-        )
+        stated = self.model_dump(include=set(WindowIn.model_fields) - {"start", "stop"})
+        return WindowEntry(start_utc_ns=self.start.utc_ns, stop_utc_ns=self.stop.utc_ns, **stated)
 
 
 class WindowFilter(Paging):

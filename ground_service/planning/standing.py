@@ -11,7 +11,7 @@ import functools
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -335,13 +335,7 @@ class _Keyed:
     """A planner, equal to others of the same ephemeris and mission description."""
 
     key: tuple[str, str]
-    planner: Planner
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Keyed) and self.key == other.key
+    planner: Planner = field(compare=False)
 
 
 @functools.lru_cache(maxsize=16)

@@ -17,6 +17,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     writing = actions.add_parser("write", help="write the mission description of a scenario")
     option(writing, "scenario SCENARIO", str, "scenario file or name")
     option(writing, "--out FILE", Path, "", Path("mission.toml"))
+    option(
+        writing,
+        "--flight",
+        bool,
+        "of a spacecraft that the ground commands, with craters.csv, reference.oem and request.json beside it",
+    )
+    option(writing, "--windows N", int, "windows a day of the request", 2)
+    option(writing, "--window-min M", float, "duration of its windows", 12.0)
     writing.set_defaults(handler=write)
     checking = actions.add_parser("check", help="check a mission description; print one line for each fault")
     option(checking, "file FILE", Path)
@@ -80,7 +88,14 @@ def write(arguments: argparse.Namespace) -> int:
     from payload_emulator.session.mission import scenario_mission_text
     from payload_emulator.session.scenario import load_scenario
 
-    text = scenario_mission_text(load_scenario(arguments.scenario), data_folder())
+    scenario = load_scenario(arguments.scenario)
+    if arguments.flight:
+        from studies.mission_run.dynamics import write_flight
+
+        window_s = 60.0 * arguments.window_min
+        text = write_flight(scenario, data_folder(), arguments.out, arguments.windows, window_s)
+    else:
+        text = scenario_mission_text(scenario, data_folder())
     mission = parse_mission(text, str(arguments.out))
     arguments.out.write_text(text, encoding="utf-8")
     figures = {**_figures(mission), "file": str(arguments.out)}

@@ -77,14 +77,6 @@ class DistributedGround(MissionGround):
         """Record the processes, so that a later run can end them if this one is killed."""
         self.pids.note({name: part.pid for name, part in self.parts.items()})
 
-    def deliver_reference(self, path: Path, day: int) -> None:
-        """Upload the orbit determination of a day as flight dynamics; the same file again changes nothing."""
-        name = f"orbit determination of day {day}"
-        self._wait(
-            lambda: bool(self._flight_dynamics.add_ephemeris(path, name=name, precedence=day)),
-            "upload of " + name,
-        )
-
     def close(self, *, is_finished: bool = False) -> None:
         """Stop all processes; the files of the database server of a run that is finished are removed."""
         for client in self._clients:
@@ -141,8 +133,8 @@ class DistributedGround(MissionGround):
             self.parts[name] = Part(command, folder / f"{name}.log", _safely(ready), env=self._environment)
             self.parts[name].start()
         self.client = Client(address, tokens[USER])
-        self._flight_dynamics = Client(address, tokens[FLIGHT_DYNAMICS])
-        self._clients = [self.client, self._flight_dynamics]
+        self.flight_dynamics = Client(address, tokens[FLIGHT_DYNAMICS])
+        self._clients = [self.client, self.flight_dynamics]
 
     def _has_scheduler(self) -> bool:
         with self.ground.database.reading() as connection:

@@ -1,12 +1,14 @@
-"""Flight dynamics of a mission run, outside of spacecraft and ground: reference ephemerides and the crater catalogue.
+"""Flight dynamics of a mission, outside of spacecraft and ground: reference ephemerides, crater catalogue, request.
 
 Each day's orbit determination has errors of its own; the burns that it knows of are those that were planned.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +16,12 @@ from lunar.catalogue import save_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
-from payload_emulator.session.live import pruned
-from payload_emulator.session.recipe import Box
+from lunar.timescales import format_utc
+from payload_emulator.session.live import pruned, station_names
+from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
 from payload_emulator.session.regions import observed_boxes, observed_craters
 from payload_emulator.session.scenario import Scenario
+from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from payload_emulator.session.world import (
     CHUNK_S,
     World,
@@ -30,6 +34,12 @@ from payload_emulator.session.world import (
 DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
 AHEAD_NS = 54 * 3600 * NS
+LAST_NS = 4 * 3600 * NS
+"""No windows so long before the end of a run, so that the data of the last one are down and evaluated."""
+
+ORBIT_S = 6_672.0
+"""Orbital period of the scenarios of this project, for the latitudes of windows of a given length."""
+
 ARCS_KEPT = 4
 """Days of the flight that are kept: more than an orbit determination spans."""
 
@@ -59,12 +69,58 @@ class FlightDynamics:
         save_oem(with_reference_error(arc, scenario.reference, scenario.seed + 1_000 * (1 + day)), path)
         return path
 
-    def boxes(self, latitude_limit_deg: float) -> list[Box]:
-        """Return where windows are requested: on the ground that the data describe, see `observed_boxes`."""
-        return observed_boxes(self.world.terrain, latitude_limit_deg)
-
-    def save_craters(self, latitude_limit_deg: float, path: Path) -> int:
+    def save_craters(self, window_s: float, path: Path) -> int:
         """Write the craters around the places of the windows with their rim heights; their number."""
-        catalogue = observed_craters(self.world, latitude_limit_deg)
+        catalogue = observed_craters(self.world, _latitude_limit_deg(window_s))
         save_catalogue(catalogue, path)
         return len(catalogue)
+
+    def request(self, windows_per_day: int, window_s: float, days: float | None = None) -> dict[str, Any]:
+        """Return a standing request as it is posted: windows over the ground that the data describe.
+
+        With `days`, the last window is `LAST_NS` before their end.
+        """
+        scenario = self.world.scenario
+        start = scenario.epoch_utc_ns
+        return {
+            "name": "observations",
+            "spacecraft_id": SPACECRAFT_ID,
+            "windows": windows_per_day,
+            "period_days": 1.0,
+            "horizon_days": 1.0,
+            "start": format_utc(start),
+            "stop": None if days is None else format_utc(start + round(days * DAY_NS) - LAST_NS),
+            "regions": [
+                {
+                    "latitude_deg": {"min": one.south_deg, "max": one.north_deg},
+                    "west_deg": one.west_deg,
+                    "east_deg": one.east_deg,
+                }
+                for one in observed_boxes(self.world.terrain, _latitude_limit_deg(window_s))
+            ],
+            "minimum_duration_s": 0.8 * window_s,
+            "maximum_duration_s": 1.25 * window_s,
+            "cadence_s": scenario.camera.frame_interval_s,
+        }
+
+
+def write_flight(
+    scenario: Scenario, data: DataFolder, mission: Path, windows_per_day: int, window_s: float
+) -> str:
+    """Write what the ground posts to fly a scenario, beside its mission description; return the description.
+
+    The files are `craters.csv`, `reference.oem` and `request.json`.
+    """
+    dynamics, folder = FlightDynamics.of(scenario, data), mission.parent
+    craters = folder / "craters.csv"
+    dynamics.save_craters(window_s, craters)
+    dynamics.save_reference(scenario.epoch_utc_ns, folder / "reference.oem")
+    request = dynamics.request(windows_per_day, window_s)
+    (folder / "request.json").write_text(json.dumps(request, indent=2) + "\n", encoding="utf-8")
+    ports = default_ports(station_names(scenario, has_operator=False))
+    return live_mission_text(dynamics.world, data, "127.0.0.1", ports, OPERATIONS, catalogue=craters)
+
+
+def _latitude_limit_deg(window_s: float) -> float:
+    """Return half the band of latitudes that a pass crosses within about the duration of a window."""
+    return min(180.0 * window_s / ORBIT_S, 60.0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -16,21 +17,31 @@ from studies.mission_run.ground import MissionGround
 FLOWN = ("executing", "executed", "downlinked", "processed")
 
 
-class RunProgress(Protocol):
-    """What the runner has counted (`run.Progress`)."""
+@dataclass(slots=True)
+class Progress:
+    """What the runner has seen; kept in the folder of the run and in its checkpoints.
 
-    wall_s: float
-    utc: str
-    starts: int
-    contacts: int
-    frames: int
-    images_lost: int
-    packets: int
-    packets_lost_on_link: int
-    telecommands: int
-    telecommand_octets_lost: int
-    resets: int
-    posts: list[tuple[int, int]]
+    Attributes
+    ----------
+    posts
+        First and last number of the entries of the audit log for the posts of each start.
+    """
+
+    wall_s: float = 0.0
+    utc: str = ""
+    starts: int = 0
+    contacts: int = 0
+    frames: int = 0
+    images_lost: int = 0
+    packets: int = 0
+    packets_lost_on_link: int = 0
+    telecommands: int = 0
+    telecommand_octets_lost: int = 0
+    resets: int = 0
+    reference_day: int = -1
+    request_id: int | None = None
+    finished: bool = False
+    posts: list[tuple[int, int]] = field(default_factory=list)
 
 
 def windows_asked(days: float, windows_per_day: int, last_days: float) -> int:
@@ -38,7 +49,7 @@ def windows_asked(days: float, windows_per_day: int, last_days: float) -> int:
     return windows_per_day * max(math.ceil(days - last_days), 0)
 
 
-def closing_figures(ground: MissionGround, progress: RunProgress, asked: int) -> dict[str, Any]:
+def closing_figures(ground: MissionGround, progress: Progress, asked: int) -> dict[str, Any]:
     """Return the figures of the closing report; what is not known is None."""
     windows = ground.windows()
     performance = ground.client.get_performance(SPACECRAFT_ID)

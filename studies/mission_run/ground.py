@@ -18,7 +18,6 @@ from ground_service.client import Client
 from ground_service.client.local import local_client
 from ground_service.client.problems import Unavailable, Unreachable
 from ground_service.clock import ClockFile, set_mission_clock
-from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import PASSING, GroundError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.live import spooled_octets
@@ -34,7 +33,6 @@ from ground_service.worker.actions import has_repetitions, repeat_due
 from ground_service.worker.follow_up import CONSUMER, KINDS
 from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
-from payload_emulator.session.recipe import Box
 
 USER = "mission-run"
 FLIGHT_DYNAMICS = "flight-dynamics"
@@ -60,6 +58,7 @@ class MissionGround:
 
     ground: Ground
     client: Client
+    flight_dynamics: Client
     while_waiting: Callable[[], object] = field(default=lambda: None, init=False)
 
     def add_mission(self, text: bytes) -> None:
@@ -69,12 +68,10 @@ class MissionGround:
 
     def deliver_reference(self, path: Path, day: int) -> None:
         """Add the orbit determination of a day as flight dynamics; later ones are preferred."""
-        add_ephemeris(
-            self.ground,
-            self.ground.files.put_file(path),
-            name=f"orbit determination of day {day}",
-            precedence=day,
-            actor=FLIGHT_DYNAMICS,
+        name = f"orbit determination of day {day}"
+        self._wait(
+            lambda: bool(self.flight_dynamics.add_ephemeris(path, name=name, precedence=day)),
+            "upload of " + name,
         )
 
     def wait_sent(self, station: str) -> None:
@@ -186,7 +183,7 @@ class EmbeddedGround(MissionGround):
         """Open the ground service under a folder; mission time comes from a file."""
         set_mission_clock(ClockFile(clock_file).read)
         ground = open_ground(home, data)
-        opened = cls(ground, local_client(ground, USER))
+        opened = cls(ground, local_client(ground, USER), local_client(ground, FLIGHT_DYNAMICS))
         opened.links = LinkSupervisor(ground)
         opened.links.start()
         return opened
@@ -200,6 +197,7 @@ class EmbeddedGround(MissionGround):
     def close(self, *, is_finished: bool = False) -> None:
         """Stop the links with received octets ingested, and close the archive."""
         self.links.stop()
+        self.flight_dynamics.close()
         self.client.close()
         set_mission_clock()
 
@@ -207,38 +205,3 @@ class EmbeddedGround(MissionGround):
 def is_of_person(entry: AuditEntry) -> bool:
     """Return whether a person caused an entry of the audit log."""
     return entry.actor not in SYSTEMS
-
-
-@dataclass(frozen=True, slots=True)
-class PlanTerms:
-    """What is asked for: windows a day until a time, over boxes on the ground, with a longest duration."""
-
-    windows_per_day: int
-    boxes: tuple[Box, ...]
-    duration_s: float
-    cadence_s: float
-    start: str
-    stop: str
-
-    def request(self, spacecraft: int) -> dict[str, Any]:
-        """Return the standing request as it is posted."""
-        return {
-            "name": "observations",
-            "spacecraft_id": spacecraft,
-            "windows": self.windows_per_day,
-            "period_days": 1.0,
-            "horizon_days": 1.0,
-            "start": self.start,
-            "stop": self.stop,
-            "regions": [
-                {
-                    "latitude_deg": {"min": one.south_deg, "max": one.north_deg},
-                    "west_deg": one.west_deg,
-                    "east_deg": one.east_deg,
-                }
-                for one in self.boxes
-            ],
-            "minimum_duration_s": 0.8 * self.duration_s,
-            "maximum_duration_s": 1.25 * self.duration_s,
-            "cadence_s": self.cadence_s,
-        }

@@ -6,11 +6,10 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ground_service.errors import GroundError
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
@@ -22,9 +21,9 @@ from studies.harness.kills import SPACECRAFT, Keeper, plan_kills
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import REPORT
 from studies.mission_run.distributed import DistributedGround, Servers
-from studies.mission_run.dynamics import DAY_NS, FlightDynamics
-from studies.mission_run.figures import closing_figures, months, windows_asked
-from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround, PlanTerms
+from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics
+from studies.mission_run.figures import Progress, closing_figures, months, windows_asked
+from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftKilled, SpacecraftProcess
 
 DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
@@ -33,9 +32,6 @@ DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 SETTLE_NS = (round(SILENCE_S) + 5) * NS
 """Mission time after a contact at which the ground notices its end."""
 
-LAST_NS = 4 * 3600 * NS
-"""No windows so long before the end of the run, so that the data of the last one are down and evaluated."""
-
 CHECKPOINT_S = 60.0
 """Wall time between two checkpoints."""
 
@@ -43,9 +39,6 @@ COUNTED = (
     "frames", "images_lost", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
 )  # fmt: skip
 """What the spacecraft counts itself."""
-
-ORBIT_S = 6_672.0
-"""Orbital period of the scenarios of this project, for the latitudes of windows of a given length."""
 
 Say = Callable[[str], None]
 OWN_SERVERS = Servers()
@@ -68,38 +61,6 @@ class RunTerms:
     distributed: bool = False
     kill_seed: int | None = None
     kills: int = 0
-
-    @property
-    def latitude_limit_deg(self) -> float:
-        """Half the band of latitudes that a pass crosses within about the duration of a window."""
-        return min(180.0 * self.window_s / ORBIT_S, 60.0)
-
-
-@dataclass(slots=True)
-class Progress:
-    """What the runner has seen; kept in the folder of the run and in its checkpoints.
-
-    Attributes
-    ----------
-    posts
-        First and last number of the entries of the audit log for the posts of each start.
-    """
-
-    wall_s: float = 0.0
-    utc: str = ""
-    starts: int = 0
-    contacts: int = 0
-    frames: int = 0
-    images_lost: int = 0
-    packets: int = 0
-    packets_lost_on_link: int = 0
-    telecommands: int = 0
-    telecommand_octets_lost: int = 0
-    resets: int = 0
-    reference_day: int = -1
-    request_id: int | None = None
-    finished: bool = False
-    posts: list[tuple[int, int]] = field(default_factory=list)
 
 
 def run_mission(
@@ -168,7 +129,7 @@ class MissionRun:
             return dict(json.loads((self._folder / REPORT).read_text()))
         dynamics = FlightDynamics.of(self._scenario, self._data)
         if not self._files.craters.exists():
-            count = dynamics.save_craters(self._terms.latitude_limit_deg, self._files.craters)
+            count = dynamics.save_craters(self._terms.window_s, self._files.craters)
             self._say(f"catalogue: {count} craters with rim heights")
         self._progress.starts += 1
         spacecraft = SpacecraftProcess(
@@ -321,18 +282,9 @@ class MissionRun:
         ground.client.add_catalogue(self._files.craters)
         ground.add_mission(spacecraft.mission_text())
         if self._progress.request_id is None:
-            path = dynamics.save_reference(self._scenario.epoch_utc_ns, self._folder / "reference.oem")
-            ground.client.add_ephemeris(path, name="orbit determination of day 0", precedence=0)
-            self._progress.reference_day = 0
-            terms = PlanTerms(
-                self._terms.windows_per_day,
-                tuple(dynamics.boxes(self._terms.latitude_limit_deg)),
-                self._terms.window_s,
-                self._scenario.camera.frame_interval_s,
-                format_utc(self._scenario.epoch_utc_ns),
-                format_utc(self._scenario.epoch_utc_ns + round(self._terms.days * DAY_NS) - LAST_NS),
-            )
-            self._progress.request_id = ground.client.add_request(terms.request(SPACECRAFT_ID)).id
+            self._deliver_reference(ground, dynamics, self._scenario.epoch_utc_ns)
+            request = dynamics.request(self._terms.windows_per_day, self._terms.window_s, self._terms.days)
+            self._progress.request_id = ground.client.add_request(request).id
         self._progress.posts.append((before + 1, ground.audit_head()))
 
     def _deliver_reference(self, ground: MissionGround, dynamics: FlightDynamics, now: int) -> None:
@@ -444,6 +396,3 @@ def _read_progress(path: Path) -> Progress:
             f"{path}: expected the progress of a run of this version of the program, found another file "
             f"({type(error).__name__}: {error}); start the run in a new folder"
         ) from None
-
-
-__all__ = ["GroundError", "RunTerms", "run_mission"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock
 from ground_service.commanding.model import TelecommandFilter
 from ground_service.commanding.service import get_command, list_telecommands
@@ -355,26 +353,6 @@ def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, 
     assert [one.request_id for one in ground.read(list_windows, WindowFilter()).items] == [None]
     with pytest.raises(NotFound):
         ground.read(get_request, key)
-
-
-def test_the_posts_of_the_documentation_give_released_windows(
-    tmp_path: Path,
-    oem: Path,
-    now: Now,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """The Python block of the page on mission runs, run as written on an empty service."""
-    (block,) = re.findall(r"```python\n(.*?)```", (DOCS / "mission-run.md").read_text(), re.DOTALL)
-    (tmp_path / "mission.toml").write_text(MISSION.format(extra=AUTOMATIC + LINKS))
-    (tmp_path / "reference.oem").write_bytes(oem.read_bytes())
-    monkeypatch.chdir(tmp_path)
-    local = local_client(open_ground(tmp_path / "home"), "ann")
-    monkeypatch.setattr("ground_service.client.Client", lambda url, token: local)
-    exec(compile(block, "mission-run.md", "exec"), {})
-    said = capsys.readouterr().out
-    assert said.count("'planned'") == said.count(" approved ") == 2
-    assert "6 telecommands wait for a contact" in said and "('a', 'waiting', " in said
 
 
 def test_contradictory_terms_are_refused(ground: Ground) -> None:

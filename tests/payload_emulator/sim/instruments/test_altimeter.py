@@ -38,7 +38,6 @@ source = "procedural"
 estimators = ["anchored"]
 filter_gravity = "builtin"
 filter_degree = 8
-[altimeter]
 """
 
 
@@ -155,12 +154,12 @@ def test_samples_depend_on_seed_and_time_alone() -> None:
 )
 def test_settings_out_of_range_are_refused(line: str, message: str) -> None:
     with pytest.raises(ScenarioError) as refusal:
-        parse_scenario(SCENARIO + line)
+        parse_scenario(f"{SCENARIO}[altimeter]\n{line}")
     assert str(refusal.value) == f"scenario: {message}"
 
 
 def test_a_pass_with_an_altimeter_uses_its_ranges_without_reading_the_truth(tmp_path: Path) -> None:
-    scenario = parse_scenario(SCENARIO + "rim_height_share = 0.0")
+    scenario = parse_scenario(SCENARIO + "[altimeter]\nrim_height_share = 0.0")
     summary = emulate(scenario, DataFolder(), tmp_path / "pass")
     assert summary["truth_reads_after_start"] == 0
     table = decode((tmp_path / "pass" / "downlink.cadu").read_bytes()).tables()["altimeter"]

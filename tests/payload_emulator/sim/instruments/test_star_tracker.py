@@ -34,6 +34,7 @@ from payload_emulator.sim.instruments.star_tracker import (
     start,
     tracker_from_camera,
 )
+from tests.payload_emulator.sim.instruments.test_altimeter import SCENARIO
 from tmtc.downlink import decode
 from tmtc.instruments import ATTITUDE
 
@@ -48,23 +49,6 @@ STEADY = StarTrackerSection(
     earth_exclusion_deg=0.0,
     moon_exclusion_deg=0.0,
 )
-SCENARIO = """
-name = "short"
-seed = 7
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 45.0
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["anchored"]
-filter_gravity = "builtin"
-filter_degree = 8
-"""
 
 
 def situation(
