@@ -129,7 +129,7 @@ def _parts(value: Any, seen: set[int]) -> Iterator[str]:
         seen.add(id(value))
         function = value.py_func
         yield repr([(name, _ordered(option)) for name, option in sorted(value.targetoptions.items())])
-        yield repr(function.__defaults__)
+        yield f"{function.__module__} {function.__defaults__}"
         names = set()
         for code in _codes(function.__code__):
             names |= set(code.co_names)

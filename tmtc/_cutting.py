@@ -6,12 +6,17 @@ octet is a candidate for a packet's beginning. To test a candidate in constant t
 header claims, the checksum register after every octet is kept (`prefix`, started at zero): with S the
 register before the packet, E after it, and n its octets, the packet's own checksum is E xor (S xor 0xFFFF)
 * x**(8n) modulo the generator polynomial, and must be zero.
+
+A packet without a checksum is accepted by what follows it: the end of the octets, a packet with a right checksum,
+or another header of such an APID or of an idle packet. Its content is not checked.
 """
 
 # numba wants numpy integers where annotations say int
 # mypy: disable-error-code="return-value,arg-type,no-any-return"
 
 from __future__ import annotations
+
+import functools
 
 import numpy as np
 
@@ -26,6 +31,7 @@ _CUC_P_FIELD = 0x2E
 _PACKET_MAX = 65_542
 
 
+@functools.cache
 def crc_tables() -> RecordArray:
     """(8, 256) int32: the register's change by an octet that is followed by 0..7 zero octets."""
     tables = np.zeros((8, 256), dtype=np.int32)
@@ -40,6 +46,7 @@ def crc_tables() -> RecordArray:
     return tables
 
 
+@functools.cache
 def powers_of_octets() -> RecordArray:
     """(65543,) int32: x**(8n) modulo the generator polynomial."""
     tables = crc_tables()[0].tolist()
@@ -93,34 +100,6 @@ def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int) -> int:
 @njit(nogil=True)
 def is_idle(buffer: RecordArray, p: int) -> bool:
     return (buffer[p] & 0x0F) == 0x07 and buffer[p + 1] == 0xFF
-
-
-@njit(nogil=True)
-def walk(
-    buffer: RecordArray,
-    p: int,
-    stop: int,
-    packet_type: int,
-    tables: RecordArray,
-    rows: RecordArray,
-    count: int,
-) -> tuple[int, int]:
-    """(position, number of rows) after the undamaged packets from `p` on have been written as rows kind,
-    start, stop.
-
-    Stops at the end, at the first position where no right packet stands (an idle one included), or with
-    full rows.
-    """
-    while p < stop and count < rows.shape[0]:
-        length = length_at(buffer, p, stop, packet_type)
-        if length == 0 or is_idle(buffer, p) or _crc(buffer, p, p + length, tables) != 0:
-            break
-        rows[count, 0] = GOOD
-        rows[count, 1] = p
-        p += length
-        rows[count, 2] = p
-        count += 1
-    return p, count
 
 
 @njit(nogil=True)
@@ -204,7 +183,7 @@ def chain_start(
 
 
 @njit(nogil=True)
-def search(
+def _search_checked(
     buffer: RecordArray, first: int, limit: int, stop: int, packet_type: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> int:  # fmt: skip
@@ -310,3 +289,96 @@ def search_unchecked(buffer: RecordArray, first: int, stop: int, packet_type: in
         if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, last, False):
             return q
     return stop
+
+
+@njit(nogil=True)
+def _is_unchecked(buffer: RecordArray, p: int, unchecked: RecordArray) -> bool:
+    return unchecked[(np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])]
+
+
+@njit(nogil=True)
+def unchecked_length(buffer: RecordArray, p: int, stop: int, packet_type: int, unchecked: RecordArray) -> int:
+    """Octets of the packet without a checksum whose header stands at `p`; 0 if there is none or it does not end."""
+    length = header_at(buffer, p, stop, packet_type)
+    if length == 0 or length > stop - p or is_idle(buffer, p) or not _is_unchecked(buffer, p, unchecked):
+        return 0
+    return length
+
+
+@njit(nogil=True)
+def follows(
+    buffer: RecordArray,
+    e: int,
+    stop: int,
+    packet_type: int,
+    unchecked: RecordArray,
+    tables: RecordArray,
+    open_end: bool,
+) -> bool:
+    """Return whether a packet can end at `e`; `open_end`: more octets will follow `stop`."""
+    if e == stop:
+        return not open_end
+    if stop - e < 7:
+        return not open_end and (buffer[e] >> 4) == packet_type
+    claimed = header_at(buffer, e, stop, packet_type)
+    if claimed == 0:
+        return False
+    if is_idle(buffer, e) or _is_unchecked(buffer, e, unchecked):
+        return True
+    if claimed > stop - e:
+        return True
+    return length_at(buffer, e, stop, packet_type) > 0 and _crc(buffer, e, e + claimed, tables) == 0
+
+
+@njit(nogil=True)
+def walk(
+    buffer: RecordArray, p: int, stop: int, packet_type: int, tables: RecordArray, rows: RecordArray, count: int,
+    unchecked: RecordArray, open_end: bool,
+) -> tuple[int, int]:  # fmt: skip
+    """(position, number of rows) after the undamaged packets from `p` on have been written as rows kind,
+    start, stop.
+
+    Stops at the end, at the first position where no right packet stands (an idle one included), or with
+    full rows. A packet of an APID in `unchecked` (2048,) does not end with a checksum: what follows it decides.
+    """
+    while p < stop and count < rows.shape[0]:
+        length = unchecked_length(buffer, p, stop, packet_type, unchecked)
+        if length:
+            if not follows(buffer, p + length, stop, packet_type, unchecked, tables, open_end):
+                break
+        else:
+            length = length_at(buffer, p, stop, packet_type)
+            if length == 0 or is_idle(buffer, p) or _crc(buffer, p, p + length, tables) != 0:
+                break
+        rows[count, 0] = GOOD
+        rows[count, 1] = p
+        p += length
+        rows[count, 2] = p
+        count += 1
+    return p, count
+
+
+@njit(nogil=True)
+def search(
+    buffer: RecordArray, first: int, limit: int, stop: int, packet_type: int,
+    prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray, unchecked: RecordArray,
+) -> int:  # fmt: skip
+    """First position in [first, limit) at which a packet is believed to begin, or `limit`.
+
+    Two packets without a checksum must follow each other before a place is believed.
+    """
+    checked = _search_checked(buffer, first, limit, stop, packet_type, prefix, known, tables, powers)
+    for q in range(first, checked):
+        length = unchecked_length(buffer, q, stop, packet_type, unchecked)
+        if length == 0:
+            continue
+        e = q + length
+        if e == stop:
+            return q
+        second = unchecked_length(buffer, e, stop, packet_type, unchecked)
+        if second == 0:
+            if follows(buffer, e, stop, packet_type, unchecked, tables, False):
+                return q
+        elif follows(buffer, e + second, stop, packet_type, unchecked, tables, False):
+            return q
+    return checked

@@ -73,16 +73,6 @@ class CaduSync:
         """Octet (n,) in which each CADU begins."""
         return self.start_bits >> 3
 
-    def head(self, count: int) -> CaduSync:
-        """The first `count` CADUs."""
-        return CaduSync(
-            self.start_bits[:count],
-            self.inverted[:count],
-            self.marker_errors[:count],
-            self.truncated[:0],
-            self.period,
-        )
-
     def take(self, rows: IntArray) -> CaduSync:
         """Return the CADUs of these rows."""
         return CaduSync(

@@ -46,6 +46,12 @@ _FRAME = (
     Field("image_ticks", "u64", "On-board time at which the image was taken", "2^-16 s"),
 )
 _OCTETS = (Field("octet", "u8", "One octet of the part"),)
+_PART = (
+    Field("transaction", "u16", "Number of the transfer"),
+    Field("part", "u16", "Number of the part, from 1"),
+    Field("table", "u8", "What is transferred", labels=TABLES),
+    Field("count", "u16", "Octets that follow"),
+)
 
 
 _HOUSEKEEPING = PacketDefinition(
@@ -204,13 +210,7 @@ _REPORTS = (
     ),
     *(
         PacketDefinition(
-            f"large_data_{part}", APID_LARGE_DATA, 13, subtype, f"Large data downlink, {part} part",
-            (
-                Field("transaction", "u16", "Number of the transfer"),
-                Field("part", "u16", "Number of the part, from 1"),
-                Field("table", "u8", "What is transferred", labels=TABLES),
-                Field("count", "u16", "Octets that follow"),
-            ),
+            f"large_data_{part}", APID_LARGE_DATA, 13, subtype, f"Large data downlink, {part} part", _PART,
             Group("count", _OCTETS),
         )
         for subtype, part in ((1, "first"), (2, "middle"), (3, "last"))
@@ -278,14 +278,7 @@ _TELECOMMANDS = (
     ),
     *(
         _command(
-            f"uplink_{part}", 13, subtype, f"Large data uplink, {part} part",
-            (
-                Field("transaction", "u16", "Number of the transfer"),
-                Field("part", "u16", "Number of the part, from 1"),
-                Field("table", "u8", "What is transferred", labels=TABLES),
-                Field("count", "u16", "Octets that follow"),
-            ),
-            Group("count", _OCTETS),
+            f"uplink_{part}", 13, subtype, f"Large data uplink, {part} part", _PART, Group("count", _OCTETS)
         )
         for subtype, part in ((9, "first"), (10, "middle"), (11, "last"))
     ),
@@ -527,14 +520,11 @@ DICTIONARY = Dictionary(
 )
 
 
-def _is_structure(definition: PacketDefinition) -> bool:
-    """Return whether a packet is a housekeeping structure with a fixed number and fixed fields."""
-    first = definition.fields[0] if definition.fields else None
-    return first is not None and first.name == "structure_id" and first.minimum == first.maximum
-
-
 STRUCTURES: dict[int, PacketDefinition] = {
-    int(one.fields[0].minimum or 0): one for one in DICTIONARY.telemetry if _is_structure(one)
+    int(first.minimum or 0): one
+    for one in DICTIONARY.telemetry
+    for first in one.fields[:1]
+    if first.name == "structure_id" and first.minimum == first.maximum
 }
 """Housekeeping structures that every build sends, by number; the data pool has their fields."""
 

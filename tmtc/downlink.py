@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,13 +30,13 @@ from tmtc.frames import (
     append_frame_checksums,
     idle_data,
 )
-from tmtc.link import Coding, LinkSettings
+from tmtc.link import LinkSettings
 from tmtc.link_check import CountPackets, LinkProposal, propose_link
 from tmtc.link_plan import LinkPlan, LinkSection, one_section, plan_link
 from tmtc.marker_survey import survey_markers
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
 from tmtc.pus import TM_HEADER_LENGTH
-from tmtc.randomiser import Randomiser, randomise
+from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary, Table
 from tmtc.sequence import SequenceReport, account
 from tmtc.stream import PacketCut, PrimaryHeaders, cut_packets, primary_headers
@@ -152,23 +153,10 @@ def _control_fields(clcw: bytes | Sequence[bytes] | None, count: int) -> OctetAr
 
 
 def encode_cadus(
-    packets: Iterable[bytes],
-    *,
-    spacecraft_id: int,
-    virtual_channel: int = 0,
-    frame_length: int = 1115,
-    coding: Coding = "rs",
-    randomiser: Randomiser = "legacy",
-    checksum: bool = True,
+    packets: Iterable[bytes], *, spacecraft_id: int, virtual_channel: int = 0, **settings: Any
 ) -> bytes:
-    """A whole downlink: CADUs that carry `packets`, frame counts from zero (`DownlinkEncoder` goes on counting)."""
-    settings = LinkSettings(
-        frame_length=frame_length,
-        coding=coding,
-        randomiser=randomiser,
-        checksum=checksum,
-    )
-    return DownlinkEncoder(spacecraft_id, settings).encode(packets, virtual_channel)
+    """A whole downlink: CADUs that carry `packets`, frame counts from zero; `settings` are those of `LinkSettings`."""
+    return DownlinkEncoder(spacecraft_id, LinkSettings(**settings)).encode(packets, virtual_channel)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,26 +228,6 @@ class DownlinkDecode:
         return dict(zip(apids.tolist(), counts.tolist(), strict=True))
 
     @property
-    def gaps(self) -> int:
-        """Stretches of missing sequence counts."""
-        return self.sequence.gaps
-
-    @property
-    def packets_missing(self) -> int:
-        """Packets missing by their sequence counts."""
-        return self.sequence.missing
-
-    @property
-    def duplicates(self) -> int:
-        """Packets that came again with the same octets."""
-        return self.sequence.duplicates
-
-    @property
-    def conflicts(self) -> int:
-        """Packets with the sequence count of another but other octets."""
-        return self.sequence.conflicts
-
-    @property
     def crc_errors(self) -> int:
         """Packets with a wrong checksum."""
         return self.cut.crc_errors
@@ -288,8 +256,8 @@ class DownlinkDecode:
     def complete(self) -> bool:
         """Whether nothing is damaged, missing, unknown or left over."""
         return not (
-            self.gaps
-            or self.conflicts
+            self.sequence.gaps
+            or self.sequence.conflicts
             or self.crc_errors
             or self.unknown
             or self.octets_skipped
@@ -307,10 +275,10 @@ class DownlinkDecode:
             "kind": "packets" if self.settings is None else "cadu",
             "packets": self.packets,
             "by_apid": {f"0x{apid:03X}": count for apid, count in self.by_apid.items()},
-            "gaps": self.gaps,
-            "packets_missing": self.packets_missing,
-            "duplicates": self.duplicates,
-            "conflicts": self.conflicts,
+            "gaps": self.sequence.gaps,
+            "packets_missing": self.sequence.missing,
+            "duplicates": self.sequence.duplicates,
+            "conflicts": self.sequence.conflicts,
             "crc_errors": self.crc_errors,
             "unknown": self.unknown,
             "octets_skipped": self.octets_skipped,
@@ -400,8 +368,10 @@ def plan_of(
     """
     stream = as_octets(octets)
     plan = plan_link(stream, _packet_counter(stream, dictionary, error_control), known)
-    no_frames = not plan.sections and plan.has_regular_markers
-    if no_frames and not _holds_packets(stream, error_control):
+    if plan.sections or not plan.has_regular_markers:
+        return plan
+    cut = cut_packets(stream, error_control=error_control)
+    if 2 * int(cut.lengths[cut.crc_ok].sum()) <= stream.size:  # bare packets do not fill most of the stream
         proposal = plan.proposal
         distance = next(iter(proposal.distances), 0) if proposal else 0
         raise UnknownCoding(proposal.markers if proposal else 0, distance)
@@ -417,12 +387,6 @@ def _packet_counter(stream: OctetArray, dictionary: Dictionary, error_control: b
         return found.packets, filled / max(len(sync.start_bits) * settings.frame_length, 1)
 
     return count_packets
-
-
-def _holds_packets(octets: Octets, error_control: bool) -> bool:
-    """Return whether bare packets fill most of a stream."""
-    cut = cut_packets(octets, error_control=error_control)
-    return 2 * int(cut.lengths[cut.crc_ok].sum()) > as_octets(octets).size
 
 
 def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: bool) -> DownlinkDecode:

@@ -54,7 +54,9 @@ def filter_estimates(tables: Mapping[str, Table]) -> FilterEstimates:
     """Return the estimates in unpacked tables, those of version 2 first; empty if no such packet was received."""
     parts = [_of_table(tables[name]) for name in ESTIMATE_PACKETS if name in tables]
     if not parts:
-        return _none()
+        none = np.zeros(0, dtype=np.int64)
+        states = np.zeros((0, STATES)), np.zeros((0, STATES, STATES))
+        return FilterEstimates(none, none, none, none, *states, none)
     columns = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in FilterEstimates.__dataclass_fields__
@@ -82,8 +84,3 @@ def _of_table(table: Table) -> FilterEstimates:
         full_covariance(columns["covariance"], upper=upper),
         columns["innovation_degrees"] if upper else np.full(len(table), -1, dtype=np.int64),
     )
-
-
-def _none() -> FilterEstimates:
-    none = np.zeros(0, dtype=np.int64)
-    return FilterEstimates(none, none, none, none, np.zeros((0, STATES)), np.zeros((0, STATES, STATES)), none)

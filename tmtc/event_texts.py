@@ -16,8 +16,8 @@ from tmtc.codes import (
     TABLES,
     Labels,
 )
+from tmtc.cuc import TICKS_PER_SECOND
 
-TICKS_PER_SECOND = 65_536
 _EPOCH = datetime(2000, 1, 1)
 
 

@@ -137,12 +137,17 @@ def _column(f: Field, values: Any) -> list[Any]:
         names = dict(f.labels)
         return [names.get(code, code) for code in values.tolist()]
     listed: list[Any] = values.tolist()
-    if values.dtype.kind == "f":
-        return [_finite(value) for value in listed]
-    return listed
+    return [plain(value) for value in listed] if values.dtype.kind == "f" else listed
 
 
-def _finite(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a value for JSON: octets as hexadecimal digits, numbers that are not finite as None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, bytes):
+        return value.hex()
     if isinstance(value, list):
-        return [_finite(element) for element in value]
-    return value if math.isfinite(value) else None
+        return [plain(one) for one in value]
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    return value

@@ -10,12 +10,11 @@ synchronisation flag, packet order flag (1 each), segment length id 11 (2), firs
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 
-from tmtc.arrays import BoolArray, IntArray, OctetArray, RecordArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
 
@@ -39,7 +38,6 @@ class TmFrameHeaders:
     first_header_pointer: IntArray
     ocf: BoolArray
     secondary_header: BoolArray
-    synchronised: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,6 @@ def frame_headers(frames: OctetArray) -> TmFrameHeaders:
         first_header_pointer=status & 0x7FF,
         ocf=(first & 1) != 0,
         secondary_header=status >> 15 != 0,
-        synchronised=(status >> 14 & 1) != 0,
     )
 
 
@@ -84,16 +81,8 @@ def frame_checksums_hold(frames: OctetArray) -> BoolArray:
     holds = np.empty(frames.shape[0], dtype=np.bool_)
     rows = np.ascontiguousarray(frames).view()
     rows.flags.writeable = False  # one compiled variant for frames of every origin
-    _cutting.checksums_hold(rows, checksum_tables(), holds)
+    _cutting.checksums_hold(rows, _cutting.crc_tables(), holds)
     return holds
-
-
-@functools.cache
-def checksum_tables() -> RecordArray:
-    """Return the tables of the checksum (see `_cutting.crc_tables`)."""
-    from tmtc import _cutting
-
-    return _cutting.crc_tables()
 
 
 def append_frame_checksums(frames: OctetArray) -> None:

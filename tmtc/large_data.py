@@ -8,7 +8,7 @@ A transfer that fits into one part is sent as its last.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -83,31 +83,14 @@ class LargeDataReceiver:
             )
             self.abort(transaction)
             return whole
-        while len(self._parts) > 1 and self.octets_kept > self.most_octets:
+        while len(self._parts) > 1 and self._kept > self.most_octets:
             self.abort(next(iter(self._parts)))
-        if self.octets_kept > self.most_octets:
+        if self._kept > self.most_octets:
             self.abort(transaction)
         return None
-
-    def missing(self, transaction: int) -> list[int]:
-        """Parts not yet there: below the last one, or below the highest so far while the last has not come."""
-        parts = self._parts.get(transaction, {})
-        highest = self._last.get(transaction, max(parts, default=0))
-        return [k for k in range(1, highest + 1) if k not in parts]
 
     def abort(self, transaction: int) -> None:
         """Forget an unfinished transfer."""
         self._kept -= sum(map(len, self._parts.pop(transaction, {}).values()))
         self._tables.pop(transaction, None)
         self._last.pop(transaction, None)
-
-    @property
-    def octets_kept(self) -> int:
-        """Octets of unfinished transfers."""
-        return self._kept
-
-
-def receive(parts: Iterable[tuple[str, Mapping[str, Any]]]) -> list[LargeData]:
-    """All transfers that are complete in `parts`."""
-    receiver = LargeDataReceiver()
-    return [whole for name, values in parts if (whole := receiver.accept(name, values)) is not None]

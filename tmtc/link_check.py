@@ -11,7 +11,7 @@ proposed only if valid packets support it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,32 +57,30 @@ _SHORTEST_CADU = cadu.ASM_LENGTH + FRAME_HEADER_LENGTH + 2
 class LinkEvidence:
     """Evidence for one candidate: shares of a sample, and valid packets in consecutive CADUs.
 
-    `clean` and `repaired`: codewords without error, and corrected codewords (None: no code, or not tried).
-    `checksums`: valid frame checksums. `regular`: frame headers of version 0 with the usual flags. `filled`: share of
-    the frames that valid packets fill.
+    `codewords_clean` and `codewords_repairable`: codewords without error, and corrected codewords (None: no code, or
+    not tried). `checksums_hold`: valid frame checksums. `headers_regular`: frame headers of version 0 with the usual
+    flags. `filled`: share of the frames that valid packets fill.
     """
 
     settings: LinkSettings
     sampled: int
-    clean: float | None
-    repaired: float | None
-    checksums: float
-    regular: float
+    codewords_clean: float | None
+    codewords_repairable: float | None
+    checksums_hold: float
+    headers_regular: float
     packets: int
     filled: float
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Order of candidates: packets first, then proof."""
+        return self.packets + self.headers_regular, max(
+            self.codewords_clean or 0.0, self.codewords_repairable or 0.0, self.checksums_hold
+        )
+
     def describe(self) -> dict[str, object]:
         """Return the evidence by name, for output."""
-        return {
-            "settings": self.settings.describe(),
-            "sampled": self.sampled,
-            "codewords_clean": self.clean,
-            "codewords_repairable": self.repaired,
-            "checksums_hold": self.checksums,
-            "headers_regular": self.regular,
-            "packets": self.packets,
-            "filled": self.filled,
-        }
+        return asdict(self) | {"settings": self.settings.describe()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,17 +128,16 @@ def propose_link(stream: OctetArray, count_packets: CountPackets, survey: Marker
                 break
         if found:
             break
-    found.sort(key=_rank, reverse=True)
+    found.sort(key=lambda one: one.rank, reverse=True)
     if not found:
         return LinkProposal(None, (), survey.markers, distances, False)
     best = found[0]
-    rivals = [one for one in found[1:] if one.packets >= best.packets > 0 and one.regular >= best.regular]
+    rivals = [
+        one
+        for one in found[1:]
+        if one.packets >= best.packets > 0 and one.headers_regular >= best.headers_regular
+    ]
     return LinkProposal(best.settings, tuple(found), survey.markers, distances, bool(rivals))
-
-
-def _rank(evidence: LinkEvidence) -> tuple[float, float]:
-    proof = max(evidence.clean or 0.0, evidence.repaired or 0.0, evidence.checksums)
-    return evidence.packets + evidence.regular, proof
 
 
 def _lengths(octets: int, distances: dict[int, int]) -> Iterator[list[int]]:
@@ -204,9 +201,10 @@ def _examine(
         finalists = _best([(float(proof.mean()), c, proof) for c, proof in held])
     if not finalists and (usual or length in _STANDARD):
         some = np.unique(np.linspace(0, rows.size - 1, min(rows.size, _REPAIRED)).astype(np.int64))
-        finalists = [
-            c for c in coded if _repairable(plain[c.randomiser][some], c) >= min(LEAST_PROOFS, some.size)
-        ]
+        for c in coded:  # by the first codeword of each block
+            words = np.ascontiguousarray(plain[c.randomiser][some, :: _code(c).interleave])
+            if np.count_nonzero(reed_solomon.repair(words, _code(c))[1] >= 0) >= min(LEAST_PROOFS, some.size):
+                finalists.append(c)
     return [_weigh(stream, sync, plain[c.randomiser], c, count_packets) for c in finalists]
 
 
@@ -238,22 +236,17 @@ def _weigh(
     begin = int(sync.start_bits[first] >> 3)
     # enough octets for these CADUs and the gaps that a station may have inserted
     stretch = stream[begin : begin + (STRETCH + 1) * (sync.period + LONGEST_GAP)]
-    consecutive = cadu.synchronise(stretch, sync.period).head(STRETCH)
-    shifted = cadu.CaduSync(
-        consecutive.start_bits + 8 * begin,
-        consecutive.inverted,
-        consecutive.marker_errors,
-        consecutive.truncated[:0],
-        sync.period,
-    )
+    consecutive = cadu.synchronise(stretch, sync.period)
+    consecutive = consecutive.take(np.arange(min(STRETCH, consecutive.start_bits.size)))
+    shifted = replace(consecutive, start_bits=consecutive.start_bits + 8 * begin)
     packets, filled = count_packets(shifted, settings)
     return LinkEvidence(
         settings=settings,
         sampled=int(blocks.shape[0]),
-        clean=clean,
-        repaired=repaired,
-        checksums=float(held.mean()),
-        regular=share,
+        codewords_clean=clean,
+        codewords_repairable=repaired,
+        checksums_hold=float(held.mean()),
+        headers_regular=share,
         packets=packets,
         filled=filled,
     )
@@ -277,13 +270,6 @@ def _best(
         for share, settings, proof in shares
         if share >= greatest / 2 and proof.sum() >= min(LEAST_PROOFS, proof.size)
     ]
-
-
-def _repairable(blocks: OctetArray, settings: LinkSettings) -> int:
-    """Return the number of blocks whose first codeword can be corrected."""
-    code = _code(settings)
-    _, corrected = reed_solomon.repair(np.ascontiguousarray(blocks[:, :: code.interleave]), code)
-    return int(np.count_nonzero(corrected >= 0))
 
 
 def _code(settings: LinkSettings) -> reed_solomon.ReedSolomon:

@@ -116,24 +116,20 @@ def one_section(stream: OctetArray, settings: LinkSettings) -> LinkPlan:
 def _explain_rest(trial: _Trial, stream: OctetArray, count_packets: CountPackets) -> None:
     """Propose settings for the runs of blocks in which no frame is valid, the longest first."""
     given_up: set[int] = set()
+    start = 0
+
+    def count(sync: cadu.CaduSync, settings: LinkSettings) -> tuple[int, float]:
+        return count_packets(replace(sync, start_bits=sync.start_bits + 8 * start), settings)
+
     for _ in range(MOST_PROPOSALS):
         run = next((one for one in trial.unexplained() if one[0] not in given_up), None)
         if run is None:
             return
         start, stop = run
         part = stream[start:stop]
-        other = propose_link(part, _within(count_packets, start), survey_markers(part)).settings
+        other = propose_link(part, count, survey_markers(part)).settings
         if other is None or not other.proves_frames or not trial.try_settings(other):
             given_up.add(start)
-
-
-def _within(count_packets: CountPackets, start: int) -> CountPackets:
-    """Return a counter of packets in a part of the stream that begins at octet `start`."""
-
-    def count(sync: cadu.CaduSync, settings: LinkSettings) -> tuple[int, float]:
-        return count_packets(replace(sync, start_bits=sync.start_bits + 8 * start), settings)
-
-    return count
 
 
 class _Trial:

@@ -34,7 +34,6 @@ class PrimaryHeader:
     apid: int
     packet_type: int = TYPE_TELEMETRY
     secondary_header: bool = True
-    sequence_flags: int = FLAGS_WHOLE
     sequence_count: int = 0
     data_length: int = 0
 
@@ -51,7 +50,6 @@ def pack_packet(
     sequence_count: int,
     packet_type: int = TYPE_TELEMETRY,
     secondary_header: bool = True,
-    sequence_flags: int = FLAGS_WHOLE,
 ) -> bytes:
     """A space packet with `data` as its data field (secondary header and error control included)."""
     if not 0 <= apid < APID_LIMIT:
@@ -61,7 +59,7 @@ def pack_packet(
     if not 1 <= len(data) <= 65_536:
         raise ValueRefused("space packet", "data", f"{len(data)} octets", "1..65536 octets")
     first = packet_type << 12 | secondary_header << 11 | apid
-    return _HEADER.pack(first, sequence_flags << 14 | sequence_count, len(data) - 1) + data
+    return _HEADER.pack(first, FLAGS_WHOLE << 14 | sequence_count, len(data) - 1) + data
 
 
 def unpack_primary_header(octets: bytes | memoryview) -> PrimaryHeader:
@@ -75,7 +73,6 @@ def unpack_primary_header(octets: bytes | memoryview) -> PrimaryHeader:
         apid=first & 0x7FF,
         packet_type=first >> 12 & 1,
         secondary_header=bool(first >> 11 & 1),
-        sequence_flags=second >> 14,
         sequence_count=second & 0x3FFF,
         data_length=data_length,
     )

@@ -50,12 +50,9 @@ class TcSecondaryHeader:
 
 def pack_tm_header(header: TmSecondaryHeader) -> bytes:
     """Fourteen octets."""
-    if not 0 <= header.ticks < TICKS_LIMIT:
-        raise ValueRefused("telemetry header", "ticks", header.ticks, f"0..{TICKS_LIMIT - 1}")
-    if not 0 <= header.message_counter < 1 << 16:
-        raise ValueRefused("telemetry header", "message_counter", header.message_counter, "0..65535")
-    if not 0 <= header.destination < 1 << 16:
-        raise ValueRefused("telemetry header", "destination", header.destination, "0..65535")
+    for name, limit in (("ticks", TICKS_LIMIT), ("message_counter", 1 << 16), ("destination", 1 << 16)):
+        if not 0 <= getattr(header, name) < limit:
+            raise ValueRefused("telemetry header", name, getattr(header, name), f"0..{limit - 1}")
     return _TM.pack(
         PUS_VERSION << 4 | header.time_status,
         header.service,

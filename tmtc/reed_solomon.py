@@ -194,10 +194,13 @@ def dual_basis_tables() -> tuple[OctetArray, OctetArray]:
 def generator(errors: int) -> tuple[int, ...]:
     """Coefficients of the generator polynomial, highest power first."""
     exponent, _ = _field_tables()
+    times = _multiplication_table()
     polynomial = [1]
     for j in range(128 - errors, 128 + errors):
         root = int(exponent[11 * j % 255])
-        polynomial = [a ^ _times(root, b) for a, b in zip([*polynomial, 0], [0, *polynomial], strict=True)]
+        polynomial = [
+            a ^ int(times[root, b]) for a, b in zip([*polynomial, 0], [0, *polynomial], strict=True)
+        ]
     return tuple(polynomial)
 
 
@@ -275,7 +278,3 @@ def _place_table(errors: int) -> npt.NDArray[np.uint64]:
     table = np.ones((errors + 1, 256, 256), dtype=np.uint8)
     table[:, :, :CODEWORD] = _multiplication_table()[:, powers].transpose(1, 0, 2)
     return table.view(np.uint64)
-
-
-def _times(a: int, b: int) -> int:
-    return int(_multiplication_table()[a, b])

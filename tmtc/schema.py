@@ -454,20 +454,9 @@ def _gather_items(
     octets: OctetArray, starts: IntArray, counts: IntArray, dtype: np.dtype[Any]
 ) -> tuple[RecordArray, IntArray]:
     """Return the `counts` (n,) items of `dtype` from each of `starts` (n,), and the index of the start of each."""
-    from tmtc import _gathering  # numba is imported only where it is used
-
-    total = int(counts.sum())
-    result = np.empty(total * dtype.itemsize, dtype=np.uint8)
-    owner = np.empty(total, dtype=np.int64)
-    _gathering.copy_items(_readable(octets), starts, counts, dtype.itemsize, result, owner)
-    return result.view(dtype), owner
-
-
-def _readable(octets: OctetArray) -> OctetArray:
-    """Return a read-only view: one compiled variant serves octets of every origin."""
-    view = octets.view()
-    view.flags.writeable = False
-    return view
+    owner = np.repeat(np.arange(counts.size, dtype=np.int64), counts)
+    place = np.arange(owner.size, dtype=np.int64) - (np.cumsum(counts) - counts)[owner]
+    return gather(octets, starts[owner] + dtype.itemsize * place, dtype), owner
 
 
 def _checked_header(octets: bytes, packet_type: int) -> Any:

@@ -97,7 +97,9 @@ def extend_counts(sequence_count: IntArray, ticks: IntArray) -> tuple[IntArray, 
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     order = np.lexsort((np.arange(ticks.size), ticks))
     count, time = sequence_count[order], ticks[order]
-    step = _nearest(np.diff(count))
+    # the step congruent to the difference that lies nearest to 0
+    half = SEQUENCE_COUNT_LIMIT // 2
+    step = (np.diff(count) + half) % SEQUENCE_COUNT_LIMIT - half
     restart = (step < -_RESET_FALL) & (count[1:] < _RESET_COUNT) & (np.diff(time) > 0)
     extended = np.empty(count.size, dtype=np.int64)
     extended[0] = count[0]
@@ -169,9 +171,3 @@ def account(
             )
         )
     return SequenceReport(tuple(accounts), extended, verdict)
-
-
-def _nearest(difference: IntArray) -> IntArray:
-    """The step congruent to `difference` that lies nearest to 0."""
-    half = SEQUENCE_COUNT_LIMIT // 2
-    return (difference + half) % SEQUENCE_COUNT_LIMIT - half

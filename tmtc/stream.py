@@ -11,7 +11,6 @@ counts must continue. Damage inside such a packet cannot be detected.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -80,7 +79,6 @@ class PrimaryHeaders:
 
     apid: IntArray
     sequence_count: IntArray
-    sequence_flags: IntArray
     secondary_header: BoolArray
 
 
@@ -123,10 +121,8 @@ def cut_packets(
     cutter: _Cutter | _UncheckedCutter
     if not error_control:
         cutter = _UncheckedCutter(octets, packet_type, begins)
-    elif unchecked_apids:
-        cutter = _MixedCutter(octets, packet_type, unchecked_apids)
     else:
-        cutter = _Cutter(octets, packet_type)
+        cutter = _Cutter(octets, packet_type, unchecked_apids)
     for start, stop in segments.tolist():
         consumed = cutter.cut(start, stop, final)
     rows = cutter.rows[: cutter.count]
@@ -158,7 +154,6 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
     return PrimaryHeaders(
         apid=first & 0x7FF,
         sequence_count=second & 0x3FFF,
-        sequence_flags=second >> 14,
         secondary_header=(first & 0x800) != 0,
     )
 
@@ -166,17 +161,19 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
 class _Cutter:
     """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
 
-    def __init__(self, octets: OctetArray, packet_type: int) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int, unchecked_apids: Collection[int]) -> None:
         from tmtc import _cutting  # numba is imported only where it is used
 
         self.kernels: Any = _cutting
-        self.tables, self.powers = _tables()
+        self.tables, self.powers = _cutting.crc_tables(), _cutting.powers_of_octets()
         self.octets = octets
         self.packet_type = packet_type
         self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
         self.count = 0
         self.prefix: npt.NDArray[np.uint16] | None = None
         self.known = np.full(2, -1, dtype=np.int64)
+        self.unchecked = np.zeros(1 << 11, dtype=np.bool_)
+        self.unchecked[list(unchecked_apids)] = True
 
     def cut(self, p: int, stop: int, final: bool) -> int:
         """The position reached in [p, stop): `stop`, or earlier where octets to come could change what follows."""
@@ -203,14 +200,22 @@ class _Cutter:
     def walk(self, p: int, stop: int, final: bool) -> int:
         """Write rows of undamaged packets from `p` on; return the position behind them."""
         end, self.count = self.kernels.walk(
-            self.octets, p, stop, self.packet_type, self.tables, self.rows, self.count
+            self.octets,
+            p,
+            stop,
+            self.packet_type,
+            self.tables,
+            self.rows,
+            self.count,
+            self.unchecked,
+            not final,
         )
         return int(end)
 
     def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
         """Return the first position in [first, limit) at which a packet is believed to begin, or `limit`."""
         key = (first, limit, stop, self.packet_type)
-        return int(self.kernels.search(self.octets, *key, *state))
+        return int(self.kernels.search(self.octets, *key, *state, self.unchecked))
 
     def note(self, kind: int, p: int, q: int, begin: int) -> None:
         """Write a row; what is skipped right after something skipped prolongs that row."""
@@ -264,48 +269,15 @@ class _Cutter:
         return bool(self.octets[p] & 0x0F == 0x07 and self.octets[p + 1] == 0xFF)
 
     def length_at(self, p: int, stop: int) -> int:
-        return int(self.kernels.length_at(self.octets, p, stop, self.packet_type))
+        key = (self.octets, p, stop, self.packet_type)
+        return int(self.kernels.unchecked_length(*key, self.unchecked) or self.kernels.length_at(*key))
 
     def is_packet_at(self, p: int, stop: int) -> bool:
-        """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
+        """Whether a whole packet, with a right checksum if it has one, or the header of an idle one stands at `p`."""
+        if self.kernels.unchecked_length(self.octets, p, stop, self.packet_type, self.unchecked):
+            return True
         length = self.length_at(p, stop)
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
-
-
-class _MixedCutter(_Cutter):
-    """A cutter that knows APIDs whose packets do not end with a checksum."""
-
-    def __init__(
-        self, octets: npt.NDArray[np.uint8], packet_type: int, unchecked_apids: Collection[int]
-    ) -> None:
-        from tmtc import _mixed_cutting
-
-        super().__init__(octets, packet_type)
-        self.mixed: Any = _mixed_cutting
-        self.unchecked = np.zeros(1 << 11, dtype=np.bool_)
-        self.unchecked[list(unchecked_apids)] = True
-
-    def walk(self, p: int, stop: int, final: bool) -> int:
-        end, self.count = self.mixed.walk_mixed(
-            self.octets, p, stop, self.packet_type, self.tables, self.rows, self.count,
-            self.unchecked, not final,
-        )  # fmt: skip
-        return int(end)
-
-    def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
-        key = (first, limit, stop, self.packet_type)
-        return int(self.mixed.search_mixed(self.octets, *key, *state, self.unchecked))
-
-    def length_at(self, p: int, stop: int) -> int:
-        key = (p, stop, self.packet_type)
-        found = self.mixed.unchecked_length(self.octets, *key, self.unchecked)
-        return int(found) or super().length_at(p, stop)
-
-    def is_packet_at(self, p: int, stop: int) -> bool:
-        key = (p, stop, self.packet_type, self.unchecked)
-        if self.mixed.unchecked_length(self.octets, *key):
-            return True
-        return super().is_packet_at(p, stop)
 
 
 class _UncheckedCutter:
@@ -370,10 +342,3 @@ class _UncheckedCutter:
     def grow(self) -> None:
         """Make room for more rows."""
         self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
-
-
-@functools.cache
-def _tables() -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    from tmtc import _cutting
-
-    return _cutting.crc_tables(), _cutting.powers_of_octets()

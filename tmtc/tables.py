@@ -2,7 +2,8 @@
 
 Every table is one block: magic `LINNATBL`, kind (2 octets, ASCII), version (u16), length of the content
 (u32), CRC-32 of the content (u32), then the content; all big-endian. The identity of a table in telemetry is
-the first 32 bits of the SHA-256 of the whole block.
+the first 32 bits of the SHA-256 of the whole block. The functions `unpack_…` raise `TableError` if the block is
+damaged, is of another kind, or holds numbers that are not finite or times out of order.
 
 Kinds: `AE` anchor ephemeris, `CC` crater catalogue, `GR` gravity field, `OR` orientation, `IS` initial state,
 `BU` burns.
@@ -15,7 +16,7 @@ import hashlib
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -132,14 +133,7 @@ class CatalogueTable:
         return int(self.ids.shape[0])
 
     def select(self, which: BoolArray | IntArray) -> CatalogueTable:
-        return CatalogueTable(
-            self.ids[which],
-            self.latitude_rad[which],
-            self.longitude_rad[which],
-            self.diameter_m[which],
-            self.rim_height_m[which],
-            self.sigma_m[which],
-        )
+        return CatalogueTable(*(getattr(self, one.name)[which] for one in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,13 +235,7 @@ def pack_anchor_table(ticks: ArrayLike, position_mcmf_m: ArrayLike) -> bytes:
 
 
 def unpack_anchor_table(octets: bytes) -> AnchorTable:
-    """Return the anchor ephemeris in a block of octets.
-
-    Raises
-    ------
-    TableError
-        The block is damaged or holds another kind of table.
-    """
+    """Return the anchor ephemeris in a block of octets."""
     content = _unwrap(b"AE", octets)
     count = _count(content, 32, b"AE")
     times = np.frombuffer(content, dtype=">i8", count=count, offset=4)
@@ -275,13 +263,7 @@ def pack_catalogue_table(table: CatalogueTable) -> bytes:
 
 
 def unpack_catalogue_table(octets: bytes) -> CatalogueTable:
-    """Return the anchoring catalogue in a block of octets, in order of latitude.
-
-    Raises
-    ------
-    TableError
-        The block is damaged or holds another kind of table.
-    """
+    """Return the anchoring catalogue in a block of octets, in order of latitude."""
     content = _unwrap(b"CC", octets)
     count = _count(content, _CRATER.itemsize, b"CC")
     rows = np.frombuffer(content, dtype=_CRATER, count=count, offset=4)
@@ -307,13 +289,7 @@ def pack_gravity_table(table: GravityTable) -> bytes:
 
 
 def unpack_gravity_table(octets: bytes) -> GravityTable:
-    """Return the gravity field in a block of octets.
-
-    Raises
-    ------
-    TableError
-        The block is damaged or holds another kind of table.
-    """
+    """Return the gravity field in a block of octets."""
     content = _unwrap(b"GR", octets)
     head = struct.Struct(">32sddH")
     if len(content) < head.size:
@@ -345,13 +321,7 @@ def pack_orientation_table(ticks: ArrayLike, mcmf_from_icrf: ArrayLike, pa_from_
 
 
 def unpack_orientation_table(octets: bytes) -> OrientationTable:
-    """Return the rotation of the Moon in a block of octets.
-
-    Raises
-    ------
-    TableError
-        The block is damaged or holds another kind of table.
-    """
+    """Return the rotation of the Moon in a block of octets."""
     content = _unwrap(b"OR", octets)
     count = _count(content, 80, b"OR", extra=72)
     constant = np.frombuffer(content, dtype=">f8", count=9, offset=4)
@@ -373,13 +343,7 @@ def pack_initial_state(state: InitialState) -> bytes:
 
 
 def unpack_initial_state(octets: bytes) -> InitialState:
-    """Return the state that starts the filter.
-
-    Raises
-    ------
-    TableError
-        The block is damaged, holds another kind of table, or values that are not finite.
-    """
+    """Return the state that starts the filter."""
     content = _unwrap(b"IS", octets)
     if len(content) != 72:
         raise TableError(f"initial state: expected 72 octets of content, found {len(content)}")

@@ -21,7 +21,6 @@ from tmtc.errors import ChecksumError, FrameError, TruncatedPacket, ValueRefused
 from tmtc.frames import Clcw
 from tmtc.packets import PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import sequence
-from tmtc.stream import cut_packets
 
 CLTU_START = bytes.fromhex("EB90")
 CLTU_TAIL = bytes.fromhex("C5C5C5C5C5C5C579")
@@ -156,11 +155,6 @@ class UplinkEncoder:
                 self.sequence_number = (self.sequence_number + 1) & 0xFF
         return frames
 
-    def control(self, command: bytes) -> bytes:
-        """A CLTU with a control command for the receiver (`CONTROL_UNLOCK`, or `CONTROL_SET_COUNT` and a number)."""
-        frame = TcFrame(self.spacecraft_id, self.virtual_channel, 0, command, bypass=True, control=True)
-        return encode_cltu(pack_tc_frame(frame), randomised=self.randomised)
-
 
 @dataclass(slots=True)
 class Farm:
@@ -220,7 +214,6 @@ class UplinkDecode:
 
     packets: tuple[bytes, ...]
     frames: int
-    blocks_corrected: int
     octets_skipped: int
     faults: tuple[str, ...]
 
@@ -242,9 +235,9 @@ class UplinkDecoder:
         stream = octets.tobytes() if isinstance(octets, np.ndarray) else bytes(octets)
         packets: list[bytes] = []
         faults: list[str] = []
-        frames = corrected = used = at = 0
+        frames = used = at = 0
         while (start := stream.find(CLTU_START, at)) >= 0:
-            information, repaired, end = _read_blocks(stream, start + len(CLTU_START))
+            information, end = _read_blocks(stream, start + len(CLTU_START))
             # should the start be a false one, the true one may follow at once
             at = start + len(CLTU_START)
             if not information:
@@ -259,7 +252,6 @@ class UplinkDecoder:
                 continue
             at = end + (len(CLTU_TAIL) if stream[end : end + len(CLTU_TAIL)] == CLTU_TAIL else 0)
             used += at - start
-            corrected += repaired
             if frame.spacecraft_id != self.spacecraft_id:
                 faults.append(
                     f"telecommand frame: expected spacecraft {self.spacecraft_id}, found {frame.spacecraft_id}"
@@ -275,7 +267,7 @@ class UplinkDecoder:
                 faults.append(
                     f"telecommand frame: expected sequence number {farm.expected}, found {frame.sequence_number}"
                 )
-        return UplinkDecode(tuple(packets), frames, corrected, len(stream) - used, tuple(faults))
+        return UplinkDecode(tuple(packets), frames, len(stream) - used, tuple(faults))
 
     def _segment(self, frame: TcFrame) -> tuple[list[bytes], list[str]]:
         """(packets, faults) that the frame's segment completes."""
@@ -314,15 +306,9 @@ class UplinkDecoder:
         return packets
 
 
-def cut_telecommands(octets: Octets) -> list[bytes]:
-    """Whole telecommand packets in a buffer of bare packets."""
-    return list(cut_packets(octets, packet_type=1).packets(octets))
-
-
-def _read_blocks(stream: bytes, at: int) -> tuple[bytes, int, int]:
-    """(information, corrected blocks, position behind the last good block) of the code blocks from `at` on."""
+def _read_blocks(stream: bytes, at: int) -> tuple[bytes, int]:
+    """(information, position behind the last good block) of the code blocks from `at` on."""
     information = bytearray()
-    corrected = 0
     while at + _BLOCK <= len(stream) and len(information) < TC_FRAME_MAX_LENGTH:
         block = bytearray(stream[at : at + _BLOCK])
         syndrome = _remainder(block[:_INFORMATION]) ^ (block[_INFORMATION] >> 1 ^ 0x7F)
@@ -332,10 +318,9 @@ def _read_blocks(stream: bytes, at: int) -> tuple[bytes, int, int]:
             if bit is None:
                 break
             block[bit >> 3] ^= 0x80 >> (bit & 7)
-            corrected += 1
         information += block[:_INFORMATION]
         at += _BLOCK
-    return bytes(information), corrected, at
+    return bytes(information), at
 
 
 def _randomise(octets: bytes) -> bytes:

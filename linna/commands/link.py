@@ -101,8 +101,9 @@ def _lines(proposal: LinkProposal, packets: int, differences: list[str]) -> list
         lines.append(f"octets between markers: {text}")
     for one in proposal.evidence[:SHOWN]:
         lines.append(
-            f"{_named(one.settings.describe())}: of {one.sampled} frames: codewords clean {_share(one.clean)}, "
-            f"repairable {_share(one.repaired)}, checksums {_share(one.checksums)}, headers {_share(one.regular)}; "
+            f"{_named(one.settings.describe())}: of {one.sampled} frames: "
+            f"codewords clean {_share(one.codewords_clean)}, repairable {_share(one.codewords_repairable)}, "
+            f"checksums {_share(one.checksums_hold)}, headers {_share(one.headers_regular)}; "
             f"{one.packets} packets in consecutive CADUs"
         )
     if proposal.settings is not None:

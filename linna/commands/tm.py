@@ -222,7 +222,7 @@ def _describe_verdicts(found: XtceDecode) -> str:
 
 
 def _describe(decoded: DownlinkDecode) -> str:
-    lines = []
+    lines, sequence = [], decoded.sequence
     if decoded.settings is not None:
         link = decoded.settings
         coding = "uncoded"
@@ -237,8 +237,8 @@ def _describe(decoded: DownlinkDecode) -> str:
             f"symbols corrected {decoded.symbols_corrected}"
         )
     lines.append(
-        f"packets {decoded.packets}: missing {decoded.packets_missing} in {decoded.gaps} gaps, "
-        f"duplicates {decoded.duplicates}, conflicts {decoded.conflicts}, "
+        f"packets {decoded.packets}: missing {sequence.missing} in {sequence.gaps} gaps, "
+        f"duplicates {sequence.duplicates}, conflicts {sequence.conflicts}, "
         f"wrong checksum {decoded.crc_errors}, not in the dictionary {decoded.unknown}"
     )
     lines += [f"  APID 0x{apid:03X}: {count}" for apid, count in decoded.by_apid.items()]

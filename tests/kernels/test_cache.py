@@ -100,6 +100,15 @@ def test_clones_share_compiled_code_until_a_callee_changes(tmp_path: Path) -> No
     assert run(first, cache, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="") == "20 0"
 
 
+def test_a_kernel_that_moved_to_another_module_is_compiled_again(tmp_path: Path) -> None:
+    """Compiled code names the module that it came from, which the new version does not have."""
+    cache, folder = tmp_path / "cache", write(tmp_path / "code")
+    assert run(folder, cache) == "20 0"
+    (folder / "callee.py").rename(folder / "moved.py")
+    (folder / "caller.py").write_text(CALLER.replace("callee", "moved"))
+    assert run(folder, cache) == "20 0"
+
+
 def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> None:
     cache, folder = tmp_path / "cache", write(tmp_path / "code")
     processes = [start(folder, cache) for _ in range(3)]

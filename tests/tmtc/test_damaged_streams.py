@@ -125,7 +125,7 @@ def test_noise_is_never_a_frame_or_a_packet(seed):
 
 def test_every_frame_twice_gives_every_packet():
     decoded = check(np.repeat(cadus(), 2, axis=0), PACKETS)
-    assert (decoded.frames_lost, decoded.packets_missing, decoded.conflicts) == (0, 0, 0)
+    assert (decoded.frames_lost, decoded.sequence.missing, decoded.sequence.conflicts) == (0, 0, 0)
 
 
 def test_two_receivers_with_losses_give_the_union():
@@ -139,7 +139,7 @@ def test_two_receivers_with_losses_give_the_union():
 
 def test_odd_frames_followed_by_even_frames_give_every_packet():
     decoded = check(np.concatenate((cadus()[1::2], cadus()[0::2])), PACKETS)
-    assert (decoded.frames_lost, decoded.packets_missing) == (0, 0)
+    assert (decoded.frames_lost, decoded.sequence.missing) == (0, 0)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -184,7 +184,7 @@ def test_foreign_packets_are_not_ordered_by_a_time_they_do_not_carry():
     ]
     decoded = decode(b"".join(append_crc(packet) for packet in _with_room(foreign)))
     assert decoded.packets == 50
-    assert (decoded.gaps, decoded.packets_missing) == (0, 0)
+    assert (decoded.sequence.gaps, decoded.sequence.missing) == (0, 0)
 
 
 def _with_room(packets: list[bytes]) -> list[bytes]:

@@ -234,7 +234,7 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
     decoded = decode(damaged)
     assert list(decoded.cut.packets(decoded.buffer)) == [p for k, p in enumerate(PACKETS) if k not in hit]
     assert decoded.frames_lost == 1 and decoded.frames_bad == 0
-    assert decoded.packets_missing == len(hit)
+    assert decoded.sequence.missing == len(hit)
     assert_all_octets_are_accounted_for(damaged, decoded)
 
 
@@ -284,7 +284,7 @@ def test_a_bad_frame_checksum_discards_the_frame_of_an_uncoded_link():
     octets[3 * 1119 + 500] ^= 1
     decoded = decode(bytes(octets))
     assert decoded.frames_bad == 1 and decoded.frames.verdict[3] == FRAME_BAD_CHECKSUM
-    assert decoded.crc_errors == 0 and decoded.packets_missing > 0
+    assert decoded.crc_errors == 0 and decoded.sequence.missing > 0
 
 
 def test_frames_of_another_spacecraft_are_not_used():
@@ -328,7 +328,8 @@ def test_a_truncated_downlink_gives_all_whole_frames():
 def test_a_dump_that_comes_twice_is_duplicates():
     octets = encode_cadus(PACKETS, spacecraft_id=76)
     decoded = decode(octets + octets)
-    assert decoded.duplicates == len(PACKETS) and decoded.gaps == 0 and decoded.conflicts == 0
+    found = decoded.sequence
+    assert (found.duplicates, found.gaps, found.conflicts) == (len(PACKETS), 0, 0)
 
 
 def test_late_playback_out_of_order_leaves_no_gap():
@@ -336,13 +337,13 @@ def test_late_playback_out_of_order_leaves_no_gap():
     half = len(PACKETS) // 2
     octets = encoder.encode(PACKETS[half:]) + encoder.encode(PACKETS[:half])
     decoded = decode(octets)
-    assert (decoded.gaps, decoded.duplicates, decoded.packets) == (0, 0, len(PACKETS))
+    assert (decoded.sequence.gaps, decoded.sequence.duplicates, decoded.packets) == (0, 0, len(PACKETS))
 
 
 def test_a_reboot_starts_new_counts_and_is_no_loss():
     first, second = make_packets(40, boot=1), make_packets(40, seed=1, boot=2, start_s=5000)
     decoded = decode(encode_cadus(first + second, spacecraft_id=76))
-    assert (decoded.gaps, decoded.duplicates, decoded.conflicts) == (0, 0, 0)
+    assert (decoded.sequence.gaps, decoded.sequence.duplicates, decoded.sequence.conflicts) == (0, 0, 0)
     assert {account.boot for account in decoded.sequence.accounts} == {1, 2}
 
 
@@ -418,7 +419,7 @@ def test_whatever_the_link_does_no_packet_is_invented_and_every_octet_is_account
             del octets[at : at + size]
     decoded = decode(bytes(octets), settings=LinkSettings(frame_length=223, coding=coding))
     assert set(decoded.cut.packets(decoded.buffer)) <= set(SENT)
-    assert decoded.conflicts == 0 and decoded.duplicates == 0
+    assert decoded.sequence.conflicts == 0 and decoded.sequence.duplicates == 0
     assert_all_octets_are_accounted_for(octets, decoded)
 
 

@@ -61,7 +61,7 @@ def test_a_capture_of_7200_packets_without_error_control_is_read_whole():
     theirs = parse_space_packets(octets, [PacketId(PacketType.TM, True, 11)])
     assert [bytes(p) for p in theirs.tm_list] == packets
     decoded = decode(octets, error_control=False)
-    assert (decoded.packets, decoded.gaps, decoded.octets_skipped) == (7200, 0, 0)
+    assert (decoded.packets, decoded.sequence.gaps, decoded.octets_skipped) == (7200, 0, 0)
     assert decoded.by_apid == {11: 7200}
 
 
@@ -240,7 +240,7 @@ def test_pieces_of_a_stream_are_refused_without_error_control():
 
 def check(decoded: DownlinkDecode, packets: list[bytes]) -> None:
     assert list(decoded.cut.packets(decoded.buffer)) == packets
-    assert decoded.gaps == decoded.packets_missing == 0
+    assert decoded.sequence.gaps == decoded.sequence.missing == 0
 
 
 def test_packets_without_error_control_are_taken_out_of_frames():

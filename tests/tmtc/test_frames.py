@@ -15,13 +15,13 @@ from tmtc.frames import (
 
 HEADERS = (
     # version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10
-    ("04C5 05 06 180A", (0, 76, 2, 5, 6, 10, True, False, False)),
-    ("3FFF FF FF DFFF", (0, 1023, 7, 255, 255, 2047, True, True, True)),
-    ("C000 00 00 1800", (3, 0, 0, 0, 0, 0, False, False, False)),
+    ("04C5 05 06 180A", (0, 76, 2, 5, 6, 10, True, False)),
+    ("3FFF FF FF DFFF", (0, 1023, 7, 255, 255, 2047, True, True)),
+    ("C000 00 00 1800", (3, 0, 0, 0, 0, 0, False, False)),
 )
 FIELDS = (
     "version", "spacecraft_id", "virtual_channel", "master_count", "channel_count", "first_header_pointer", "ocf",
-    "secondary_header", "synchronised",
+    "secondary_header",
 )  # fmt: skip
 
 

@@ -9,8 +9,6 @@ import numpy as np
 
 from tmtc.arrays import BoolArray, IntArray, RecordArray
 
-IntArray = IntArray
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ValueColumn:

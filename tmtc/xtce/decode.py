@@ -384,8 +384,8 @@ def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
                 rows = _fixed_columns(run, step, rows)
             rows = _moved(rows, rows.at + step.advance)
         elif isinstance(step, _Seek):
-            origin = rows.at if step.mark is None else _mark(rows, step.mark)
-            at = origin + step.offset
+            mark = None if step.mark is None else rows.column(step.mark)
+            at = (mark.raw if isinstance(mark, ValueColumn) else rows.at) + step.offset
             begin = run.begins[rows.packet]
             good = (at >= begin) & (at <= run.end(rows))
             moved = _moved(rows, at)
@@ -394,7 +394,9 @@ def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
             rows = _moved(rows, rows.at)
             rows.columns[step.name] = ValueColumn(rows.at, rows.at)
         elif isinstance(step, _Read):
-            rows = _read_parameter(run, step.parameter, rows)
+            column, at, readable = _read(run, step.parameter.type, rows, step.parameter.name)
+            rows = _moved(rows if readable is None else rows.narrowed(readable), at)
+            rows.columns[step.parameter.name] = column
         else:
             rows = _optional(run, step, rows)
     return rows
@@ -419,13 +421,6 @@ def _moved(rows: _Rows, at: IntArray) -> _Rows:
     return moved
 
 
-def _mark(rows: _Rows, name: str) -> IntArray:
-    column = rows.column(name)
-    assert isinstance(column, ValueColumn)
-    marked: IntArray = column.raw
-    return marked
-
-
 def _optional(run: _Run, step: _Optional, rows: _Rows) -> _Rows:
     inner = rows.narrowed(_holds(step.condition, rows))
     done = _advance(run, step.steps, inner)
@@ -440,13 +435,6 @@ def _optional(run: _Run, step: _Optional, rows: _Rows) -> _Rows:
     kept = _moved(rows, at).narrowed(keep)
     for name, column in done.all_columns(since=inner).items():
         kept.columns[name] = OptionalColumn(present[keep], column)
-    return kept
-
-
-def _read_parameter(run: _Run, parameter: Parameter, rows: _Rows) -> _Rows:
-    column, at, good = _read(run, parameter.type, rows, parameter.name)
-    kept = _moved(rows if good is None else rows.narrowed(good), at)
-    kept.columns[parameter.name] = column
     return kept
 
 

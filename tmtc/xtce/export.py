@@ -158,11 +158,8 @@ def _define(types: ET.Element, parameters: ET.Element, packet: str, f: Field) ->
     """The type and the parameters of a field; names of the parameters."""
     type_name = _type_name(packet, f)
     _parameter_type(types, type_name, f)
-    names = (
-        [parameter_name(packet, f.name)]
-        if f.size == 1
-        else [parameter_name(packet, f.name, k) for k in range(1, f.size + 1)]
-    )
+    indices = [None] if f.size == 1 else range(1, f.size + 1)
+    names = [parameter_name(packet, f.name, index) for index in indices]
     for name in names:
         _parameter(parameters, name, type_name, _description(f))
     return names
@@ -258,10 +255,8 @@ def _binary_type(types: ET.Element, name: str, count: str, what: str = "Paramete
     ET.SubElement(element, "UnitSet")
     size = ET.SubElement(ET.SubElement(element, "BinaryDataEncoding"), "SizeInBits")
     dynamic = ET.SubElement(size, "DynamicValue")
-    if what == "Parameter":
-        ET.SubElement(dynamic, "ParameterInstanceRef", {"parameterRef": count, "useCalibratedValue": "false"})
-    else:
-        ET.SubElement(dynamic, "ArgumentInstanceRef", {"argumentRef": count, "useCalibratedValue": "false"})
+    reference = {f"{what.lower()}Ref": count, "useCalibratedValue": "false"}
+    ET.SubElement(dynamic, f"{what}InstanceRef", reference)
     ET.SubElement(dynamic, "LinearAdjustment", {"slope": "8", "intercept": "0"})
 
 

@@ -510,13 +510,15 @@ class _Importer:
             (listed for _, one in chain if (listed := one.child("EnumerationList")) is not None), None
         )
         units = next((u for _, one in chain if (u := one.child("UnitSet")) is not None), None)
+        time = node.child("ReferenceTime")
+        reference = None if time is None else time.child("Epoch")
         return ScalarType(
             name=node.attributes["name"],
             encoding=encoding,
             labels=_labels(node, labels, encoding) if node.tag == "EnumeratedParameterType" else (),
             is_boolean=node.tag == "BooleanParameterType",
             unit=" ".join(u.text for u in units.children) if units is not None else "",
-            epoch=_epoch(node) if is_time else "",
+            epoch=reference.text if is_time and reference is not None else "",
             warning=_limits(chain, ("WarningRange", "WatchRange")),
             alarm=_limits(chain, ("CriticalRange", "DistressRange", "SevereRange")),
         )
@@ -908,12 +910,6 @@ def _range(encoding: IntegerEncoding) -> tuple[int, int]:
     if encoding.form == "unsigned":
         return 0, (1 << encoding.bits) - 1
     return -(1 << encoding.bits - 1), (1 << encoding.bits - 1) - 1
-
-
-def _epoch(node: Node) -> str:
-    reference = node.child("ReferenceTime")
-    epoch = reference.child("Epoch") if reference is not None else None
-    return "" if epoch is None else epoch.text
 
 
 def _limits(chain: Sequence[tuple[_System, Node]], levels: tuple[str, ...]) -> Limits | None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
-from typing import Any
 
-from tmtc.export import Record, format_records
+from tmtc.export import Record, format_records, plain
 from tmtc.xtce.decode import XtceDecode
 
 _CONTAINER = "packet"
@@ -27,7 +25,7 @@ def xtce_records(found: XtceDecode, *, raw: bool = False) -> list[Record]:
         rows = zip(*columns.values(), strict=True) if columns else ((),) * len(table)
         for index, values in zip(table.packet_index.tolist(), rows, strict=True):
             record: Record = {_CONTAINER: name}
-            record.update(zip(columns, map(_plain, values), strict=True))
+            record.update(zip(columns, map(plain, values), strict=True))
             numbered.append((index, record))
     numbered.sort(key=lambda pair: pair[0])
     return [record for _, record in numbered]
@@ -52,15 +50,3 @@ def _flat(record: Record) -> Record:
         else:
             flat[key] = value
     return flat
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, list):
-        return [_plain(one) for one in value]
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    return value

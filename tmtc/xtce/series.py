@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from tmtc.arrays import FloatArray
 from tmtc.xtce.columns import Column, OptionalColumn, RecordColumn, ValueColumn
 from tmtc.xtce.decode import XtceTable
 from tmtc.xtce.definition import (
@@ -22,8 +22,6 @@ from tmtc.xtce.definition import (
     ScalarType,
     StringEncoding,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

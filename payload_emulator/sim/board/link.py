@@ -25,7 +25,8 @@ from tmtc.crc import CRC_LENGTH
 from tmtc.downlink import DownlinkEncoder
 from tmtc.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
 from tmtc.link import LinkSettings
-from tmtc.uplink import Farm, UplinkDecoder, UplinkEncoder, cut_telecommands
+from tmtc.stream import cut_packets
+from tmtc.uplink import Farm, UplinkDecoder, UplinkEncoder
 
 LIGHT_S = 1.28
 _LIGHT_NS = 1_500_000_000
@@ -96,7 +97,11 @@ class Receiver:
 
     def take(self, packets: bytes) -> bytes:
         """Telecommand packets of a station, sent as it sends them and received here."""
-        return b"".join(self.decoder.decode(self.station.encode(cut_telecommands(packets))).packets)
+        return b"".join(
+            self.decoder.decode(
+                self.station.encode(cut_packets(packets, packet_type=1).packets(packets))
+            ).packets
+        )
 
     @property
     def clcw(self) -> bytes:
