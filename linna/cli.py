@@ -124,7 +124,8 @@ def _guarded(
     except BrokenPipeError:
         raise
     except OSError as error:
-        return _refused(_os_message(error), arguments)
+        where = f" ({error.filename})" if error.filename else ""
+        return _refused(f"{error.strerror or error}{where}", arguments)
     except _known_errors() as error:
         return _refused(str(error), arguments)
 
@@ -150,11 +151,6 @@ def _known_errors() -> tuple[type[Exception], ...]:
     }
     loaded = (getattr(sys.modules.get(f"{package}.errors"), name, None) for package, name in bases.items())
     return tuple(error for error in loaded if error is not None)
-
-
-def _os_message(error: OSError) -> str:
-    where = f" ({error.filename})" if error.filename else ""
-    return f"{error.strerror or error}{where}"
 
 
 def _nearest(name: str) -> str:

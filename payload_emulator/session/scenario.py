@@ -504,9 +504,8 @@ def _check(scenario: Scenario, source: str) -> None:
             raise ScenarioError(f"{source}: {key} must be {expected}, found {found!r}")
 
     for check in (
+        _check_limits,
         _check_orbit,
-        _check_dynamics,
-        _check_camera,
         _check_window,
         _check_terrain,
         _check_detector,
@@ -519,6 +518,47 @@ def _check(scenario: Scenario, source: str) -> None:
         check(scenario, require)
     for text in scenario.faults.events:
         parse_fault(text)
+
+
+_ANY = math.inf
+_POSITIVE = math.ulp(0.0)
+_LIMITS: dict[str, tuple[float, float]] = {
+    "orbit.inclination_deg": (0.0, 180.0),
+    "dynamics.degree": (2, 1200),
+    "dynamics.solar_area_to_mass_m2_kg": (0.0, 1e3),
+    "dynamics.solar_reflection": (0.0, 2.0),
+    "camera.width_px": (16, 8192),
+    "camera.height_px": (16, 8192),
+    "camera.fov_deg": (1.0, 170.0),
+    "camera.tilt_deg": (-60.0, 60.0),
+    "camera.frame_interval_s": (_POSITIVE, _ANY),
+    "window.passes": (1, _ANY),
+    "window.arc_interval": (1, _ANY),
+    "detector.max_detections": (1, 255),
+    "disturbances.kidnap_distance_km": (0.0, _ANY),
+    **{
+        f"reference.{key}": (0.0, _ANY) for key in ("position_error_m", "radial_m", "transverse_m", "normal_m")
+    },
+    **{
+        f"link.{key}": (0.0, 1.0)
+        for key in (
+            "frame_loss", "burst_start", "burst_end", "burst_frame_loss", "repeat_share", "reorder_share",
+        )
+    },
+    "link.bit_error_rate": (0.0, 0.5),
+    "link.burst_bit_error_rate": (0.0, 0.5),
+    "link.rate_bps": (_POSITIVE, _ANY),
+    "link.uplink_bps": (_POSITIVE, _ANY),
+}  # fmt: skip
+"""Least and greatest value of a key."""
+
+
+def _check_limits(scenario: Scenario, require: Require) -> None:
+    for key, (low, high) in _LIMITS.items():
+        section, _, name = key.partition(".")
+        found = getattr(getattr(scenario, section), name)
+        words = {_POSITIVE: "positive", 0.0: "zero or more"}.get(low, f"at least {low:g}")
+        require(low <= found <= high, key, words if high == _ANY else f"from {low:g} to {high:g}", found)
 
 
 def _check_orbit(scenario: Scenario, require: Require) -> None:
@@ -547,38 +587,6 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
             "an orbit above the ground (perilune radius over 1737.4 km)",
             round(perilune_km, 3),
         )
-        require(
-            0.0 <= orbit.inclination_deg <= 180.0,
-            "orbit.inclination_deg",
-            "from 0 to 180",
-            orbit.inclination_deg,
-        )
-
-
-def _check_dynamics(scenario: Scenario, require: Require) -> None:
-    dynamics = scenario.dynamics
-    require(2 <= dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", dynamics.degree)
-    require(
-        0.0 <= dynamics.solar_area_to_mass_m2_kg <= 1e3,
-        "dynamics.solar_area_to_mass_m2_kg",
-        "from 0 to 1000",
-        dynamics.solar_area_to_mass_m2_kg,
-    )
-    require(
-        0.0 <= dynamics.solar_reflection <= 2.0,
-        "dynamics.solar_reflection",
-        "from 0 to 2",
-        dynamics.solar_reflection,
-    )
-
-
-def _check_camera(scenario: Scenario, require: Require) -> None:
-    camera = scenario.camera
-    require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
-    require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)
-    require(1.0 <= camera.fov_deg <= 170.0, "camera.fov_deg", "from 1 to 170", camera.fov_deg)
-    require(-60.0 <= camera.tilt_deg <= 60.0, "camera.tilt_deg", "from -60 to 60", camera.tilt_deg)
-    require(camera.frame_interval_s > 0.0, "camera.frame_interval_s", "positive", camera.frame_interval_s)
 
 
 def _check_window(scenario: Scenario, require: Require) -> None:
@@ -602,8 +610,6 @@ def _check_window(scenario: Scenario, require: Require) -> None:
         "over window.longitude_min_deg by up to 360",
         window.longitude_max_deg,
     )
-    require(window.passes >= 1, "window.passes", "at least 1", window.passes)
-    require(window.arc_interval >= 1, "window.arc_interval", "at least 1", window.arc_interval)
     require(
         window.search != "none" or window.duration_s > 0.0,
         "window.duration_s",
@@ -650,12 +656,6 @@ def _check_detector(scenario: Scenario, require: Require) -> None:
         "between 0 and 1, or negative for that of the network",
         detector.score_threshold,
     )
-    require(
-        1 <= detector.max_detections <= 255,
-        "detector.max_detections",
-        "from 1 to 255",
-        detector.max_detections,
-    )
     require(detector.network != "", "detector.network", "a shipped network or an ONNX file", detector.network)
 
 
@@ -667,12 +667,6 @@ def _check_disturbances(scenario: Scenario, require: Require) -> None:
         "maneuvers.enabled",
         "false, and orbit.oem empty, where [disturbances] change the orbit",
         scenario.maneuvers.enabled,
-    )
-    require(
-        scenario.disturbances.kidnap_distance_km >= 0.0,
-        "disturbances.kidnap_distance_km",
-        "zero or more",
-        scenario.disturbances.kidnap_distance_km,
     )
 
 
@@ -697,8 +691,6 @@ def _check_navigation(scenario: Scenario, require: Require) -> None:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
     reference = scenario.reference
-    for key in ("position_error_m", "radial_m", "transverse_m", "normal_m"):
-        require(getattr(reference, key) >= 0.0, f"reference.{key}", "zero or more", getattr(reference, key))
     require(
         reference.transverse_m >= 2.0 * reference.radial_m,
         "reference.transverse_m",
@@ -708,23 +700,7 @@ def _check_navigation(scenario: Scenario, require: Require) -> None:
 
 
 def _check_link(scenario: Scenario, require: Require) -> None:
-    link = scenario.link
-    for key in (
-        "frame_loss",
-        "burst_start",
-        "burst_end",
-        "burst_frame_loss",
-        "repeat_share",
-        "reorder_share",
-    ):
-        share = getattr(link, key)
-        require(0.0 <= share <= 1.0, f"link.{key}", "from 0 to 1", share)
-    for key in ("bit_error_rate", "burst_bit_error_rate"):
-        rate = getattr(link, key)
-        require(0.0 <= rate <= 0.5, f"link.{key}", "from 0 to 0.5", rate)
-    require(link.rate_bps > 0.0, "link.rate_bps", "positive", link.rate_bps)
-    require(link.uplink_bps > 0.0, "link.uplink_bps", "positive", link.uplink_bps)
-    for text in link.outages:
+    for text in scenario.link.outages:
         parse_outage(text)
 
 
