@@ -11,7 +11,7 @@ from benchmarks._rows import measure, report
 
 NAMES = (
     "tmtc", "xtce", "downlink", "downlink_memory", "ground", "orbit", "ephemeris", "render", "detector", "machine",
-    "gate_error_rates", "planning", "report_pages", "pages",
+    "planning", "report_pages", "pages",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""
 

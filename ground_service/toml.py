@@ -87,7 +87,11 @@ def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
     message = str(error["msg"])
     expected = (message[:1].lower() + message[1:]).removeprefix("value error, ")
     expected, _, found = expected.removeprefix("input should be ").partition(", found ")
-    return InvalidInput(source, place, expected, found or repr(error["input"])[:80])
+    try:
+        found = found or repr(error["input"])[:80]
+    except ValueError:  # hexadecimal, so that it was read
+        found = "a number with too many digits"
+    return InvalidInput(source, place, expected, found)
 
 
 def _keys(kind: type[BaseModel], place: Sequence[int | str]) -> list[str]:

@@ -62,14 +62,13 @@ def _gates(report: RegressionReport) -> Table:
             significant_text(g.candidate),
             significant_text(g.limit),
             g.unit,
-            significant_text(g.resolution / g.margin) if g.margin > 0.0 else "exact",
+            significant_text(g.resolution) if g.evidence else "",
             Cell(_outcome_text(g), strong=g.outcome != "pass"),
         )
         for g in sorted(report.gates, key=lambda g: _ORDER.index(g.outcome))
     )
     return Table(
-        "Gates, failed gates first. A resolution above 1 means that these frames cannot detect a degradation as "
-        "large as the margin.",
+        "Gates, failed gates first. The last number is the loss that these frames find with a power of 0.8.",
         (
             Column("gate", numeric=False),
             Column("pass", numeric=False),
@@ -77,7 +76,7 @@ def _gates(report: RegressionReport) -> Table:
             Column("candidate"),
             Column("limit"),
             Column("unit", numeric=False),
-            Column("resolution / margin"),
+            Column("detectable loss"),
             Column("outcome", numeric=False),
         ),
         rows,
@@ -85,15 +84,13 @@ def _gates(report: RegressionReport) -> Table:
 
 
 def _outcome_text(gate: RegressionGate) -> str:
-    """Return the outcome of a gate, the frames that an inconclusive gate needs, and the reason of a waiver."""
-    text = {"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome)
-    if gate.outcome == "inconclusive":
-        if gate.reason.startswith("unknown"):
-            text += f": {gate.reason}"
-        elif gate.frames_needed is not None:
-            text += f": {count_text(gate.frames_needed)} frames needed, {count_text(gate.frames)} compared"
-        else:
-            text += f": {count_text(gate.frames)} frames are too few to estimate how many are needed"
+    """Return the outcome of a gate with its reason and evidence, and the reason of a waiver."""
+    parts = [{"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome), gate.reason, gate.evidence]
+    if gate.outcome == "inconclusive" and gate.frames_needed is not None:
+        parts.append(
+            f"about {count_text(gate.frames_needed)} frames decide, {count_text(gate.frames)} compared"
+        )
+    text = ", ".join(filter(None, parts))
     return f"{text}; waived: {gate.waived}" if gate.waived else text
 
 

@@ -661,14 +661,15 @@ class RegressionGate:
     limit
         The baseline degraded by the margin, in the same unit.
     outcome
-        "pass", "fail" or "inconclusive".
-    margin, resolution
-        Tolerated degradation, and the smallest degradation that the frames can detect: in the unit, or as a share of
-        the baseline.
+        "pass", "fail", "inconclusive" or "not judged".
+    resolution
+        Loss that the frames find with a power of 0.8: in the unit, or as a share of the baseline.
     frames, frames_needed
         Number of compared frames, and number needed to decide the gate; None if unknown.
+    evidence
+        Number and name of the units.
     reason, waived
-        Why the gate is inconclusive, and why its outcome is waived; empty if neither applies.
+        The fact in words, and why its outcome is waived; empty if neither applies.
     """
 
     name: str
@@ -678,10 +679,10 @@ class RegressionGate:
     outcome: str
     unit: str = ""
     pass_id: str = ""
-    margin: float = float("nan")
     resolution: float = float("nan")
     frames: int = 0
     frames_needed: int | None = None
+    evidence: str = ""
     reason: str = ""
     waived: str = ""
 

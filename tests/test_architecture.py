@@ -250,7 +250,6 @@ def test_no_module_reads_data_that_can_name_code() -> None:
     assert UNSAFE.search("stored = torch.load(path, map_location=device)")
 
 
-
 LONGEST_FUNCTION = 80
 
 

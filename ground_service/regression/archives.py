@@ -440,8 +440,8 @@ def _shown(record: ArchiveRecord) -> KeptArchive:
     return KeptArchive.of(dict(record))
 
 
-def frame_inputs(folder: Path) -> list[dict[str, Any]]:
-    """What the payload was given with each frame, a row per frame; steps without one are left out."""
+def frame_inputs(folder: Path, *, steps: bool = False) -> list[dict[str, Any]]:
+    """What the payload was given with each frame, a row per frame; steps without one only with `steps`."""
     path = folder / INPUTS
     rows = []
     try:
@@ -449,7 +449,7 @@ def frame_inputs(folder: Path) -> list[dict[str, Any]]:
             row = read_json(line, f"line {number + 1}")
             if not isinstance(row["frame"], int) or not isinstance(row["shape"], list):
                 raise ValueError(f"line {number + 1}")
-            if row["frame"] >= 0:
+            if row["frame"] >= 0 or steps:
                 rows.append({"image": None, **row})
     except (InvalidInput, ValueError, KeyError, TypeError) as error:
         raise InvalidInput(str(path), "", "a line of inputs for each step", str(error)) from None

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-import numpy as np
-
 from ground_service.evaluation.service import plain
-from ground_service.regression.gates.core import metric_interval
-from ground_service.regression.gates.metrics import figures_of, joined
+from ground_service.regression.gates.metrics import metrics_of
 from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.gates.statistics import joined_sums, ratio_error
 from ground_service.regression.outcome import RegressionOutcome, pass_figures
 
 
 def baseline_figures(outcome: RegressionOutcome) -> dict[str, Any]:
-    """Every figure over the suite and over each pass, with its 95 % interval by blocks of frames."""
+    """Every metric over the suite and over each pass; ratios with the 95 % interval by units of the evidence."""
     judged = [(one.name, one.baseline_read.frames) for one in outcome.passes if one.baseline_read is not None]
     result: dict[str, Any] = plain(
         {
             "build": {"name": outcome.baseline.name, "digest": outcome.baseline.digest},
-            "suite": _figures([frames for _, frames in judged], outcome) if judged else {},
+            "suite": _figures([frames for _, frames in judged]) if judged else {},
             "passes": [
                 {
                     "name": name,
                     "frames": len(frames),
-                    "figures": _figures([frames], outcome),
+                    "figures": _figures([frames]),
                     **pass_figures(frames),
                 }
                 for name, frames in judged
@@ -52,17 +51,13 @@ def baseline_text(figures: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _figures(passes: list[PassFrames], outcome: RegressionOutcome) -> dict[str, Any]:
-    frames = joined(passes)
-    sizes = [len(one) for one in passes]
-    whole = np.ones((1, len(frames)))
-    return {
-        figure.name: {
-            "value": float(figure.compute(frames, whole)[0]),
-            "interval_95": list(
-                metric_interval(figure.sample(frames), sizes, outcome.policy.policy.resamples)
-            ),
-            "unit": figure.unit,
-        }
-        for figure in figures_of(passes)
-    }
+def _figures(passes: list[PassFrames]) -> dict[str, Any]:
+    found = {}
+    for metric in metrics_of(passes):
+        value, low, high = metric.over(passes), math.nan, math.nan
+        if metric.sums is not None:
+            sums = joined_sums([metric.sums(one) for one in passes])
+            reach = 1.96 * ratio_error(sums)
+            low, high = value - reach, value + reach
+        found[metric.name] = {"value": value, "interval_95": [low, high], "unit": metric.unit}
+    return found

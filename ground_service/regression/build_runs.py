@@ -166,14 +166,18 @@ def _outcome(report: Mapping[str, Any], printed: str) -> tuple[str, str]:
 
 
 def read_performance(path: Path) -> dict[str, Any] | None:
-    """The costs that a build reports of itself, None where they are not in the form of the contract."""
+    """Return the costs that a build reports of itself; None if they are not finite times of the contract's form."""
     try:
         with path.open("rb") as stream:
             octets = stream.read(PERFORMANCE_LIMIT_OCTETS + 1)
         given = read_json(octets, PERFORMANCE, limit_octets=PERFORMANCE_LIMIT_OCTETS)
         stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
         yardstick = [float(value) for value in given.get("yardstick", [])]
-        is_finite = np.isfinite([*yardstick, *itertools.chain(*stages.values())]).all()
-        return {"stages": stages, "yardstick": yardstick} if is_finite else None
+        every = np.array([*yardstick, *itertools.chain(*stages.values())])
+        return (
+            {"stages": stages, "yardstick": yardstick}
+            if (np.isfinite(every) & (every >= 0.0)).all()
+            else None
+        )
     except (InvalidInput, OSError, ArithmeticError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -7,6 +7,7 @@ network, parameters and the flight code itself. The limits of a program belong t
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import importlib.util
 import io
@@ -92,6 +93,7 @@ def _without_controls(text: str) -> str:
 
 Text = Annotated[str, AfterValidator(_without_controls)]
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
+Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
 class BuildTable(_Table):
@@ -107,7 +109,7 @@ class BuildTable(_Table):
     parameters: Text = ""
     camera: CameraTable = CameraTable()
     limits: Limits = Limits()
-    provenance: dict[str, Any] = {}
+    provenance: dict[str, bool | Whole | float | Text | datetime.date | datetime.time] = {}
 
 
 CHECK_LIMITS = Limits(wall_s=120, cpu_s=60, memory_mib=2048, file_mib=1, folder_mib=16, processes=32)
@@ -150,7 +152,7 @@ class Build:
     @property
     def title(self) -> str:
         """Name, version and the beginning of the identity."""
-        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
+        return " ".join(filter(None, (self.name, self.version, f"({self.digest[:12]})")))
 
     @property
     def folder(self) -> Path:

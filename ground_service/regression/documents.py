@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,11 @@ from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
 from ground_service.regression import store
 from ground_service.regression.archives import store_of
-from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED, PASS, Gate
-from ground_service.regression.model import JudgedGate, Verdict
+from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, INFORMS, NOT_JUDGED, PASS, Gate
+from ground_service.regression.gates.metrics import metrics_of
+from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.headline import headline
+from ground_service.regression.model import Verdict
 from ground_service.regression.outcome import (
     JUDGED,
     JUDGED_STATES,
@@ -40,6 +43,9 @@ from reports.values import (
     RegressionReport,
 )
 
+PASS_METRICS = (("precision", "precision"), ("recall", "recall"), ("localisation_px", "localisation"))
+"""Fields of a pass in the report, and the metrics of the detector."""
+
 CHANGED_FRAMES = 4
 """Frames shown side by side: those that changed most."""
 
@@ -55,9 +61,10 @@ def verdict_document(outcome: RegressionOutcome) -> Verdict:
                 "policy": {
                     "version": outcome.policy.policy.version,
                     "sha256": outcome.policy.sha256,
-                    "confidence": outcome.policy.policy.confidence,
-                    "power": outcome.policy.policy.power,
+                    "fail_level": outcome.policy.policy.fail_level,
+                    "inconclusive": outcome.policy.policy.inconclusive,
                 },
+                "headline": headline(outcome),
                 "frames": outcome.frames_judged,
                 "frames_needed": outcome.frames_needed,
                 "gates": [_gate(gate) for gate in outcome.gates],
@@ -69,96 +76,64 @@ def verdict_document(outcome: RegressionOutcome) -> Verdict:
 
 
 def regression_text(verdict: Verdict) -> str:
-    """Return a summary for a terminal: verdict, failed and inconclusive gates, and the number of frames needed."""
-    lines = [f"{verdict.candidate.title} against {verdict.baseline.title}: {verdict.verdict}"]
+    """Return one screen for a terminal: the headline, then a line for each fact."""
+    lines = [f"{verdict.headline}", f"  {verdict.candidate.title} against {verdict.baseline.title}"]
     for one in verdict.passes:
         if one.state != "judged":
             lines.append(f"  {one.name}: {one.state}: {one.detail}")
     order = (FAIL, INCONCLUSIVE, NOT_JUDGED, PASS)
-    for gate in sorted(verdict.gates, key=lambda gate: order.index(gate.outcome)):
-        if gate.passed:
-            continue
-        where = f" on {gate.pass_name}" if gate.pass_name else ""
-        state = f"waived ({gate.outcome}): {gate.waived}" if gate.waived else gate.outcome
-        lines.append(f"  {state}: {gate.name}{where}: {gate_text(gate)}")
-    counts = {name: sum(gate.outcome == name for gate in verdict.gates) for name in order}
+    deciding = [gate for gate in verdict.gates if gate.outcome in order]
+    for gate in sorted(deciding, key=lambda gate: order.index(gate.outcome)):
+        if gate.waived:
+            lines.append(f"  waived ({gate.outcome}): {gate.waived}: {gate.text}")
+        elif not gate.passed:
+            lines.append(f"  {gate.outcome}: {gate.text}")
+    lines += [
+        f"  informs: {gate.text}"
+        for gate in verdict.gates
+        if gate.outcome == INFORMS and (gate.reason or "").startswith(("worse", "better"))
+    ]
+    counts = {name: sum(gate.outcome == name for gate in deciding) for name in order}
     lines.append(
-        f"  {counts[PASS]} of {len(verdict.gates)} gates passed, {counts[FAIL]} failed, "
-        f"{counts[INCONCLUSIVE]} inconclusive, "
-        + (f"{counts[NOT_JUDGED]} not judged, " if counts[NOT_JUDGED] else "")
-        + f"over {sum(one.state in JUDGED_STATES for one in verdict.passes)} of {len(verdict.passes)} passes "
+        f"  {counts[PASS]} of {len(deciding)} gates passed, {counts[FAIL]} failed, "
+        f"{counts[INCONCLUSIVE]} inconclusive, {counts[NOT_JUDGED]} not judged, over "
+        f"{sum(one.state in JUDGED_STATES for one in verdict.passes)} of {len(verdict.passes)} passes "
         f"({verdict.frames} frames)"
     )
-    if not verdict.gates:
-        lines.append("  No gate was judged: the passes above give no comparable metric")
-    if needed_text(verdict):
-        lines.append(f"  {needed_text(verdict)}")
     lines += [f"  {remark}" for remark in verdict.remarks]
     return "\n".join(lines)
 
 
-def gate_text(gate: JudgedGate) -> str:
-    """Return the values of a gate, why it is inconclusive, and the number of frames needed."""
-    if gate.outcome == NOT_JUDGED:
-        return gate.reason or ""
-    parts = [
-        f"{_number(gate.baseline)} -> {_number(gate.candidate)} {gate.unit}".rstrip(),
-        f"limit {_number(gate.limit)}",
-    ]
-    if gate.outcome == INCONCLUSIVE:
-        reason = gate.reason or ""
-        parts.append(reason)
-        if not reason.startswith("unknown"):
-            parts.append(f"resolution {_number(gate.resolution)}, margin {gate.margin:.3g}")
-            parts.append(f"{gate.frames} frames, {_needed(gate.frames_needed)}")
-    elif gate.reason:
-        parts.append(gate.reason)
-    return ", ".join(parts)
-
-
-def needed_text(verdict: Verdict) -> str:
-    """Return the number of frames and passes needed to decide every gate over the suite; empty if all are decided."""
-    needed, frames = verdict.frames_needed, verdict.frames
-    judged = sum(one.state in JUDGED_STATES for one in verdict.passes)
-    if needed is None or needed <= frames or not judged:
-        return ""
-    passes = math.ceil(needed * judged / frames)
-    return f"{needed:,} frames are needed to decide every gate over the suite (about {passes:,} passes of this length)"
-
-
-def _needed(frames: int | None) -> str:
-    return "needs an unknown number" if frames is None else f"needs {frames:,}"
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.4g}"
-
-
 def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
-    """Return JUnit XML with a test case for every gate and every pass.
+    """Return JUnit XML with a test case for every pass and every deciding gate.
 
     Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in
-    the stricter one of Apache Ant (JUnit.xsd). An inconclusive case is an error, which is neither a pass nor a failure;
-    a waived case is skipped with its reason.
+    the stricter one of Apache Ant (JUnit.xsd). A pass that the candidate did not finish is one failure. What is
+    inconclusive is a failure or skipped, as the policy says; a waived case is skipped with its reason. The time of a
+    pass is that of the candidate's replay.
     """
-    cases: list[tuple[str, str, str, str]] = []
+    open_kind = "skipped" if verdict.policy.inconclusive == "skip" else "failure"
+    cases: list[tuple[str, str, str, str, float]] = []
     for one in verdict.passes:
         kind = {"candidate failed": "failure", NOT_JUDGED: "skipped"}.get(one.state, "error")
         if one.state in JUDGED_STATES:
             kind = ""
-        cases.append((f"pass {one.name}", "passes", kind, one.detail and f"{one.state}: {one.detail}"))
+        seconds = one.candidate.wall_s if one.candidate else 0.0
+        cases.append((one.name, "passes", kind, one.detail and f"{one.state}: {one.detail}", seconds))
     for gate in verdict.gates:
-        kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: "error", NOT_JUDGED: "skipped"}[gate.outcome]
-        text = f"{gate.outcome}: {gate_text(gate)}"
+        if gate.outcome == INFORMS:
+            continue
+        kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: open_kind, NOT_JUDGED: "skipped"}[gate.outcome]
+        text = f"{gate.outcome}: {gate.text}"
         if gate.waived:
             kind, text = "skipped", f"waived: {gate.waived}; {text}"
-        cases.append((f"{gate.name} ({gate.pass_name or 'suite'})", "gates", kind, text))
-    if not verdict.gates:
-        cases.append(("gates", "gates", "error", "inconclusive: no gate was judged"))
-    kinds = [kind for _, _, kind, _ in cases]
+        cases.append((" on ".join(filter(None, (gate.name, gate.pass_name))), "gates", kind, text, 0.0))
+    if not verdict.gates and all(one.state != "candidate failed" for one in verdict.passes):
+        cases.append(("gates", "gates", open_kind, "inconclusive: no gate was judged", 0.0))
+    kinds = [kind for _, _, kind, _, _ in cases]
     suite = ET.Element(
         "testsuite",
-        name="linna regress",
+        name=_xml(f"linna regress {verdict.candidate.name} {verdict.candidate.version}".rstrip()),
         # The schema of Apache Ant permits neither fractions of a second nor a time zone: this is UTC.
         timestamp=format_utc(finished_utc_ns)[:19],
         hostname="localhost",
@@ -166,7 +141,7 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
         failures=str(kinds.count("failure")),
         errors=str(kinds.count("error")),
         skipped=str(kinds.count("skipped")),
-        time="0",
+        time=f"{sum(seconds for *_, seconds in cases):.3f}",
     )
     properties = ET.SubElement(suite, "properties")
     for name, value in (
@@ -178,12 +153,14 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
         ("frames_needed", "unknown" if verdict.frames_needed is None else str(verdict.frames_needed)),
     ):
         ET.SubElement(properties, "property", name=name, value=value)
-    for name, group, kind, text in cases:
-        case = ET.SubElement(suite, "testcase", name=_xml(name), classname=f"regress.{group}", time="0")
+    for name, group, kind, text, seconds in cases:
+        case = ET.SubElement(
+            suite, "testcase", name=_xml(name), classname=f"linna.regress.{group}", time=f"{seconds:.3f}"
+        )
         if kind == "skipped":
             ET.SubElement(case, kind, message=_xml(text))
         elif kind:
-            ET.SubElement(case, kind, message=_xml(text), type="inconclusive" if kind == "error" else "fail")
+            ET.SubElement(case, kind, message=_xml(text), type=text.split(":")[0])
     ET.SubElement(suite, "system-out").text = _xml(regression_text(verdict))
     ET.SubElement(suite, "system-err")
     ET.indent(suite)
@@ -215,11 +192,11 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         regression_id=identity,
         candidate=outcome.candidate.title,
         baseline=outcome.baseline.title,
-        gates=tuple(_report_gate(gate) for gate in outcome.gates),
+        gates=tuple(_report_gate(gate) for gate in outcome.gates if gate.outcome != INFORMS),
         candidate_passes=tuple(_regression_pass(one, "candidate") for one in judged),
         baseline_passes=tuple(_regression_pass(one, "baseline") for one in judged),
         changed_frames=tuple(changed_frames(ground, judged)),
-        verdict=_verdict_text(outcome, troubled),
+        verdict=headline(outcome).capitalize() + ".",
         verdict_level=outcome.verdict,
         evidence_level=weakest_evidence([one.context.evidence for one in judged if one.context]),
         headline=_headline(outcome),
@@ -234,11 +211,10 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         remarks=(
             *(f"{one.name}: {one.state}: {one.detail}" for one in troubled),
             *outcome.remarks,
-            "A gate passes if the frames resolve the margin of the policy and the upper confidence bound of the "
-            "degradation is within it. It fails if the degradation exceeds the margin by more than chance explains "
-            "(paired by frame, one-sided Student's t with the autocorrelation of the frames, Holm's procedure over "
-            "all gates). Otherwise it is inconclusive. "
-            f"Confidence {outcome.policy.policy.confidence:g}, power {outcome.policy.policy.power:g}.",
+            "A gate fails if the lower bound of the loss is above what is material, at a level of "
+            f"{outcome.policy.policy.fail_level:g} for all gates together. It passes if the upper 95 % bound is below "
+            "the margin. Otherwise it is inconclusive. Units: tracks of craters, ground cells, blocks of frames, "
+            "passes. Claims are on these passes.",
         ),
     )
 
@@ -248,9 +224,12 @@ def changed_frames(ground: Ground, judged: list[PassVerdict]) -> list[ChangedFra
     rows = []
     for one in judged:
         assert one.context and one.baseline_read and one.candidate_read
-        old, new = one.baseline_read.frames, one.candidate_read.frames
-        change = np.abs(new.hits - old.hits) + np.abs(new.alarms - old.alarms)
-        moved = np.abs(new.shift_u_px - old.shift_u_px) + np.abs(new.shift_v_px - old.shift_v_px)
+        change, moved = (
+            np.abs(new - old)
+            for old, new in zip(
+                *(_seen(read.frames) for read in (one.baseline_read, one.candidate_read)), strict=True
+            )
+        )
         rows += [
             (float(change[i]), float(moved[i]), one, int(i))
             for i in np.lexsort((-moved, -change))[:CHANGED_FRAMES]
@@ -258,6 +237,14 @@ def changed_frames(ground: Ground, judged: list[PassVerdict]) -> list[ChangedFra
         ]
     rows.sort(key=lambda row: (-row[0], -row[1], row[2].name, row[3]))
     return [_changed_frame(ground, one, frame) for _, _, one, frame in rows[:CHANGED_FRAMES]]
+
+
+def _seen(frames: PassFrames) -> tuple[Any, Any]:
+    """Return the hits less the false detections, and the sum of the shifts of the centres, of each frame (n,)."""
+    craters, found, n = frames.craters, frames.detections, len(frames)
+    explained = np.bincount(found.frame, weights=np.where(found.true, 1.0, -1.0), minlength=n)
+    shift = np.bincount(craters.frame, weights=np.nan_to_num(craters.du_px + craters.dv_px), minlength=n)
+    return explained, shift
 
 
 def _changed_frame(ground: Ground, one: PassVerdict, frame: int) -> ChangedFrame:
@@ -335,25 +322,14 @@ def _build(build: Any) -> dict[str, Any]:
 
 
 def _gate(gate: Gate) -> dict[str, Any]:
-    return {
-        "name": gate.name,
-        "pass": gate.pass_name or None,
-        "outcome": gate.outcome,
-        "passed": gate.passed,
-        "baseline": gate.baseline,
-        "candidate": gate.candidate,
-        "margin": gate.margin,
-        "limit": gate.limit,
-        "unit": gate.unit,
-        "change_bounds": [gate.change_low, gate.change_high],
-        "p_value": gate.p_value,
-        "level": gate.level,
-        "resolution": gate.resolution,
-        "frames": gate.frames,
-        "frames_needed": gate.frames_needed,
+    row = asdict(gate)
+    bounds = [row.pop("change_low"), row.pop("change_high")]
+    texts = {
+        "pass": row.pop("pass_name") or None,
         "reason": gate.reason or None,
         "waived": gate.waived or None,
     }
+    return {**row, **texts, "passed": gate.passed, "change_bounds": bounds}
 
 
 def _pass(one: PassVerdict) -> dict[str, Any]:
@@ -383,28 +359,14 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
 
 
 def _report_gate(gate: Gate) -> RegressionGate:
-    return RegressionGate(
-        name=gate.name,
-        baseline=gate.baseline,
-        candidate=gate.candidate,
-        limit=gate.limit,
-        outcome=gate.outcome,
-        unit=gate.unit,
-        pass_id=gate.pass_name,
-        margin=gate.margin,
-        resolution=gate.resolution,
-        frames=gate.frames,
-        frames_needed=gate.frames_needed,
-        reason=gate.reason,
-        waived=gate.waived,
-    )
+    names = [field.name for field in fields(RegressionGate) if field.name != "pass_id"]
+    return RegressionGate(pass_id=gate.pass_name, **{name: getattr(gate, name) for name in names})
 
 
 def _regression_pass(one: PassVerdict, side: str) -> RegressionPass:
     assert one.context and one.baseline_read and one.candidate_read
     frames = (one.candidate_read if side == "candidate" else one.baseline_read).frames
-    hits, expected = float(frames.hits.sum()), float(frames.expected.sum())
-    found = hits + float(frames.alarms.sum())
+    metrics = {metric.name: metric for metric in metrics_of([frames])}
     return RegressionPass(
         pass_id=one.name,
         start_utc_ns=int(one.context.frame_utc_ns[0]),
@@ -413,9 +375,7 @@ def _regression_pass(one: PassVerdict, side: str) -> RegressionPass:
         frames_expected=len(frames),
         frames_processed=int(frames.answered.sum()),
         packets=int(frames.packets.sum()),
-        precision=hits / found if found else float("nan"),
-        recall=hits / expected if expected else float("nan"),
-        localisation_px=float(frames.error_px.sum()) / hits if hits else float("nan"),
+        **{field: metrics[f"detector.{name}"].value(frames) for field, name in PASS_METRICS},
         navigation={name: _statistics(estimator) for name, estimator in frames.estimators.items()},
     )
 
@@ -435,56 +395,14 @@ def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
         ("detector.precision", "Precision", 100.0, "%"),
         ("navigation.anchored.p50", "Median error, anchored", 1.0, "m"),
         ("navigation.anchored.p95", "95 % error, anchored", 1.0, "m"),
-        ("latency.network", "Network, against baseline", 0.0, "%"),
     )
     by_name: Mapping[str, Gate] = {gate.name: gate for gate in outcome.gates if not gate.pass_name}
     figures = []
     for name, label, scale, unit in wanted:
         gate = by_name.get(name)
-        if gate is None or (scale == 0.0 and not gate.baseline > 0.0):
-            figures.append(HeadlineFigure(label, None, unit, "not gated"))
-        elif scale == 0.0:
-            figures.append(
-                HeadlineFigure(label, 100.0 * (gate.candidate / gate.baseline - 1.0), unit, "CPU time")
-            )
+        if gate is None:
+            figures.append(HeadlineFigure(label, None, unit, "not measured"))
         else:
-            figures.append(
-                HeadlineFigure(
-                    label, scale * gate.candidate, unit, f"baseline {scale * gate.baseline:.3g} {unit}"
-                )
-            )
+            told = f"baseline {scale * gate.baseline:.3g} {unit}"
+            figures.append(HeadlineFigure(label, scale * gate.candidate, unit, told))
     return tuple(figures)
-
-
-def _verdict_text(outcome: RegressionOutcome, troubled: list[PassVerdict]) -> str:
-    failed = [gate for gate in outcome.gates if gate.outcome == FAIL and not gate.waived]
-    unresolved = [gate for gate in outcome.gates if gate.outcome == INCONCLUSIVE and not gate.waived]
-    waived = [gate for gate in outcome.gates if gate.waived]
-    parts = [outcome.verdict.capitalize() + "."]
-    if failed:
-        parts.append(f"{_counted(failed, 'failed')}.")
-    if unresolved:
-        parts.append(f"{_counted(unresolved, 'inconclusive')}.")
-    unjudged = [gate for gate in outcome.gates if gate.outcome == NOT_JUDGED]
-    if len(unjudged) == len(outcome.gates):
-        parts.append("No gate was judged.")
-    elif not failed and not unresolved:
-        parts.append(f"{sum(gate.passed for gate in outcome.gates)} of {len(outcome.gates)} gates passed.")
-    if unjudged:
-        parts.append(f"{_counted(unjudged, 'not judged')}.")
-    if waived:
-        parts.append(f"{_counted(waived, 'waived')}.")
-    needed = needed_text(verdict_document(outcome))
-    if needed:
-        parts.append(f"{needed}.")
-    if troubled:
-        parts.append(
-            f"{len(troubled)} of {len(outcome.passes)} passes were not judged, or without frames: see the remarks."
-        )
-    return " ".join(parts)
-
-
-def _counted(gates: Sequence[Gate], state: str) -> str:
-    names = list(dict.fromkeys(gate.name for gate in gates))
-    more = f" and {len(names) - 6} others" if len(names) > 6 else ""
-    return f"{len(gates)} {'gate' if len(gates) == 1 else 'gates'} {state}: {', '.join(names[:6])}{more}"

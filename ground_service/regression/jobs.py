@@ -18,7 +18,7 @@ from ground_service.regression.baseline import baseline_figures
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
 from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
 from ground_service.regression.model import Comparison
-from ground_service.regression.outcome import PassVerdict, RegressionOutcome
+from ground_service.regression.outcome import RegressionOutcome
 from ground_service.regression.pass_archives import archive_of_pass
 from ground_service.regression.rendering import settle_archive
 from ground_service.regression.service import (
@@ -33,9 +33,7 @@ from ground_service.regression.service import (
 log = logging.getLogger(__name__)
 
 
-def prepared(
-    ground: Ground, candidate: str, baseline: str, archives: Sequence[str], *, all_if_empty: bool = True
-) -> dict[str, Any]:
+def prepared(ground: Ground, candidate: str, baseline: str, archives: Sequence[str]) -> dict[str, Any]:
     """Return the arguments of the job of a regression: identities of existing builds and archives.
 
     Parameters
@@ -43,7 +41,7 @@ def prepared(
     candidate, baseline
         Identities of registered builds, or "current".
     archives
-        Identities of kept archives; all that are kept when empty, unless `all_if_empty` is False.
+        Identities of kept archives; all that are kept when empty.
 
     Raises
     ------
@@ -54,8 +52,8 @@ def prepared(
     for digest in archives:
         if digest not in kept:
             raise InvalidInput("archives", "", "identities of archives that are kept", digest[:64])
-    chosen = list(archives) or (sorted(kept) if all_if_empty else [])
-    if all_if_empty and not chosen:
+    chosen = list(archives) or sorted(kept)
+    if not chosen:
         raise InvalidInput("archives", "", "at least one archive that is kept", "none")
     return {
         "candidate": named_build(ground, candidate).digest,
@@ -66,11 +64,9 @@ def prepared(
 
 def compared(ground: Ground, given: Comparison) -> dict[str, Any]:
     """Return the arguments of the job of a comparison."""
-    unusable = [one.model_dump() for one in given.unusable]
     of_passes = [archive_of_pass(ground, pass_id).digest for pass_id in given.passes]
     archives = list(dict.fromkeys([*given.archives, *of_passes]))
-    arguments = prepared(ground, given.candidate, given.baseline, archives, all_if_empty=not unusable)
-    return {**arguments, "unusable": unusable, "workers": given.workers}
+    return {**prepared(ground, given.candidate, given.baseline, archives), "workers": given.workers}
 
 
 def named_build(ground: Ground, name: str) -> Build:
@@ -139,7 +135,4 @@ def _outcome(
         policy,
         workers=arguments.get("workers"),
         progress=progress,
-        unusable=[
-            PassVerdict(one["name"], "", "unusable", one["detail"]) for one in arguments.get("unusable", ())
-        ],
     )

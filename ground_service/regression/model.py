@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity, Given
 from ground_service.http.times import UtcTime
+
+UNUSABLE_STATES = ("unusable", "baseline failed")
+"""States of a pass that no candidate can be blamed for."""
 
 OK = "ok"
 """Outcome of a successful replay."""
@@ -18,6 +22,13 @@ COMPLETE, TO_RENDER, TELEMETRY_ONLY = "complete", "to render", "telemetry only"
 
 REASONS_LIMIT = 5
 """Reasons in a list; the verdict has all."""
+
+
+def exit_status(verdict: str, states: Collection[str]) -> int:
+    """Return 0 for pass, 1 for fail, 2 if an archive or the baseline cannot be used, 3 for inconclusive."""
+    if verdict == "inconclusive" and set(states) & set(UNUSABLE_STATES):
+        return 2
+    return {"pass": 0, "fail": 1}.get(verdict, 3)
 
 
 class Build(Entity):
@@ -86,13 +97,6 @@ class Pruned(Entity):
     removed: list[str] = Field(description="Identities")
 
 
-class UnusableArchive(Given):
-    """Archive that could not be kept: it makes the verdict inconclusive."""
-
-    name: str = Field(max_length=300)
-    detail: str = Field(max_length=1000, description="Why it cannot be used")
-
-
 class Comparison(Given):
     """Builds to compare, and the archives to replay."""
 
@@ -107,9 +111,6 @@ class Comparison(Given):
     )
     passes: list[Annotated[int, Field(ge=1, le=2**31 - 1)]] = Field(
         default_factory=list, max_length=1000, description="Passes whose archives are replayed"
-    )
-    unusable: list[UnusableArchive] = Field(
-        default_factory=list, max_length=1000, description="Archives that could not be kept"
     )
     workers: int | None = Field(
         default=None,
@@ -140,7 +141,7 @@ class JudgedBuild(Entity):
     @property
     def title(self) -> str:
         """Name, version and the beginning of the identity."""
-        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
+        return " ".join(filter(None, (self.name, self.version, f"({self.digest[:12]})")))
 
 
 class JudgedPolicy(Entity):
@@ -148,8 +149,10 @@ class JudgedPolicy(Entity):
 
     version: str
     sha256: str
-    confidence: float
-    power: float
+    fail_level: float | None = Field(default=None, description="null for verdicts of earlier policies")
+    inconclusive: str = "failure"
+    confidence: float | None = Field(default=None, description="Of verdicts of earlier policies")
+    power: float | None = Field(default=None, description="Of verdicts of earlier policies")
 
 
 class JudgedGate(Entity):
@@ -159,33 +162,42 @@ class JudgedGate(Entity):
 
     name: str = Field(examples=["detector.recall"])
     pass_name: str | None = Field(alias="pass", description="null: the whole suite")
-    outcome: str = Field(description="pass, fail, inconclusive or not judged", examples=["pass"])
+    outcome: str = Field(
+        description="pass, fail, inconclusive, not judged, or informs: a metric that never decides",
+        examples=["pass"],
+    )
     passed: bool
     baseline: float | None
     candidate: float | None
     margin: float | None
     limit: float | None
     unit: str
-    change_bounds: tuple[float | None, float | None] = Field(
-        description="One-sided confidence bounds of the degradation"
-    )
+    change_bounds: tuple[float | None, float | None] = Field(description="One-sided 95 % bounds of the loss")
     p_value: float | None
     level: float | None
-    resolution: float | None = Field(description="Smallest degradation that the frames detect")
+    resolution: float | None = Field(description="Loss that the frames find with a power of 0.8")
     frames: int
     frames_needed: int | None
+    evidence: str = Field(default="", description="Number and name of the units of the evidence")
     reason: str | None
     waived: str | None
 
     @property
     def text(self) -> str:
-        """The gate with its figures, or the reason of its outcome."""
+        """The gate as one line: the change, its bounds and its evidence, or the reason of its outcome."""
         place = "" if self.pass_name is None else f" on {self.pass_name}"
-        if self.outcome == "inconclusive" or self.baseline is None or self.candidate is None:
+        if self.baseline is None or self.candidate is None or self.outcome == "not judged":
             return f"{self.name}{place}: {self.reason or self.outcome}"
         unit = f" {self.unit}" if self.unit else ""
-        limit = "" if self.limit is None else f", limit {self.limit:.4g}{unit}"
-        return f"{self.name}{place}: {self.baseline:.4g} to {self.candidate:.4g}{unit}{limit}"
+        parts = [f"{self.name}{place}: {self.baseline:.4g} to {self.candidate:.4g}{unit}"]
+        low, high = self.change_bounds
+        if self.outcome in ("fail", "inconclusive") and low is not None and high is not None:
+            parts.append(f"loss {low:.3g} to {high:.3g}, margin {self.margin:.3g}, {self.evidence}")
+        if self.reason:
+            parts.append(self.reason)
+        if self.outcome == "inconclusive" and self.frames_needed is not None:
+            parts.append(f"about {self.frames_needed:,} frames decide it, {self.frames:,} compared")
+        return ", ".join(parts)
 
 
 class JudgedReplay(Entity):
@@ -224,13 +236,19 @@ class Verdict(Entity):
     baseline: JudgedBuild
     candidate: JudgedBuild
     policy: JudgedPolicy
+    headline: str = Field(default="", description="What changed, by how much, where, and whether it matters")
     frames: int = Field(description="Number of frames processed by both builds")
     frames_needed: int | None = Field(
-        description="Number of frames needed to decide every gate over the suite; null if unknown"
+        description="Number of frames that decide the inconclusive gates; null if unknown"
     )
     gates: list[JudgedGate]
     passes: list[JudgedPass]
     remarks: list[str]
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of a command with this verdict."""
+        return exit_status(self.verdict, [one.state for one in self.passes])
 
     def document(self) -> dict[str, Any]:
         """Return the JSON document."""
@@ -249,7 +267,9 @@ class Regression(Entity):
         """Return why the verdict is not pass: failed and open gates, passes without a comparison."""
         if self.verdict == "pass":
             return []
-        gates = [one for one in self.result.gates if one.outcome != "pass" and not one.waived]
+        gates = [
+            one for one in self.result.gates if one.outcome in ("fail", "inconclusive") and not one.waived
+        ]
         gates.sort(key=lambda one: one.outcome != "fail")
         return [
             *(one.text for one in gates),
@@ -262,7 +282,8 @@ class Regression(Entity):
 
     def summary(self) -> RegressionSummary:
         """Return the regression as lists show it."""
-        counted = [gate.outcome for gate in self.result.gates if not gate.waived]
+        deciding = [gate for gate in self.result.gates if gate.outcome != "informs"]
+        counted = [gate.outcome for gate in deciding if not gate.waived]
         return RegressionSummary(
             id=self.id,
             verdict=self.verdict,
@@ -271,7 +292,7 @@ class Regression(Entity):
             baseline=self.result.baseline.digest,
             baseline_title=self.result.baseline.title,
             reasons=self.reasons(),
-            gates=len(self.result.gates),
+            gates=len(deciding),
             gates_failed=counted.count("fail"),
             gates_inconclusive=counted.count("inconclusive"),
             frames=self.result.frames,

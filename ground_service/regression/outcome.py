@@ -8,24 +8,15 @@ from typing import Any
 import numpy as np
 
 from ground_service.regression.builds import Build
-from ground_service.regression.gates.core import (
-    FAIL,
-    INCONCLUSIVE,
-    NOT_JUDGED,
-    PASS,
-    Gate,
-    verdict_of,
-)
+from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED, Gate, verdict_of
 from ground_service.regression.gates.metrics import outcome_shares
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
-from ground_service.regression.model import KeptReplay
+from ground_service.regression.model import KeptReplay, exit_status
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 
 JUDGED, TELEMETRY_JUDGED = "judged", "telemetry judged"
 JUDGED_STATES = (JUDGED, TELEMETRY_JUDGED)
-
-EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,8 +71,8 @@ class RegressionOutcome:
 
     @property
     def exit_status(self) -> int:
-        """0 pass, 1 fail, 3 inconclusive."""
-        return EXIT_STATUS[self.verdict]
+        """Exit status of a command with this verdict."""
+        return exit_status(self.verdict, [one.state for one in self.passes])
 
     @property
     def frames_judged(self) -> int:
@@ -94,15 +85,11 @@ class RegressionOutcome:
 
     @property
     def frames_needed(self) -> int | None:
-        """Number of frames needed to decide every gate over the suite; None if no gate states a number."""
-        return max(
-            (
-                gate.frames_needed
-                for gate in self.gates
-                if gate.frames_needed is not None and not gate.pass_name and not gate.waived
-            ),
-            default=None,
-        )
+        """Number of frames that decide the inconclusive gates; None if no gate states a number."""
+        needed = [
+            gate.frames_needed for gate in self.gates if gate.frames_needed is not None and not gate.waived
+        ]
+        return max(needed, default=None)
 
 
 def pass_figures(frames: PassFrames) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from ground_service.regression.archives import PassArchive, frame_inputs
-from ground_service.regression.gates.samples import PassFrames, pass_frames
+from ground_service.regression.gates.metrics import LATENCY_LEVEL
+from ground_service.regression.gates.samples import PassFrames, TimeTags, pass_frames
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
@@ -28,21 +30,21 @@ from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
 from lunar.messages.ephemeris_files import load_ephemeris
-from lunar.timescales import utc_ns_from_ticks
+from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
 from tmtc.definitions import parse_dictionary
 from tmtc.downlink import DownlinkDecode, decode
 from tmtc.errors import TmtcError
 from tmtc.schema import Dictionary, Table
 
 FRAME_TIMES = "frame_times.csv"
-LATENCY_LEVEL = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassContext:
     """What the ground knows of an archived pass, whichever build flies it: read once, used for every build.
 
-    `mission` is the revision of the mission description of the archive.
+    `mission` is the revision of the mission description of the archive, `step_ticks` the on-board time of every step of
+    the payload, those without an image included.
     """
 
     name: str
@@ -58,6 +60,7 @@ class PassContext:
     viewing: Viewing
     evidence: Evidence
     mission: str = ""
+    step_ticks: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +100,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
         viewing=_viewing(folder, mission.camera, camera, ticks, utc_ns),
         evidence=mission.evidence,
         mission=mission.revision,
+        step_ticks=np.array([row["ticks"] for row in frame_inputs(folder, steps=True)], dtype=np.int64),
     )
 
 
@@ -170,8 +174,40 @@ def read_downlink(
             + decoded.crc_errors
             + _meaningless(decoded, tables, context.dictionary),
             memory_mib=memory_mib,
+            digests=_digests(decoded, ticks, context.frame_ticks),
+            times=_time_tags(decoded, tables, ticks, context),
         ),
     )
+
+
+def _digests(decoded: DownlinkDecode, ticks: IntArray, frame_ticks: IntArray) -> tuple[bytes, ...]:
+    hashes = [hashlib.sha256() for _ in range(len(frame_ticks) + 1)]
+    rows = np.searchsorted(frame_ticks, ticks[decoded.cut.crc_ok], side="right").tolist()
+    for row, packet in zip(rows, decoded.cut.packets(decoded.buffer), strict=True):
+        hashes[row].update(packet)
+    return tuple(one.digest() for one in hashes)
+
+
+def _time_tags(
+    decoded: DownlinkDecode, tables: Mapping[str, Table], ticks: IntArray, context: PassContext
+) -> TimeTags:
+    unknown: dict[str, int] = {}
+    delays: dict[str, NDArray[np.float64]] = {}
+    steps = np.unique(np.concatenate((context.step_ticks, context.frame_ticks)))
+    for name, table in tables.items():
+        if len(table) == 0 or len(steps) == 0:
+            continue
+        since = steps[np.maximum(np.searchsorted(steps, table.ticks, side="right") - 1, 0)]
+        if "image_ticks" in table.columns:
+            named = np.asarray(table.columns["image_ticks"], dtype=np.int64)
+            known = _rows(table, context)[1]
+            unknown[name] = int(np.count_nonzero(~known))
+            since = np.where(known, named, since)
+        delays[name] = (table.ticks - since) / TICKS_PER_SECOND
+    backwards = 0
+    for apid in np.unique(decoded.headers.apid).tolist():
+        backwards += int(np.count_nonzero(np.diff(ticks[decoded.headers.apid == apid]) < 0))
+    return TimeTags({name: len(table) for name, table in tables.items()}, unknown, delays, backwards)
 
 
 def _frame_times(folder: Path, numbers: list[int], ticks: IntArray) -> IntArray:

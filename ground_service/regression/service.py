@@ -11,8 +11,9 @@ import dataclasses
 import functools
 import os
 import platform
+import re
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -35,15 +36,8 @@ from ground_service.regression.archives import (
 from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
-from ground_service.regression.gates.core import (
-    NOT_JUDGED,
-    Gate,
-    GatePolicy,
-    judge,
-    judge_without_frames,
-    not_judged,
-)
-from ground_service.regression.gates.metrics import same_telemetry
+from ground_service.regression.gates.core import NOT_JUDGED, judge
+from ground_service.regression.gates.faults import first_difference
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.model import (
@@ -80,7 +74,6 @@ def run_regression(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-    unusable: Sequence[PassVerdict] = (),
 ) -> RegressionOutcome:
     """Fly archives with both builds, where that was not done before, and judge.
 
@@ -92,12 +85,10 @@ def run_regression(
         Number of parallel replays, each in a separate process. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
-    unusable
-        Verdicts on further archives, which could not be kept.
     """
-    if not archives and not unusable:
+    if not archives:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
-    kept = [*(_kept(ground, given) for given in archives), *unusable]
+    kept = [_kept(ground, given) for given in archives]
     builds = tuple(dict.fromkeys((baseline, candidate)))
     usable = {
         one.digest: one for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)
@@ -245,14 +236,18 @@ def judge_regression(
             f"{elsewhere} passes were flown on different machines by the two builds: their latencies are not compared"
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
-    gates = _gates(before, after, whole, passes, policy.policy)
-    if before and all(same_telemetry(before[name], after[name]) for name in before):
-        remarks.append("Both builds sent identical telemetry in every frame: it is compared exactly")
-    waived = [gate for gate in gates if gate.waived]
-    remarks += [f"waived: {gate.name} {gate.pass_name}: {gate.waived}".replace(" :", ":") for gate in waived]
+    today = format_utc(utc_now_ns())[:10]
+    gates = judge(before, after, policy.policy, imaged=whole, today=today)
+    rows = {name: first_difference(before[name], after[name]) for name in before}
+    differing = [f"{name}, frame {row}" for name, row in rows.items() if row is not None]
+    if differing:
+        remarks.append(
+            f"first different packets: {differing[0]}; {len(before) - len(differing)} of {len(before)} passes are "
+            "identical in every octet"
+        )
     isolations = sorted(
         {
-            replay.isolation
+            re.sub(r"user \d+", "a user of its own", replay.isolation)
             for one in passes
             for replay in (one.baseline, one.candidate)
             if replay and replay.isolation
@@ -328,33 +323,6 @@ def _unreplayable(archive: PassArchive, builds: Sequence[Build]) -> str:
         return archive.reason
     programs = [build.name for build in builds if build.command]
     return f"{programs[0]} is a program, which needs frames: {archive.reason}" if programs else ""
-
-
-def _gates(
-    before: Mapping[str, PassFrames],
-    after: Mapping[str, PassFrames],
-    whole: Collection[str],
-    passes: Sequence[PassVerdict],
-    policy: GatePolicy,
-) -> list[Gate]:
-    """Return the gates over the passes with frames (`whole`), those without frames, and those that were not judged."""
-    today = format_utc(utc_now_ns())[:10]
-
-    def part(frames: Mapping[str, PassFrames], complete: bool) -> dict[str, PassFrames]:
-        return {name: one for name, one in frames.items() if (name in whole) == complete}
-
-    without = part(before, False)
-    if without and len(without) < len(before):
-        # Two families of tests: each has half of the probability that a build as good as the baseline fails.
-        policy = dataclasses.replace(policy, confidence=1.0 - (1.0 - policy.confidence) / 2.0)
-    gates = judge(part(before, True), part(after, True), policy, today=today)
-    if without:
-        reason = next(one.detail for one in passes if one.state == TELEMETRY_JUDGED)
-        gates += judge_without_frames(without, part(after, False), policy, reason, today=today)
-    out = [one for one in passes if one.state == NOT_JUDGED]
-    if out:
-        gates += not_judged(policy, [one.name for one in out], out[0].detail)
-    return gates
 
 
 def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseline: Build) -> PassVerdict:

@@ -6,7 +6,7 @@ import argparse
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,12 +28,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "run",
         help="replay archives with two builds and judge the candidate",
         description="Replay archives with two builds and judge the candidate. Exit status: 0 pass, 1 fail, "
-        "3 inconclusive (too few frames, or a value is unknown), 2 bad usage or input.",
+        "3 inconclusive (the frames do not decide), 2 bad usage, or an archive or a baseline that cannot be used.",
     )
     _archives(run)
     option(run, "--build BUILD", str, "candidate: build file, 'current' or identity", required=True)
     option(run, "--baseline BUILD", str, "baseline", "current")
-    option(run, "--policy FILE", Path, "policy of the gates (default: the shipped one)")
+    option(run, "--policy FILE", Path, "policy of the gates: a file, or a shipped one by name", Path("ci"))
     option(run, "--junit FILE", Path, "write JUnit XML")
     option(run, "--report FILE", Path, "write the report as HTML")
     _finish(run, _run)
@@ -43,9 +43,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _archives(baseline)
     option(baseline, "--build BUILD", str, "build", "current")
     _finish(baseline, _baseline)
-    suite = commands.add_parser("suite", help="write the pass archives of the regression suite")
-    option(suite, "scenario", str, "scenario files (default: the shipped suite)", nargs="*")
-    option(suite, "--out DIR", Path, "folder for the archives", required=True)
+    suite = commands.add_parser(
+        "suite", help="show what the passes of the regression suite can detect, or write their archives"
+    )
+    option(
+        suite, "scenario", str, "names of shipped passes, or scenario files (default: all shipped)", nargs="*"
+    )
+    option(suite, "--out DIR", Path, "folder for the archives; without it nothing is written")
     option(suite, "--frames N", int, "frames of each pass (default: the scenario's)")
     option(suite, "--seeds K", int, "passes of each scenario", 1)
     finish(suite, _suite)
@@ -107,12 +111,11 @@ def _finish(
 def _run(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
     from ground_service.regression.documents import regression_junit, regression_text
-    from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.outcome import EXIT_STATUS
+    from ground_service.regression.gates.policy import SHIPPED, load_policy
 
     request: dict[str, Any] = {}
-    if arguments.policy is not None:
-        load_policy(arguments.policy)
+    load_policy(arguments.policy)
+    if str(arguments.policy) not in SHIPPED:
         text = arguments.policy.read_text(encoding="utf-8")
         request = {"policy": text, "policy_name": str(arguments.policy)}
     with ground_client(arguments, background=True) as service:
@@ -124,7 +127,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.junit:
         arguments.junit.write_text(regression_junit(found.result, utc_now_ns()), encoding="utf-8")
     emit(arguments, {"id": found.id, **found.result.document()}, text=regression_text(found.result))
-    return EXIT_STATUS[found.verdict]
+    return found.result.exit_status
 
 
 def _sandbox(arguments: argparse.Namespace) -> int:
@@ -164,30 +167,33 @@ def _baseline(arguments: argparse.Namespace) -> int:
 
 
 def _suite(arguments: argparse.Namespace) -> int:
+    from ground_service.regression.gates.policy import load_policy
+    from ground_service.regression.gates.power import detectable, power_text
     from linna.data import data_folder
     from payload_emulator.session.suite import suite_scenarios, write_suite
 
     scenarios = suite_scenarios(arguments.scenario, frames=arguments.frames, seeds=arguments.seeds)
+    if arguments.out is None:
+        frames = [round(one.window.duration_s / one.camera.frame_interval_s) for one in scenarios]
+        names = [one.name.removeprefix("suite-") for one in scenarios]
+        rows = [{"scenario": name, "frames": n} for name, n in zip(names, frames, strict=True)]
+        lines = [f"{row['scenario']}: about {row['frames']} frames" for row in rows]
+        found = detectable(load_policy().policy, sum(frames), len(frames))
+        lines.append(power_text(found))
+        return emit(arguments, {"passes": rows, "detectable": found}, text="\n".join(lines))
     written = write_suite(
         scenarios,
         data_folder(),
         arguments.out,
         progress=lambda items, total: progress(items, total, "frames", "frame"),
     )
-    rows = [
-        {
-            "archive": str(one.folder),
-            "scenario": one.scenario,
-            "frames": one.frames,
-            "altitude_km": list(one.altitude_km),
-        }
+    keys = ("scenario", "frames", "altitude_km")
+    passes = [{"archive": str(one.folder)} | {key: getattr(one, key) for key in keys} for one in written]
+    lines = [
+        f"{one.folder}: {one.frames} frames, {one.altitude_km[0]:.0f} to {one.altitude_km[1]:.0f} km"
         for one in written
     ]
-    lines = [
-        f"{row['archive']}: {row['frames']} frames, {one.altitude_km[0]:.0f} to {one.altitude_km[1]:.0f} km"
-        for row, one in zip(rows, written, strict=True)
-    ]
-    return emit(arguments, {"passes": rows}, text="\n".join(lines))
+    return emit(arguments, {"passes": passes}, text="\n".join(lines))
 
 
 def _comparison(
@@ -202,13 +208,12 @@ def _comparison(
     if workers is None and server_of(arguments) is None:
         workers = os.cpu_count() or 1
     builds = {name: _identity(service, name) for name in (candidate, baseline)}
-    archives, unusable = _kept(service, _listed(arguments.archive))
+    archives = _kept(service, _listed(arguments.archive))
     return {
         "candidate": builds[candidate],
         "baseline": builds[baseline],
         "archives": archives,
         "passes": arguments.passes,
-        "unusable": unusable,
         "workers": workers,
     }
 
@@ -219,36 +224,36 @@ def _identity(service: Client, given: str) -> str:
     return _registered(service, given).digest if is_file and given != "current" else given
 
 
-def _kept(service: Client, given: list[str]) -> tuple[list[str], list[dict[str, str]]]:
-    """Return the identities of archives, and those that cannot be used; archives that are not kept are uploaded."""
-    from ground_service.client.problems import InvalidRequest
-    from ground_service.errors import InvalidInput
-    from lunar.errors import LunarError
+def _kept(service: Client, given: list[str]) -> list[str]:
+    """Return the identities of archives; those that are not kept are uploaded.
 
-    kept = list(service.list_kept_archives())
-    known = {one.digest for one in kept}
-    of_pass = {str(one.pass_id): one.digest for one in kept if one.pass_id is not None}
+    Raises
+    ------
+    InvalidInput
+        Something given is no archive.
+    """
+    from ground_service.errors import InvalidInput
+
+    kept = service.list_kept_archives()
+    known = {key: one.digest for one in kept for key in (one.digest, str(one.pass_id or ""))}
     digests: list[str] = []
-    unusable: list[dict[str, str]] = []
     for item in given:
         path = Path(item)
-        try:
-            if path.exists():
-                digests.append(_upload(service, path, known))
-            elif item in known:
-                digests.append(item)
-            elif item in of_pass:
-                digests.append(of_pass[item])
-            else:
-                raise InvalidInput(
-                    item, "", "a pass archive, or the identity or the pass of one that is kept", "neither"
-                )
-        except (InvalidInput, InvalidRequest, LunarError) as error:
-            unusable.append({"name": path.name, "detail": str(error)[:1000]})
-    return digests, unusable
+        if path.exists():
+            digests.append(_upload(service, path, known))
+        elif item in known:
+            digests.append(known[item])
+        else:
+            raise InvalidInput(
+                f"--archive {item}",
+                "",
+                "a pass archive, or the identity or the pass of one that is kept",
+                "nothing there",
+            )
+    return digests
 
 
-def _upload(service: Client, path: Path, known: set[str]) -> str:
+def _upload(service: Client, path: Path, known: Container[str]) -> str:
     """Check an archive, upload it if it is not kept, and return its identity."""
     from ground_service.regression.archives import check_archive, opened_archive, pack_archive
 
@@ -258,7 +263,6 @@ def _upload(service: Client, path: Path, known: set[str]) -> str:
             packed = Path(scratch) / f"{folder.name}.zip"
             pack_archive(folder, packed)
             service.keep_archive(packed)
-            known.add(digest)
         return digest
 
 
@@ -291,7 +295,7 @@ def _archive(arguments: argparse.Namespace) -> int:
         if arguments.action == "add" and _is_pass(arguments.target):
             service.keep_pass_archive(int(arguments.target))
         elif arguments.action == "add":
-            _upload(service, Path(arguments.target), set())
+            _upload(service, Path(arguments.target), ())
         elif arguments.action == "render":
             target = arguments.target
             digest = service.keep_pass_archive(int(target)).digest if _is_pass(target) else target

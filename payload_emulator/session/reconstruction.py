@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from payload_emulator.flight.onboard.parameters import find_parameter
 from payload_emulator.flight.ports import UNLIMITED, ResetCause
 from payload_emulator.flight.telemetry.products import image_report
 from payload_emulator.session.camera import Exposure, expose
-from payload_emulator.session.emulator import file_entries
+from payload_emulator.session.emulator import Progress, file_entries
 from payload_emulator.session.instruments import InstrumentBench, onboard_attitudes
 from payload_emulator.session.loading import LoadedPayload, launch_payload
 from payload_emulator.session.mission import save_attitudes
@@ -53,8 +53,6 @@ from tmtc.downlink import decode
 from tmtc.errors import TmtcError
 from tmtc.schema import Table
 from tmtc.tables import table_hash
-
-Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
 DOWNLINK = "downlink.packets"
 TELECOMMANDS = "telecommands.packets"

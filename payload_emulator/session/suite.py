@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.emulator import Progress, emulate
 from payload_emulator.session.scenario import SHIPPED, Scenario, load_scenario
-
-Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
 SUITE = SHIPPED / "suite"
 
@@ -35,24 +32,24 @@ def suite_scenarios(
 
     Parameters
     ----------
+    given
+        Names of shipped passes ("low"), or scenario files.
     frames
         Length of each pass; None keeps the scenario's own.
     seeds
         The scenario's own seed and those that follow it: another Moon where it is procedural, other light, other noise.
     """
-    paths: Sequence[Path | str] = given or sorted(SUITE.glob("*.toml"))
+    shipped = {path.stem: path for path in sorted(SUITE.glob("*.toml"))}
     if frames is not None and frames < 1:
         raise ScenarioError(f"suite: expected at least one frame a pass, found {frames}")
     scenarios = []
-    for path in paths:
+    for path in [shipped.get(name, name) for name in given] or shipped.values():
         scenario = load_scenario(path)
         if frames is not None:
             duration_s = frames * scenario.camera.frame_interval_s
             scenario = replace(scenario, window=replace(scenario.window, duration_s=duration_s))
         scenarios += [
-            scenario
-            if number == 0
-            else replace(scenario, seed=scenario.seed + number, name=f"{scenario.name}-{number}")
+            replace(scenario, seed=scenario.seed + number, name=scenario.name + f"-{number}" * (number > 0))
             for number in range(seeds)
         ]
     return scenarios

@@ -357,8 +357,8 @@ def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., Flyab
 
     from tmtc.definitions import format_dictionary
 
-    def make(frames: int = 12, seed: int = 1) -> FlyablePass:
-        made = make_pass(frames=frames, seed=seed)
+    def make(frames: int = 12, seed: int = 1, **options: Any) -> FlyablePass:
+        made = make_pass(frames=frames, seed=seed, **options)
         folder = made.folder
         manifest = json.loads((folder / "manifest.json").read_text())
         manifest["pass_name"] = f"synthetic pass {seed}"

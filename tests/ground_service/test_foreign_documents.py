@@ -47,9 +47,10 @@ def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path:
         '{"stages": {"a": [' + "9" * 5_000 + "]}}",
         '{"stages": {"a": [1' + "0" * 400 + "]}}",
         '{"stages": {"a": [NaN]}}',
+        '{"stages": {"a": [-5]}}',
         '{"stages": {"a": [1.0]}}' + " " * (8 << 20),
     ],
-    ids=["deep", "digits", "overflow", "not a number", "long"],
+    ids=["deep", "digits", "overflow", "not a number", "negative", "long"],
 )
 def test_costs_that_a_build_states_without_end_are_not_read(text: str, tmp_path: Path) -> None:
     (tmp_path / "performance.json").write_text('{"stages": {"a": [1.0]}}')

@@ -6,7 +6,7 @@ import datetime
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
@@ -14,8 +14,10 @@ from ground_service.errors import InvalidInput, storage_error
 from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule, Waiver
 from ground_service.toml import parse_table, read_table
 
-SHIPPED = Path(__file__).with_name("regression_policy.toml")
-SCHEMA_VERSION = 2
+SHIPPED = {"ci": Path(__file__).with_name("ci.toml")}
+"""Policies by name; the first one is the default."""
+
+SCHEMA_VERSION = 3
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
 
@@ -24,28 +26,23 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class ConfidenceTable(_Table):
-    """Confidence of the decisions: of each pass, and of all failures together."""
+class LevelTable(_Table):
+    """Probability of a wrong claim on an equal build."""
 
-    value: float = Field(ge=0.8, le=0.9999)
-    reason: Text
-
-
-class PowerTable(_Table):
-    """Probability with which a degradation as large as the resolution is detected."""
-
-    value: float = Field(ge=0.5, le=0.999)
+    level: float = Field(ge=1e-6, le=0.2)
     reason: Text
 
 
 class GateTable(_Table):
-    """Gate rule: the metrics it applies to, and the tolerated degradation."""
+    """Gate: an exact metric with a margin, or a primary metric with a weight and the sizes that count."""
 
-    figure: Text
+    metric: Text
+    weight: float = Field(default=0.0, ge=0.0, le=1.0)
+    materiality: float = Field(default=0.0, ge=0.0, le=1e9)
     margin: float = Field(ge=0.0, le=1e9)
-    pass_margin: float | None = Field(default=None, gt=0.0, le=1e9)
+    window_materiality: float | None = Field(default=None, ge=0.0, le=1e9)
+    window_margin: float | None = Field(default=None, gt=0.0, le=1e9)
     reason: Text
-    required: bool | None = None
 
 
 class WaiverTable(_Table):
@@ -62,9 +59,8 @@ class PolicyTable(_Table):
 
     schema_version: int = Field(ge=SCHEMA_VERSION, le=SCHEMA_VERSION)
     version: Text
-    resamples: int = Field(default=400, ge=50, le=10_000)
-    confidence: ConfidenceTable
-    power: PowerTable
+    inconclusive: Literal["failure", "skip"] = "failure"
+    fail: LevelTable
     gate: list[GateTable] = Field(min_length=1)
     waiver: list[WaiverTable] = []
 
@@ -79,14 +75,15 @@ class PolicyFile:
 
 
 def load_policy(path: Path | None = None) -> PolicyFile:
-    """Return the policy in a file; the shipped one by default.
+    """Return the policy in a file, or a shipped one by its name; the shipped one `ci` by default.
 
     Raises
     ------
     InvalidInput
         The file is missing or not a valid policy; the message names the key.
     """
-    where = path or SHIPPED
+    name = "ci" if path is None else str(path)
+    where = SHIPPED.get(name, path or SHIPPED["ci"])
     try:
         octets = where.read_bytes()
     except FileNotFoundError:
@@ -94,7 +91,7 @@ def load_policy(path: Path | None = None) -> PolicyFile:
     except OSError as error:
         raise storage_error(error, where) from None
     read = read_policy(octets, str(where))
-    return read if path is not None else replace(read, name="shipped")
+    return replace(read, name=name) if name in SHIPPED else read
 
 
 def read_policy(octets: bytes, source: str) -> PolicyFile:
@@ -114,19 +111,26 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
             waiver["until"] = _day(waiver["until"])
     read = parse_table(PolicyTable, table, source)
     for i, item in enumerate(read.gate):
-        if item.margin == 0.0 and item.figure not in EXACT_METRICS:
+        if (item.weight == 0.0) != (item.metric in EXACT_METRICS):
+            expected = "no weight: the metric is exact" if item.weight else "a weight above 0"
+            raise InvalidInput(source, f"gate.{i}.weight", expected, f"{item.weight:g}")
+        if item.weight and not item.materiality < item.margin:
             raise InvalidInput(
                 source,
                 f"gate.{i}.margin",
-                "a number above 0: no number of frames can show a change of exactly zero",
-                "0",
+                f"more than the materiality {item.materiality:g}",
+                f"{item.margin:g}",
             )
+        if (item.window_margin is None) != (item.window_materiality is None):
+            raise InvalidInput(source, f"gate.{i}", "window_materiality and window_margin", "one of them")
+    weights = sum(item.weight for item in read.gate)
+    if not 0.0 < weights <= 1.0 + 1e-9:
+        raise InvalidInput(source, "gate", "weights above 0 that sum to at most 1", f"{weights:g}")
     policy = GatePolicy(
         version=read.version,
-        confidence=read.confidence.value,
-        power=read.power.value,
-        resamples=read.resamples,
+        fail_level=read.fail.level,
         rules=tuple(_rule(item) for item in read.gate),
+        inconclusive=read.inconclusive,
         waivers=tuple(
             Waiver(item.gate, item.reason, item.until.isoformat(), item.pass_name) for item in read.waiver
         ),
@@ -135,9 +139,10 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
 
 
 def _rule(item: GateTable) -> GateRule:
-    wild = any(character in item.figure for character in "*?[")
-    required = not wild if item.required is None else item.required
-    return GateRule(item.figure, item.margin, item.pass_margin, item.reason, required)
+    window = (item.margin, item.materiality)
+    if item.window_margin is not None and item.window_materiality is not None:
+        window = (item.window_margin, item.window_materiality)
+    return GateRule(item.metric, item.margin, item.weight, item.materiality, *window, item.reason)
 
 
 def _day(text: str) -> datetime.date | str:

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from ground_service.evaluation.detection.recall import SCORED_CLASSES, expected_craters, match_detections
+from ground_service.evaluation.detection.recall import (
+    SCORED_CLASSES,
+    ExpectedCraters,
+    expected_craters,
+    match_detections,
+)
 from ground_service.evaluation.detection.viewing import Viewing
-from ground_service.evaluation.navigation.alignment import error_of_places_rtn_m, reference_states
+from ground_service.evaluation.navigation.alignment import (
+    ReferenceStates,
+    error_of_places_rtn_m,
+    reference_states,
+)
 from ground_service.evaluation.navigation.consistency import squared_normalised_errors
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.camera import PinholeCamera
-from lunar.catalogue import CraterCatalogue
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.catalogue import CraterCatalogue, size_class
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris
-from lunar.frames import Orientation
+from lunar.frames import Orientation, spherical_from_mcmf
 
 WRONG_FIX_SIGMAS = 6.0
 WRONG_FIX_M = 500.0
@@ -25,6 +35,54 @@ WRONG_FIX_M = 500.0
 
 BAD_OUTCOMES = ("missed", "rejected", "refused")
 """Outcomes of a frame with an image that left the estimator without help from it."""
+
+VISIT_GAP_FRAMES = 40
+"""A crater that was out of view for longer is another visit."""
+
+CELL_DEG = 0.25
+"""Ground cells of detections: a lasting feature that is detected again and again is one cell."""
+
+KINDS = ("sparse", "cratered")
+"""Kinds of terrain, by the density of catalogued craters."""
+
+DENSITY_ARC_M = 100e3
+CRATERED_PER_1E6_KM2 = 1000.0
+"""Craters of 5 to 30 km within the arc: maria have some 300 per 10^6 km2, highlands some 2,000."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CraterRows:
+    """Expected craters of 5 to 30 km, a row for each frame that should show one (m,); the same for every build.
+
+    Attributes
+    ----------
+    track
+        Number of the track: one crater in one visit.
+    kind
+        Index into `KINDS`.
+    du_px, dv_px
+        Detected minus expected centre; NaN for a crater that the build missed.
+    """
+
+    frame: IntArray
+    track: IntArray
+    kind: IntArray
+    du_px: FloatArray
+    dv_px: FloatArray
+
+    @property
+    def hit(self) -> BoolArray:
+        """Whether the build detected it (m,)."""
+        return np.isfinite(self.du_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectionRows:
+    """Detections of 5 to 30 km (n,): frame, ground cell, and whether a catalogued crater explains them."""
+
+    frame: IntArray
+    cell: IntArray
+    true: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +96,6 @@ class EstimatorFrames:
     squared_normalised_error
         Sum of squared errors over variances of the three axes: 3 on average for a consistent estimator.
         Packets of most dictionaries hold sigmas and no covariance, so this ignores correlations and is not a NEES.
-    drift_percent
-        Growth of the horizontal error since the previous frame over the ground path between them.
     outcome
         Outcome by name; empty without a report.
     wrong
@@ -49,7 +105,6 @@ class EstimatorFrames:
     error_m: FloatArray
     sigma_m: FloatArray
     squared_normalised_error: FloatArray
-    drift_percent: FloatArray
     outcome: tuple[str, ...]
     wrong: FloatArray
 
@@ -61,6 +116,26 @@ class EstimatorFrames:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TimeTags:
+    """Time tags of the packets of a pass.
+
+    Attributes
+    ----------
+    packets, unknown_images
+        Number of packets of each kind, and of those that name a time at which the payload was given no image.
+    delays_s
+        Time in the header of each packet since the image that it names, or since the last step of the payload.
+    backwards
+        Packets with an earlier header time than the packet before them of the same application process.
+    """
+
+    packets: Mapping[str, int] = field(default_factory=dict)
+    unknown_images: Mapping[str, int] = field(default_factory=dict)
+    delays_s: Mapping[str, FloatArray] = field(default_factory=dict)
+    backwards: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PassFrames:
     """One build on one pass, a row per frame of the archive (n,).
 
@@ -68,32 +143,30 @@ class PassFrames:
     ----------
     answered
         Whether a report on the image came down.
-    expected, hits, alarms
-        Craters of 5 to 30 km that should be seen, were detected, and detections of that size that are none.
-    error_px, shift_u_px, shift_v_px
-        Sums over the hits of the centre's distance, and of detected minus expected centre.
     packets, octets
         Telemetry that belongs to the frame.
     latency
         CPU time of each stage over that of the yardstick.
     latency_ms
         The same in milliseconds as measured.
+    digests
+        Hash of the packets since each frame, in the order received; the first one of packets before all frames.
+    times
+        Time tags of the packets.
     """
 
     answered: BoolArray
-    expected: FloatArray
-    hits: FloatArray
-    alarms: FloatArray
-    error_px: FloatArray
-    shift_u_px: FloatArray
-    shift_v_px: FloatArray
     packets: FloatArray
     octets: FloatArray
     estimators: Mapping[str, EstimatorFrames]
+    craters: CraterRows
+    detections: DetectionRows
     latency: Mapping[str, FloatArray] = field(default_factory=dict)
     latency_ms: Mapping[str, FloatArray] = field(default_factory=dict)
     undecodable: int = 0
     memory_mib: float = float("nan")
+    digests: tuple[bytes, ...] = ()
+    times: TimeTags = TimeTags()
 
     def __len__(self) -> int:
         return len(self.answered)
@@ -130,47 +203,106 @@ def pass_frames(
     """
     n = len(frame_ticks)
     track = reference_states(reference, orientation, frame_utc_ns)
-    rotations = None
-    if viewing is not None:
-        rotations = viewing.camera_from_mcmf(frame_utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    rotations = (
+        nadir_camera_from_mcmf(track.position_mcmf_m)
+        if viewing is None
+        else viewing.camera_from_mcmf(frame_utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    )
     expected = expected_craters(catalogue, camera, track.position_mcmf_m, rotations)
     whole = _by_frame(detections, n)
     matches = match_detections(whole, expected)
     frame_of_crater = np.repeat(np.arange(n), np.diff(expected.offsets))
     frame_of_detection = np.repeat(np.arange(n), np.diff(whole.offsets))
     counted = np.isin(expected.size_class, SCORED_CLASSES) & expected.complete
-    due = np.bincount(frame_of_crater[counted], minlength=n).astype(np.float64)
-    at = np.flatnonzero(counted & (matches.detection_of_crater >= 0))
-    by = matches.detection_of_crater[at]
-    du, dv = whole.u_px[by] - expected.u_px[at], whole.v_px[by] - expected.v_px[at]
-    owner = frame_of_crater[at]
+    rows = np.flatnonzero(counted)
+    by = matches.detection_of_crater[rows]
+    # A missed crater has the row -1: the value after the last.
+    du, dv = (
+        np.append(seen, np.nan)[by] - there[rows]
+        for seen, there in ((whole.u_px, expected.u_px), (whole.v_px, expected.v_px))
+    )
     false = (matches.crater_of_detection < 0) & np.isin(whole.size_class, SCORED_CLASSES)
-    answered = np.zeros(n, dtype=np.bool_)
-    answered[detections.frame_number] = True
+    shown = np.concatenate((by[by >= 0], np.flatnonzero(false)))
+    shown_frame = frame_of_detection[shown]
+    lines = np.einsum(
+        "nji,nj->ni", rotations[shown_frame], camera.rays(np.column_stack((whole.u_px, whole.v_px))[shown])
+    )
     row = np.clip(np.searchsorted(frame_ticks, packet_ticks, side="right") - 1, 0, max(n - 1, 0))
-    estimators = {}
-    for name, samples in navigation.items():
-        rows = samples.frame_number
-        error = np.full((n, 3), np.nan)
-        latitude, longitude, altitude = (np.full(n, np.nan) for _ in range(3))
-        latitude[rows], longitude[rows] = samples.latitude_deg, samples.longitude_deg
-        altitude[rows] = samples.altitude_m
-        sigma = np.full((n, 3), np.nan)
-        sigma[rows] = samples.sigma_rtn_m
-        error = error_of_places_rtn_m(track, latitude, longitude, altitude)
-        estimators[name] = _estimator(error, sigma, track.position_mcmf_m, outcomes.get(name, {}))
     return PassFrames(
-        answered=answered,
-        expected=due,
-        hits=_sums(owner, np.ones(len(at)), n),
-        alarms=_sums(frame_of_detection[false], np.ones(int(np.count_nonzero(false))), n),
-        error_px=_sums(owner, np.hypot(du, dv), n),
-        shift_u_px=_sums(owner, du, n),
-        shift_v_px=_sums(owner, dv, n),
+        answered=np.isin(np.arange(n), detections.frame_number),
         packets=_sums(row, np.ones(len(row)), n),
         octets=_sums(row, packet_octets.astype(np.float64), n),
-        estimators=estimators,
+        estimators=_estimators(navigation, outcomes, track, n),
+        craters=CraterRows(
+            frame_of_crater[rows],
+            _tracks(expected.index[rows], frame_of_crater[rows]),
+            terrain_kinds(catalogue, expected, rows),
+            du,
+            dv,
+        ),
+        detections=DetectionRows(
+            shown_frame,
+            _cells(track.position_mcmf_m[shown_frame], lines),
+            matches.crater_of_detection[shown] >= 0,
+        ),
     )
+
+
+def _estimators(
+    navigation: Mapping[str, NavigationSamples],
+    outcomes: Mapping[str, Mapping[int, str]],
+    track: ReferenceStates,
+    n: int,
+) -> dict[str, EstimatorFrames]:
+    estimators = {}
+    for name, samples in navigation.items():
+        at = samples.frame_number
+        latitude, longitude, altitude = (np.full(n, np.nan) for _ in range(3))
+        latitude[at], longitude[at] = samples.latitude_deg, samples.longitude_deg
+        altitude[at] = samples.altitude_m
+        sigma = np.full((n, 3), np.nan)
+        sigma[at] = samples.sigma_rtn_m
+        error = error_of_places_rtn_m(track, latitude, longitude, altitude)
+        estimators[name] = _estimator(error, sigma, outcomes.get(name, {}))
+    return estimators
+
+
+def _tracks(crater: IntArray, frame: IntArray) -> IntArray:
+    """Return the number of the track (m,) of each row: one crater in one visit."""
+    order = np.lexsort((frame, crater))
+    first = np.ones(len(order), dtype=np.bool_)
+    first[1:] = (np.diff(crater[order]) != 0) | (np.diff(frame[order]) > VISIT_GAP_FRAMES)
+    track = np.empty(len(order), dtype=np.int64)
+    track[order] = np.cumsum(first) - 1
+    return track
+
+
+def terrain_kinds(catalogue: CraterCatalogue, expected: ExpectedCraters, rows: IntArray) -> IntArray:
+    """Return the kind of terrain (m,) around the expected craters of these rows."""
+    scored = np.isin(size_class(catalogue.diameter_m), SCORED_CLASSES)
+    area_1e6_km2 = math.pi * (DENSITY_ARC_M / 1e3) ** 2 / 1e6
+    craters, row_of = np.unique(expected.index[rows], return_inverse=True)
+    latitude, longitude, _ = spherical_from_mcmf(catalogue.position_mcmf_m[craters])
+    count = [
+        np.count_nonzero(scored[catalogue.near(*place, DENSITY_ARC_M)])
+        for place in zip(latitude.tolist(), longitude.tolist(), strict=True)
+    ]
+    kind = np.array(count, dtype=np.float64) > CRATERED_PER_1E6_KM2 * area_1e6_km2
+    return kind[row_of].astype(np.int64)
+
+
+def _cells(position_mcmf_m: FloatArray, line_mcmf: FloatArray) -> IntArray:
+    """Return the ground cell (n,) where lines of sight meet the sphere; -1 above the horizon."""
+    along = np.einsum("ni,ni->n", position_mcmf_m, line_mcmf)
+    square = along**2 - np.einsum("ni,ni->n", position_mcmf_m, position_mcmf_m) + MOON_RADIUS_M**2
+    with np.errstate(invalid="ignore"):
+        place = position_mcmf_m - (along + np.sqrt(square))[:, None] * line_mcmf
+    latitude, longitude, _ = spherical_from_mcmf(place)
+    row = np.floor(np.nan_to_num(np.degrees(latitude)) / CELL_DEG)
+    # Columns narrow with the latitude, so that cells have about the same area.
+    column = np.floor(np.nan_to_num(np.degrees(longitude)) * np.cos(np.radians(row * CELL_DEG)) / CELL_DEG)
+    cell = (row * 100_000 + column).astype(np.int64)
+    return np.where(np.isfinite(square) & (square >= 0.0), cell, -1)
 
 
 def _sums(owner: IntArray, values: FloatArray, frames: int) -> FloatArray:
@@ -179,15 +311,10 @@ def _sums(owner: IntArray, values: FloatArray, frames: int) -> FloatArray:
 
 
 def _estimator(
-    error_rtn_m: FloatArray, sigma_rtn_m: FloatArray, position_mcmf_m: FloatArray, outcomes: Mapping[int, str]
+    error_rtn_m: FloatArray, sigma_rtn_m: FloatArray, outcomes: Mapping[int, str]
 ) -> EstimatorFrames:
     n = len(error_rtn_m)
     length = np.linalg.norm(error_rtn_m, axis=1)
-    direction = position_mcmf_m / np.linalg.norm(position_mcmf_m, axis=1, keepdims=True)
-    path_m = np.full(n, np.nan)
-    path_m[1:] = MOON_RADIUS_M * np.linalg.norm(np.diff(direction, axis=0), axis=1)
-    gained = np.full(n, np.nan)
-    gained[1:] = np.linalg.norm(np.diff(error_rtn_m[:, 1:], axis=0), axis=1)
     outcome = tuple(outcomes.get(i, "") for i in range(n))
     fixed = np.array([name == "fixed" for name in outcome], dtype=np.bool_)
     claimed = np.linalg.norm(sigma_rtn_m, axis=1)
@@ -197,7 +324,6 @@ def _estimator(
         error_m=length,
         sigma_m=claimed,
         squared_normalised_error=squared_normalised_errors(error_rtn_m, sigma_rtn_m),
-        drift_percent=np.where(path_m > 0.0, 100.0 * gained / np.where(path_m > 0.0, path_m, 1.0), np.nan),
         outcome=outcome,
         wrong=np.where(known, (fixed & far).astype(np.float64), np.nan),
     )

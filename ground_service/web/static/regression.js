@@ -12,19 +12,19 @@ async function upload(path, file) {
   return answer.json();
 }
 
-const OUTCOMES = ["fail", "inconclusive", "not judged", "pass"];
+const OUTCOMES = ["fail", "inconclusive", "not judged", "pass", "informs"];
 
 // What would decide an open gate, or why its outcome does not count.
 function remarkOf(gate) {
   if (gate.waived) return `waived: ${gate.waived}`;
-  if (gate.outcome !== "inconclusive") return gate.reason ?? "";
-  if (gate.frames_needed == null) return gate.reason;
-  return `${gate.reason}: ${figure(gate.frames_needed)} frames needed, ${figure(gate.frames)} compared`;
+  const told = [gate.reason, gate.evidence].filter(Boolean).join(", ");
+  if (gate.outcome !== "inconclusive" || gate.frames_needed == null) return told;
+  return `${told}: about ${figure(gate.frames_needed)} frames decide, ${figure(gate.frames)} compared`;
 }
 
 function gateRows(regression) {
   return table(
-    "Gates",
+    regression.result.headline || "Gates",
     [
       ["Gate", (row) => row.name.replaceAll("_", " ")],
       ["Baseline", (row) => figure(row.baseline), "num"],

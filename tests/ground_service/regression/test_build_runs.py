@@ -184,6 +184,12 @@ def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
             "gone.onnx: expected a file in the folder of the build file, found nothing",
         ),
         ('name = "x"\n[limits]\nwall_s = -1', "limits.wall_s: expected greater than 0, found -1"),
+        ('name = "x"\n[limits]\nwall_s = 7_201', "limits.wall_s: expected less than or equal to 7200"),
+        (
+            'name = "x"\n[limits]\nmemory_mib = 9_000_000_000_000',
+            "limits.memory_mib: expected less than or equal",
+        ),
+        (f'name = "x"\n[provenance]\ncommit = 0x{"f" * 5000}', "provenance.commit"),
         ('name = "x"\nschema_version = 9', "schema_version: expected 1, found 9"),
         ("name = ", "expected a build file (TOML)"),
         ('name = "x\\u001b"', "name: expected a text without control characters, found"),

@@ -8,7 +8,7 @@ from ground_service.http.times import UtcTime
 from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regression, Verdict
 
 BUILD = {"version": "1.2", "digest": "ab" * 32, "flight_code": None, "provenance": {}}
-POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}
+POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # of an earlier version
 
 
 def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
@@ -61,8 +61,8 @@ def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_compariso
     lost = {"name": "pass 2", "archive": "x", "state": "candidate failed", "detail": "exit status 4"}
     found = regression("fail", [open_gate, failed, waived], passes=[lost])
     assert found.summary().reasons == [
-        "recall on pass 1: 0.9 to 0.7 m, limit 0.05 m",
-        "drift: too few frames",
+        "recall on pass 1: 0.9 to 0.7 m",
+        "drift: 0.9 to 0.7, too few frames",
         "pass 2: exit status 4",
     ]
 
@@ -70,7 +70,7 @@ def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_compariso
 @pytest.mark.parametrize("candidate", [None, 0.7])
 def test_a_gate_without_figures_states_its_reason_or_outcome(candidate: float | None) -> None:
     text = gate("recall", "fail", candidate=candidate, limit=None, reason="no detections").text
-    assert text == ("recall: no detections" if candidate is None else "recall: 0.9 to 0.7")
+    assert text == ("recall: no detections" if candidate is None else "recall: 0.9 to 0.7, no detections")
 
 
 def test_a_list_has_the_first_reasons_only() -> None:
