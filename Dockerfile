@@ -11,7 +11,7 @@ RUN npm ci --ignore-scripts --no-audit --no-fund \
     && mkdir openmct && cp -r node_modules/openmct/dist node_modules/openmct/package.json node_modules/openmct/LICENSE.md openmct \
     && find openmct -name '*.map' -delete
 
-FROM ${PYTHON_IMAGE} AS build
+FROM ${PYTHON_IMAGE} AS sources
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/linna
 WORKDIR /src
@@ -30,6 +30,16 @@ COPY ground_service ground_service
 COPY linna linna
 COPY db db
 COPY scenarios scenarios
+
+# The documentation, with the pages that the program generates; its tools stay in this stage.
+FROM sources AS help
+RUN /opt/linna/bin/pip install --require-hashes -r requirements/site.txt
+COPY mkdocs.yml docs_site.py ./
+COPY docs docs
+RUN NO_MKDOCS_2_WARNING=1 /opt/linna/bin/python -m mkdocs build --strict
+
+FROM sources AS build
+COPY --from=help /src/ground_service/web/help ground_service/web/help
 RUN /opt/linna/bin/pip install --no-deps .
 
 FROM ${PYTHON_IMAGE}

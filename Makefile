@@ -14,6 +14,9 @@ DEMO_STAMPS := $(VENV)/.runtime $(if $(LINNA_DATA),$(VENV)/.terrain)
 DEMO_OUT    ?= linna-demo
 
 
+# An environment that is a link belongs to another checkout: it is used as it is, nothing is installed into it.
+LINKED := $(shell test -L $(VENV) && echo yes)
+
 # Mutants of each group that `make mutation` tests; 0: every one.
 SAMPLE ?= 60
 SEED   ?= 1
@@ -21,7 +24,7 @@ SEED   ?= 1
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 
-.PHONY: demo test check openmct docs pictures page-table links sbom licences package release bench bench-planning campaigns mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures page-table sbom licences package release bench bench-planning campaigns mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -43,14 +46,10 @@ check: $(VENV)/.dev
 	$(BIN)/python -m pytest -q tests/test_dependencies.py
 	$(BIN)/python deploy/audit.py $(SHIPPED)
 
-# The documentation site with executed notebooks; `linna serve` shows it at /help.
+# The documentation site with executed notebooks; `linna serve` shows it at /help, wheel and image contain it.
 docs: $(VENV)/.dev
 	$(BIN)/python docs_site.py notebooks build/notebooks
 	NO_MKDOCS_2_WARNING=1 NOTEBOOK_OUTPUTS=build/notebooks $(BIN)/python -m mkdocs build --strict
-
-# External links of the documentation; needs the network.
-links: $(VENV)/.dev
-	$(BIN)/python docs_site.py links
 
 # Telemetry displays; `linna serve` shows them at /mct. The lock file states version and checksum.
 openmct: deploy/openmct/node_modules/.package-lock.json
@@ -79,7 +78,7 @@ licences: $(VENV)/.dev
 
 # Wheel, source distribution, bill of materials, licences, checksums and their signature, in a new folder. LINNA_RELEASE_KEY
 # names the private key, outside of the repository; `python deploy/release.py key FILE` makes one.
-release: $(VENV)/.dev
+release: docs
 	@test -n "$(LINNA_RELEASE_KEY)" || { echo "LINNA_RELEASE_KEY: expected the file of the private key, found none" >&2; exit 2; }
 	rm -rf dist/release
 	mkdir -p dist/release build
@@ -89,8 +88,8 @@ release: $(VENV)/.dev
 	$(BIN)/python deploy/licences.py $(SHIPPED) > dist/release/licences.txt
 	$(BIN)/python deploy/release.py sign dist/release --key "$(LINNA_RELEASE_KEY)"
 
-# Wheel and source distribution.
-package: $(VENV)/.dev
+# Wheel and source distribution, with the documentation.
+package: docs
 	$(BIN)/python -m build --outdir dist
 
 bench: $(VENV)/.bench
@@ -110,6 +109,7 @@ up:
 install: $(DEMO_STAMPS)
 install-dev: $(VENV)/.dev
 
+ifeq ($(LINKED),)
 $(BIN)/python:
 	$(PYTHON) -m venv $(if $(BASE_PIP),--without-pip) $(VENV)
 
@@ -133,6 +133,10 @@ $(VENV)/.bench: requirements/bench.txt $(VENV)/.dev
 $(VENV)/.mutation: requirements/mutation.txt $(VENV)/.dev
 	$(PIP) -r requirements/mutation.txt
 	touch $@
+
+else
+$(VENV)/%: ;
+endif
 
 $(VENV)-ortools/.stamp: requirements/ortools.txt
 	$(PYTHON) -m venv $(if $(BASE_PIP),--without-pip) $(VENV)-ortools

@@ -3,7 +3,6 @@
 `python docs_site.py notebooks FOLDER` flies the passes of the notebooks, executes the notebooks and saves them with
 their outputs in FOLDER. A build of the site with `NOTEBOOK_OUTPUTS=FOLDER` shows these outputs; without it, text and
 code only.
-`python docs_site.py links` asks for every external address in the documentation and of the data products.
 """
 
 from __future__ import annotations
@@ -41,7 +40,6 @@ source = "procedural"
 filter_gravity = "builtin"
 filter_degree = 8
 """
-_LINK = re.compile(r"https?://(?!127\.0\.0\.1|localhost|[\w.-]*\.example\b)[^\s)>\"'`|]+")
 _STYLE = re.compile(r"<style.*?</style>\s*", re.DOTALL)
 
 
@@ -118,50 +116,10 @@ def executed_notebooks(home: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         yield path.name, notebook
 
 
-def external_links() -> dict[str, str]:
-    """Return the external addresses in the documentation and of the data products, with the place of each."""
-    from payload_emulator.data_products import PRODUCTS
-
-    found: dict[str, str] = {}
-    for path in (*sorted(ROOT.glob("docs/**/*.md")), *sorted(ROOT.glob("*.md")), ROOT / "CITATION.cff"):
-        for link in _LINK.findall(path.read_text(encoding="utf-8")):
-            found.setdefault(link, str(path.relative_to(ROOT)))
-    for product in PRODUCTS:
-        for file in product.files:
-            if file.url:
-                found.setdefault(file.url, f"data product {product.name}")
-    return found
-
-
-def broken_links(links: dict[str, str]) -> list[str]:
-    """Ask for each address; return a line for each that does not answer."""
-    import httpx
-
-    broken = []
-    with httpx.Client(follow_redirects=True, timeout=30.0) as client:
-        for link, place in links.items():
-            try:
-                status = client.head(link).status_code
-                if status in (403, 405, 501):  # refuses HEAD
-                    with client.stream("GET", link) as answer:
-                        status = answer.status_code
-                found = "" if status < 400 else f"status {status}"
-            except httpx.HTTPError as error:
-                found = f"{type(error).__name__}: {error}"
-            if found:
-                broken.append(f"{place}: {link}: expected an answer, found {found}")
-    return broken
-
-
 def main(arguments: list[str]) -> int:
-    """Run a command; the exit status is 1 if a link is broken."""
-    if arguments == ["links"]:
-        links = external_links()
-        broken = broken_links(links)
-        print("\n".join([*broken, f"{len(links)} links, {len(broken)} broken"]))
-        return int(bool(broken))
+    """Run the command."""
     if len(arguments) != 2 or arguments[0] != "notebooks":
-        print("docs_site.py: expected 'links' or 'notebooks FOLDER'", file=sys.stderr)
+        print("docs_site.py: expected 'notebooks FOLDER'", file=sys.stderr)
         return 2
     save_executed_notebooks(Path(arguments[1]))
     return 0

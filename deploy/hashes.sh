@@ -4,7 +4,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 mkdir -p requirements/hashed
-for name in runtime postgres parquet traces oidc objects terrain exports; do
+for name in runtime postgres parquet traces oidc objects terrain exports site; do
   uv pip compile --quiet --no-deps --generate-hashes --no-annotate --no-header --universal --python-version 3.11 \
     "requirements/$name.txt" --output-file "requirements/hashed/$name.txt"
 done

@@ -139,7 +139,7 @@ def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
     assert stated and not licences.is_copyleft(stated), f"{name}: {stated}"
 
 
-HASHED = ("runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain", "exports")
+HASHED = ("runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain", "exports", "site")
 
 
 @pytest.mark.parametrize("name", HASHED)
@@ -155,12 +155,10 @@ def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
 
 def test_what_is_installed_for_users_is_installed_with_hashes() -> None:
     installed = re.findall(r"pip install (.*(?:\\\n.*)*)", (ROOT / "Dockerfile").read_text())
-    assert [line.startswith("--require-hashes") or "--no-deps ." in line for line in installed] == [
-        True,
-        True,
-    ]
-    image = re.findall(r"pip install ((?:.*\\\n)*.*)", (ROOT / "Dockerfile").read_text())[0]
+    assert [line.startswith("--require-hashes") or "--no-deps ." in line for line in installed] == [True] * 3
+    image = (ROOT / "Dockerfile").read_text()
     assert {f"-r requirements/{name}.txt" for name in HASHED} <= set(re.findall(r"-r \S+", image))
+    assert pins("site").items() <= {**EVERYTHING, **pins("docs")}.items()
     rules = (ROOT / "Makefile").read_text()
     for name in ("runtime", "terrain"):
         assert re.search(rf"--require-hashes .*-r requirements/hashed/{name}\.txt", rules)

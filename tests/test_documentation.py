@@ -1,19 +1,17 @@
 """The documentation site: strict build, generated reference, self-contained pages, spelling, and commands that run."""
 
-import http.server
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
 
 import docs_site
-from ground_service.web import documentation
+from ground_service.web import documentation, pages
 from linna.cli import GROUPS
 from linna.completion import command_parser
 from linna.parser import all_commands
@@ -57,7 +55,10 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
 
 
 def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(documentation, "FOLDER", site)
+    monkeypatch.setattr(documentation, "HELP", Path("absent"))
+    absent = documentation.documentation_file("index.html")
+    assert absent.status_code == 404 and b"make docs" in absent.body
+    monkeypatch.setattr(documentation, "HELP", site)
     answer = documentation.documentation_file("index.html")
     policy = answer.headers["Content-Security-Policy"]
     assert answer.media_type == "text/html; charset=utf-8" and "default-src 'none'" in policy
@@ -70,51 +71,20 @@ def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: py
             documentation.documentation_file(path)
 
 
+@pytest.mark.parametrize("folder, links", [(DOCS / "pictures", 1), (DOCS / "absent", 0)])
+def test_the_footer_links_to_the_documentation_where_it_was_built(
+    folder: Path, links: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pages, "HELP", folder)
+    assert pages.rendered.__wrapped__(pages.PAGES[0]).count('href="/help"') == links
+
+
 def test_spelling() -> None:
     checked = subprocess.run(
         [str(Path(sys.executable).with_name("typos")), "--config", str(ROOT / "typos.toml"), "docs", "README.md"],
         cwd=ROOT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert checked.returncode == 0, checked.stdout
-
-
-def test_external_links_are_found_with_their_places_and_local_ones_are_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "a.md").write_text(
-        "[one](https://a.org/x) `http://127.0.0.1:8042/` <https://b.org/y> https://ops.example/linna http://localhost:1\n"
-    )
-    (tmp_path / "CITATION.cff").write_text('url: "https://c.org"\n')
-    monkeypatch.setattr(docs_site, "ROOT", tmp_path)
-    found = docs_site.external_links()
-    assert {link: place for link, place in found.items() if not place.startswith("data product")} == {
-        "https://a.org/x": "docs/a.md",
-        "https://b.org/y": "docs/a.md",
-        "https://c.org": "CITATION.cff",
-    }
-    assert any(place.startswith("data product") for place in found.values())
-
-
-def test_links_without_an_answer_are_broken() -> None:
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_HEAD(self) -> None:
-            self.send_response({"/good": 200, "/get": 405}.get(self.path, 404))
-            self.end_headers()
-
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, *arguments: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}"
-        broken = docs_site.broken_links({f"{address}/{name}": "a.md" for name in ("good", "get", "gone")})
-        server.shutdown()
-    assert broken == [f"a.md: {address}/gone: expected an answer, found status 404"]
 
 
 def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:

@@ -36,7 +36,7 @@ SCENARIO_NAMES = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with wheel and sdist, built from the tracked files alone."""
+    """Folder with wheel and sdist, built from the tracked files and the documentation, as `make package` does."""
     folder = tmp_path_factory.mktemp("package")
     source = folder / "source"
     listed = subprocess.run(
@@ -50,6 +50,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if not name.startswith("tests/") and (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, source / name)
+    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet"], cwd=source, check=True)
     code = (
         "import setuptools.build_meta as b, sys; "
         f"b.build_wheel({str(folder)!r}); b.build_sdist({str(folder)!r})"
@@ -181,7 +182,6 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, 
     tour = re.findall(
         r"^linna (?:demo|serve|plan|report) .*$", (ROOT / "README.md").read_text(), re.MULTILINE
     )
-    assert [line.split()[1] for line in tour] == ["demo", "serve", "plan", "plan", "report"]
     (tmp_path / "short.toml").write_text(SHORT)
 
     def command(line: str, *more: str) -> list[str | Path]:
@@ -208,8 +208,10 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, 
 
 def answers(port: int) -> bool:
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/static/site.css", timeout=10) as answer:
-            return answer.status == 200 and b"{" in answer.read()
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{port}/help/tutorials/first-pass.html", timeout=10
+        ) as answer:
+            return answer.status == 200 and b"First pass" in answer.read()
     except OSError:
         return False
 

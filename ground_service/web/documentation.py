@@ -5,27 +5,19 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from functools import cache
 from pathlib import Path
 
 from fastapi import APIRouter, Response
 from fastapi.responses import RedirectResponse
 
 from ground_service.errors import NotFound
-
-FOLDER = Path(__file__).parent / "help"
+from ground_service.web.pages import HELP, MEDIA, files_of
 
 _INLINE_SCRIPT = re.compile(rb"<script>(.*?)</script>", re.DOTALL)
-_MEDIA = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".json": "application/json",
-    ".svg": "image/svg+xml",
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".map": "application/json",
-}
+_ABSENT = """<!doctype html><html lang="en"><meta name="viewport" content="width=device-width"><title>LINNA</title>
+<h1>No documentation</h1><p>This installation was made without its documentation. Released wheels and the image have it.
+In a checkout, <code>make docs</code> builds it; restart the service afterwards.</p><p><a href="/">Overview</a></p>"""
+"""Answer to every path where the documentation was not built."""
 
 documentation = APIRouter(include_in_schema=False)
 
@@ -44,15 +36,15 @@ def documentation_file(path: str) -> Response:
     Raises
     ------
     NotFound
-        There is no such file, or the documentation was not built (`make docs`).
+        There is no such file. Where the documentation was not built, every path has a page that says so.
     """
-    files = _files(FOLDER)
+    files = files_of(HELP)
     if not files:
-        raise NotFound("documentation", "it was not built, see make docs")
+        return Response(_ABSENT, 404, media_type="text/html")
     body = files.get(path)
     if body is None:
         raise NotFound("documentation page", path[:80])
-    media = _MEDIA[Path(path).suffix]
+    media = MEDIA[Path(path).suffix]
     headers = {
         "Cache-Control": "no-cache",
         "Content-Security-Policy": policy(body if media[:9] == "text/html" else b""),
@@ -70,13 +62,3 @@ def policy(page: bytes) -> str:
         f"default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
         "connect-src 'self'; worker-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     )
-
-
-@cache
-def _files(folder: Path) -> dict[str, bytes]:
-    """All files, read once; no path leads elsewhere. Empty if the documentation was not built."""
-    return {
-        file.relative_to(folder).as_posix(): file.read_bytes()
-        for file in sorted(folder.rglob("*"))
-        if file.is_file() and file.suffix in _MEDIA
-    }

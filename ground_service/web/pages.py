@@ -32,18 +32,25 @@ from tmtc.schema import Field, PacketDefinition
 
 _HERE = Path(__file__).parent
 _STATIC = _HERE / "static"
+HELP = _HERE / "help"
+"""Folder of the documentation; absent where it was not built."""
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
 
-_MEDIA = {
+MEDIA = {
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
     ".LICENSE": "text/plain; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".json": "application/json",
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
 }
+"""Media types of static files and of the documentation, by ending."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,12 +121,11 @@ for _page in PAGES:
 @pages.get("/static/{path:path}")
 def static_file(path: str, v: str = "") -> Response:
     """A file of the pages; kept by the browser for good where its version is asked for."""
-    body = _files().get(path)
+    body = files_of(_STATIC).get(path)
     if body is None:
         raise NotFound("file", path[:80])
     headers = {"Cache-Control": "public, max-age=31536000, immutable" if v else "no-cache"}
-    media = next(media for ending, media in _MEDIA.items() if path.endswith(ending))
-    return Response(body, media_type=media, headers=headers)
+    return Response(body, media_type=MEDIA[Path(path).suffix], headers=headers)
 
 
 REPORT_POLICY = (
@@ -178,12 +184,12 @@ def moon_map(request: Request) -> Response:
 
 
 @cache
-def _files() -> dict[str, bytes]:
+def files_of(folder: Path) -> dict[str, bytes]:
     """All files, read once: what is served is what was there at the start, and no path leads elsewhere."""
     return {
-        file.relative_to(_STATIC).as_posix(): file.read_bytes()
-        for file in sorted(_STATIC.rglob("*"))
-        if file.is_file() and file.name.endswith(tuple(_MEDIA))
+        file.relative_to(folder).as_posix(): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.suffix in MEDIA
     }
 
 
@@ -191,7 +197,7 @@ def _files() -> dict[str, bytes]:
 def _version() -> str:
     """One version for all files, since scripts import each other by plain names."""
     whole = hashlib.sha256()
-    for name, body in _files().items():
+    for name, body in files_of(_STATIC).items():
         whole.update(name.encode() + b"\0" + body)
     return whole.hexdigest()[:12]
 
@@ -216,13 +222,14 @@ def rendered(page: Page, template: str = "", openmct: str = "", *, provider: boo
             page=page,
             openmct=openmct,
             provider=provider,
+            help=bool(files_of(HELP)),
             pages=[one for one in PAGES if one.entry],
             version=_version(),
             dictionary=_dictionary(),
             state_values=STATE_VALUES,
             licences={
                 name.removeprefix("vendor/").removesuffix(".LICENSE"): body.decode()
-                for name, body in _files().items()
+                for name, body in files_of(_STATIC).items()
                 if name.endswith(".LICENSE")
             },
         )

@@ -88,7 +88,8 @@ def test_images_are_exact_versions() -> None:
         given = default_of(SERVICES["api"]["build"]["args"][name])
         (written,) = re.findall(rf"^ARG {name}=(\S+)$", DOCKERFILE, re.MULTILINE)
         assert given == written and EXACT.fullmatch(written)
-    assert set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
+    images = set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) - {"sources"}
+    assert images == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
 
 
 def test_the_image_holds_the_displays_and_no_source_maps() -> None:
@@ -97,6 +98,14 @@ def test_the_image_holds_the_displays_and_no_source_maps() -> None:
     last = DOCKERFILE.split("\nFROM ")[-1]
     (folder,) = re.findall(r"^COPY --from=displays /displays/openmct (\S+)$", last, re.MULTILINE)
     assert f"LINNA_OPENMCT={folder}" in last
+
+
+def test_the_image_builds_the_documentation_into_the_package() -> None:
+    stage = DOCKERFILE.split(" AS help\n")[1].split("\nFROM ")[0]
+    assert "mkdocs build" in stage and "COPY docs docs\n" in stage
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["site_dir"]
+    copied = DOCKERFILE.index(f"COPY --from=help /src/{site} {site}\n")
+    assert copied < DOCKERFILE.index("pip install --no-deps .") < DOCKERFILE.index("COPY --from=build")
 
 
 def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums() -> None:
