@@ -6,7 +6,9 @@ import functools
 import logging
 import stat
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
@@ -31,6 +33,11 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
+
+WAIT_S = 0.2
+_running: set[tuple[Path, str]] = set()
+_changed = threading.Condition()
+"""Work of `Ground.alone` in this process, and the notification of its changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +77,31 @@ class Ground:
         """Return the result of a function of a store, called in a transaction that reads."""
         with self.database.reading() as connection:
             return work(connection, *given, **named)
+
+    @contextmanager
+    def alone(self, work: str) -> Iterator[None]:
+        """Wait until no other thread or process does a piece of work, and keep others out.
+
+        Actions cause later events only, whose actions may run inside: nobody waits for an earlier event.
+        """
+        mine = (self.home, work)
+        with _changed:
+            while mine in _running:
+                self.check_stopping()
+                _changed.wait(WAIT_S)
+            _running.add(mine)
+        try:
+            while True:
+                with self.database.alone(work) as alone:
+                    if alone:
+                        yield
+                        return
+                self.check_stopping()
+                time.sleep(WAIT_S)
+        finally:
+            with _changed:
+                _running.discard(mine)
+                _changed.notify_all()
 
     @property
     def orientation(self) -> Orientation:

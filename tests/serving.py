@@ -10,9 +10,10 @@ from typing import Any
 
 import uvicorn
 
-from ground_service.access.service import add_user
+from ground_service.access.service import add_user, authenticate
 from ground_service.app import create_app
-from ground_service.ground import ground_from_settings
+from ground_service.errors import NotAuthorised
+from ground_service.ground import Ground, ground_from_settings
 from ground_service.server import bind
 from ground_service.settings import Settings
 
@@ -23,6 +24,14 @@ def wait_for(reached: Callable[[], Any], what: str, seconds: float = 60.0) -> No
     while not reached():
         assert time.monotonic() < until, f"{what}: not reached within {seconds} s"
         time.sleep(0.01)
+
+
+def token_valid(ground: Ground, token: str) -> bool:
+    """Return whether a token is accepted now."""
+    try:
+        return bool(authenticate(ground, token))
+    except NotAuthorised:
+        return False
 
 
 @contextmanager

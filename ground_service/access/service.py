@@ -322,14 +322,6 @@ def end_session(ground: Ground, caller: Caller) -> None:
             audit(connection, caller.name, "end session", caller.name, {"token_id": caller.token_id})
 
 
-def token_valid(ground: Ground, token: str) -> bool:
-    """Return whether a token is valid now; one indexed query, for connections that outlive their opening request."""
-    found = _find_token(ground, token)
-    if found is None or found.revoked_utc_ns is not None or found.state != "active":
-        return False
-    return not found.expired(utc_now_ns())
-
-
 def token_sha256(token: str) -> str:
     """Return the stored hash of a token (hex)."""
     return hashlib.sha256(token.encode()).hexdigest()

@@ -331,6 +331,10 @@ class Operations(Connection):
     def get_job(self, job_id: str) -> jobs.Job:
         """Show a job: its state, and its result when it is done."""
 
+    @operation("POST /jobs/{job_id}/repeat")
+    def repeat_job(self, job_id: str) -> jobs.Job:
+        """Do a failed job again, which changes nothing that is done already."""
+
     # missions
 
     @operation("GET /missions", reads="missions.store.list_missions")

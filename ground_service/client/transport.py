@@ -6,9 +6,8 @@ import asyncio
 import sys
 import threading
 import weakref
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import httpx
 from fastapi import FastAPI
@@ -65,29 +64,16 @@ class OperationsOnDemand:
         return any(route.matches(scope)[0] is Match.FULL for route in self._app.state.operations)
 
 
-class LocalDispatcher:
+class LocalDispatcher(Dispatcher):
     """Dispatcher that finishes every job before its request returns."""
 
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        """Submit a job and run it to completion."""
-        from ground_service.worker.dispatch import InlineDispatcher
-
-        return InlineDispatcher(self._ground).submit(kind, arguments, job_id=job_id)
-
     def start(self, job_id: str) -> None:
-        """Run a submitted job to completion."""
-        from ground_service.worker.dispatch import InlineDispatcher
+        from ground_service.worker.jobs import run_job
 
-        InlineDispatcher(self._ground).start(job_id)
+        run_job(self._ground, job_id)
 
     def resume(self) -> None:
         """Leave unfinished jobs of other processes to the server."""
-
-    def close(self) -> None:
-        """Do nothing: no job is running."""
 
 
 class FollowUpOnDemand:

@@ -1,24 +1,35 @@
-"""Interface of the dispatcher: what runs jobs, for the operations that enter them."""
+"""What runs jobs, for the operations that enter them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
+from ground_service.ground import Ground
+from ground_service.jobs.service import enter_job
 
-class Dispatcher(Protocol):
+
+class Dispatcher:
     """Receives jobs and has them done, in this process or by workers."""
+
+    def __init__(self, ground: Ground) -> None:
+        self._ground = ground
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
         """Enter a job and have it done; return its id."""
+        identity = enter_job(self._ground, kind, arguments, job_id=job_id)
+        self.start(identity)
+        return identity
 
     def start(self, job_id: str) -> None:
         """Have an entered job done."""
+        raise NotImplementedError
 
     def resume(self) -> None:
         """Start unfinished jobs of ended processes again; may be called repeatedly."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """End running jobs: interruptible jobs continue at the next start, others finish."""

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import Connection, and_, delete, or_, select
 
 from ground_service.http.model import PageOf
 from ground_service.jobs.model import Job, JobFilter
 from ground_service.store import repository
-from ground_service.store.states import JOB, change_if, move
+from ground_service.store.states import JOB, change_if, move, move_all
 
 JOBS = repository.JOBS
 
 FINISHED = ("done", "failed")
+REPEAT_NS = tuple(minutes * 60_000_000_000 for minutes in (1, 4, 16, 64))
+"""Times from the failed attempts of an ingest to the next ones."""
 
 
 def add_job(
@@ -105,7 +107,38 @@ def requeue(connection: Connection, job_id: str, attempt: int) -> None:
         Another process has started a new attempt.
     """
     where = {"attempts": attempt}
-    move(connection, JOB, job_id, "queued", where=where, attempts=attempt - 1, progress=0.0)
+    interrupted = ("running",)
+    move(
+        connection,
+        JOB,
+        job_id,
+        "queued",
+        expected=interrupted,
+        where=where,
+        attempts=attempt - 1,
+        progress=0.0,
+    )
+
+
+def repeat_job(connection: Connection, job_id: str) -> None:
+    """Queue a failed job again; its last error is kept until it ends.
+
+    Raises
+    ------
+    StateConflict
+        The job has not failed.
+    """
+    move(connection, JOB, job_id, "queued", expected=("failed",), progress=0.0)
+
+
+def repeat_ingests(connection: Connection, now_utc_ns: int) -> None:
+    """Queue the failed ingests again whose next attempt is due: what was acknowledged is not given up."""
+    due = (
+        and_(JOBS.c.attempts == k, JOBS.c.finished_utc_ns <= now_utc_ns - wait_ns)
+        for k, wait_ns in enumerate(REPEAT_NS, start=1)
+    )
+    failed = (JOBS.c.kind == "ingest", JOBS.c.state == "failed", or_(*due))
+    move_all(connection, JOB, failed, "queued", progress=0.0)
 
 
 def end_attempt(

@@ -16,10 +16,6 @@ import hashlib
 import json
 import os
 import re
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,11 +71,8 @@ LIVE_BEGINNING = "the pass was received live"
 NO_DETECTIONS = "; no received detections: "
 """Part of the reason of an archive whose downlink has no detections that can be decoded."""
 
-WAIT_S = 0.2
 _DOWNLINKS = ("downlink.cadu", "downlink.packets")
 _ARCHIVE = re.compile(r"(?:/[\w.-]+)*/archive\b")
-_rendering: set[str] = set()
-_changed = threading.Condition()
 
 
 class RenderingFailed(GroundError):
@@ -106,7 +99,7 @@ def settle_archive(ground: Ground, digest: str, *, again: bool = False) -> KeptA
     RenderingFailed
         The renderer failed without refusing the archive, whose state does not change.
     """
-    with _alone(ground, digest):
+    with ground.alone(f"render {digest}"):
         with ground.database.reading() as connection:
             record = store.get_archive(connection, digest)
         if record.state == COMPLETE:
@@ -255,29 +248,3 @@ def recorded_detections(archive: PassArchive) -> list[dict[str, Any]]:
 
 def _numbers(values: NDArray[Any]) -> list[float | None]:
     return [None if np.isnan(value) else float(value) for value in values]
-
-
-@contextmanager
-def _alone(ground: Ground, digest: str) -> Iterator[None]:
-    """Wait until no other thread or process renders the frames of an archive, and keep others out."""
-    mine = f"{ground.home} {digest}"
-    key = int.from_bytes(
-        hashlib.blake2b(f"render {digest}".encode(), digest_size=8).digest(), "big", signed=True
-    )
-    with _changed:
-        while mine in _rendering:
-            ground.check_stopping()
-            _changed.wait(WAIT_S)
-        _rendering.add(mine)
-    try:
-        while True:
-            with ground.database.alone(key) as alone:
-                if alone:
-                    yield
-                    return
-            ground.check_stopping()
-            time.sleep(WAIT_S)
-    finally:
-        with _changed:
-            _rendering.discard(mine)
-            _changed.notify_all()

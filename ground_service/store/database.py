@@ -10,6 +10,7 @@ import ast
 import contextlib
 import errno
 import functools
+import hashlib
 import json
 import logging
 import math
@@ -158,14 +159,15 @@ class Database:
             raise StorageReadOnly(self.label)
 
     @contextmanager
-    def alone(self, key: int) -> Iterator[bool]:
-        """Whether no other process holds `key` (64 bit, signed) now; it is held until the end, or the process's.
+    def alone(self, name: str) -> Iterator[bool]:
+        """Whether no other process holds the lock of this name now; it is held until the end, or the process's.
 
         A SQLite database serves the jobs of one process only, which then is alone anyway.
         """
         if self.dialect != "postgresql":
             yield True
             return
+        key = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big", signed=True)
         with self._translated(), self.engine.connect() as connection:
             connection = connection.execution_options(isolation_level="AUTOCOMMIT")
             held = bool(connection.execute(text("SELECT pg_try_advisory_lock(:key)"), {"key": key}).scalar())

@@ -53,7 +53,7 @@ JOB = StateMachine(
     "job",
     repository.JOBS,
     # A job whose process ended prematurely is still "running" and is started again.
-    {"queued": ("running",), "running": ("running", "queued", "done", "failed")},
+    {"queued": ("running",), "running": ("running", "queued", "done", "failed"), "failed": ("queued",)},
 )
 AUTOMATION_ACTION = StateMachine(
     "automation action",

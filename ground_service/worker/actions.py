@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from itertools import groupby
 from typing import Any
 
@@ -45,15 +42,6 @@ from ground_service.worker.upkeep import broken_limits
 log = logging.getLogger(__name__)
 
 
-LOCK = 7604
-"""Lock of the database for an event: one process at a time runs its actions, so that none runs twice."""
-
-_running: set[tuple[int, int]] = set()
-_changed = threading.Condition()
-"""Grounds and events whose actions run in this process, and the notification of changes of this set."""
-
-WAIT_S = 0.2
-
 ATTEMPTS = 3
 RETRY_NS = (0, 60_000_000_000)
 """Time from a failed attempt to the next one: at once, then after a minute."""
@@ -65,7 +53,7 @@ def run_actions(ground: Ground, event: int, *, notify: bool = False) -> dict[str
     Notifications wait for other people's computers. They are the work of a separate job, which runs this with `notify`.
     """
     due: list[AutomationAction] = []
-    with _alone(ground, event):
+    with ground.alone(f"actions of event {event}"):
         with ground.database.reading() as connection:
             actions = store.actions_of_event(connection, event)
         for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
@@ -79,32 +67,6 @@ def run_actions(ground: Ground, event: int, *, notify: bool = False) -> dict[str
     for one in after:
         counts[one.state] = counts.get(one.state, 0) + 1
     return {"event": event, **counts}
-
-
-@contextmanager
-def _alone(ground: Ground, event: int) -> Iterator[None]:
-    """Wait until no other thread or process runs actions of an event, and keep others out.
-
-    Actions cause later events only, whose actions may run inside: nobody waits for an earlier event.
-    """
-    mine = (id(ground), event)
-    with _changed:
-        while mine in _running:
-            ground.check_stopping()
-            _changed.wait(WAIT_S)
-        _running.add(mine)
-    try:
-        while True:
-            with ground.database.alone(LOCK << 40 | event) as alone:
-                if alone:
-                    yield
-                    return
-            ground.check_stopping()
-            time.sleep(WAIT_S)
-    finally:
-        with _changed:
-            _running.discard(mine)
-            _changed.notify_all()
 
 
 def _run_chain(ground: Ground, chain: list[AutomationAction], notify: bool) -> list[AutomationAction]:

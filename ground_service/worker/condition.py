@@ -131,6 +131,8 @@ def complaints(found: Condition) -> list[str]:
         said.append(f"A job has waited for {found.queue_age_s:.0f} s.")
     if found.ingest_lag_s > INGEST_LAG_LIMIT_S:
         said.append(f"An ingest has been unfinished for {found.ingest_lag_s:.0f} s.")
+    if failed := found.counts.jobs.get(("ingest", "failed")):
+        said.append(f"{failed} ingests have failed; repeat them on the overview.")
     if found.disk_free < DISK_FREE_LIMIT * found.disk_size:
         said.append(f"{found.disk_free / found.disk_size:.0%} of the disk of the archive are free.")
     if found.backup_missing:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 from ground_service.errors import PASSING
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.jobs.service import enter_job, get_job, unfinished_jobs
+from ground_service.jobs.service import get_job, unfinished_jobs
 from ground_service.settings import Settings
 from ground_service.worker.jobs import run_job
 
@@ -23,16 +21,8 @@ LONGEST_WAIT_S = 300.0
 """A job that the database or the disk stopped waits so long before it is taken up again, doubled each time."""
 
 
-class InlineDispatcher:
+class InlineDispatcher(Dispatcher):
     """Does every job at once, before `submit` returns."""
-
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        identity = enter_job(self._ground, kind, arguments, job_id=job_id)
-        self.start(identity)
-        return identity
 
     def start(self, job_id: str) -> None:
         run_job(self._ground, job_id)
@@ -41,28 +31,20 @@ class InlineDispatcher:
         for identity in unfinished_jobs(self._ground):
             run_job(self._ground, identity)
 
-    def close(self) -> None:
-        pass
 
-
-class ThreadDispatcher:
+class ThreadDispatcher(Dispatcher):
     """Does jobs one after another in a thread of this process, as a server without workers does.
 
     Notifications wait for other people's computers, and have a thread of their own.
     """
 
     def __init__(self, ground: Ground) -> None:
-        self._ground = ground
+        super().__init__(ground)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="job")
         self._senders = ThreadPoolExecutor(max_workers=1, thread_name_prefix="notification")
         self._waiting: set[str] = set()
         self._held: dict[str, tuple[float, float]] = {}
         self._lock = threading.Lock()
-
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        identity = enter_job(self._ground, kind, arguments, job_id=job_id)
-        self.start(identity)
-        return identity
 
     def start(self, job_id: str) -> None:
         with self._lock:
@@ -99,17 +81,12 @@ class ThreadDispatcher:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-class CeleryDispatcher:
+class CeleryDispatcher(Dispatcher):
     """Sends jobs to the workers over the broker."""
 
     def __init__(self, ground: Ground, settings: Settings) -> None:
-        self._ground = ground
+        super().__init__(ground)
         self._settings = settings
-
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        identity = enter_job(self._ground, kind, arguments, job_id=job_id)
-        self.start(identity)
-        return identity
 
     def start(self, job_id: str) -> None:
         """Send a job to the workers; a broker that is away gets it from `resume` later."""
@@ -142,9 +119,6 @@ class CeleryDispatcher:
         for identity in unfinished:
             if identity not in queued:
                 self.start(identity)
-
-    def close(self) -> None:
-        pass
 
 
 def dispatcher_for(ground: Ground, settings: Settings, *, inline: bool = False) -> Dispatcher:

@@ -54,7 +54,6 @@ from ground_service.worker.jobs import run_job
 log = logging.getLogger(__name__)
 
 CONSUMER = "follow-up"
-LOCK = 7603
 BATCH = 1000
 WAIT_S = 0.05
 
@@ -276,7 +275,7 @@ class FollowUp:
         with database.reading() as connection:
             last = events.last_number(connection)
         while True:
-            with self._lock, database.alone(LOCK) as alone:
+            with self._lock, database.alone("events") as alone:
                 if alone:
                     _draining().add(id(self._ground))
                     try:

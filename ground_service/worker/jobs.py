@@ -6,7 +6,6 @@ process, a thread of the server, or a worker on another machine. Doing a finishe
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -130,7 +129,7 @@ def run_job(ground: Ground, job_id: str) -> Job:
     DatabaseUnavailable, StorageFull, StorageReadOnly
         If the database is unavailable, or nothing can be written: the job has not finished and will run again.
     """
-    with _alone_here(job_id) as here, ground.database.alone(_lock_key(job_id)) as alone:
+    with _alone_here(job_id) as here, ground.database.alone(job_id) as alone:
         if not (here and alone):
             with ground.database.reading() as connection:
                 return store.get_job(connection, job_id)
@@ -220,10 +219,6 @@ def _alone_here(job_id: str) -> Iterator[bool]:
 
 _doing: set[str] = set()
 _doing_lock = threading.Lock()
-
-
-def _lock_key(job_id: str) -> int:
-    return int.from_bytes(hashlib.blake2b(job_id.encode(), digest_size=8).digest(), "big", signed=True)
 
 
 def _finish(

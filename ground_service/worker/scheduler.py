@@ -17,6 +17,7 @@ from ground_service.commanding.service import note_timeouts
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
+from ground_service.jobs.store import repeat_ingests
 from ground_service.links.supervisor import process_name
 from ground_service.memory import give_back
 from ground_service.planning.standing import needs_plan
@@ -104,6 +105,7 @@ class Scheduler:
             return False
         if self._since_utc_ns is None:
             log.info("this process does the recurring work", extra={"owner": self.owner})
+        self._do("failed ingests", self._repeat_ingests)
         self._do("unfinished jobs", self._dispatcher.resume)
         self._do("events of other processes", self._drain)
         self._do("failed actions", self._repeat_actions)
@@ -120,6 +122,10 @@ class Scheduler:
             log.warning("recurring work (%s) could not be done: %s", name, error)
         except Exception as error:  # one faulty part must not stop the others
             log.warning("recurring work (%s) could not be done: %s", name, error, exc_info=True)
+
+    def _repeat_ingests(self) -> None:
+        with self._ground.database.writing() as connection:
+            repeat_ingests(connection, utc_now_ns())
 
     def _repeat_actions(self) -> None:
         for job_id in repeat_due(self._ground):

@@ -8,6 +8,8 @@ from sqlalchemy import ColumnElement, Connection, exists, func, select
 
 from ground_service.store import repository
 
+PLANNED = ("regression", "analysis", "replay", "rendering")
+
 
 @dataclass(frozen=True, slots=True)
 class WorkCounts:
@@ -34,7 +36,8 @@ def count_work(connection: Connection) -> WorkCounts:
         {(kind, state): int(count) for kind, state, count in by_job},
         {state: int(count) for state, count in by_ingest},
         int(connection.execute(select(func.count()).select_from(passes)).scalar_one()),
-        oldest(jobs.created_utc_ns, jobs.state == "queued"),
+        # The work of regressions is planned: a verdict waits for its replays.
+        oldest(jobs.created_utc_ns, (jobs.state == "queued") & jobs.kind.not_in(PLANNED)),
         oldest(ingests.received_utc_ns, ingests.state.not_in(("done", "failed"))),
     )
 

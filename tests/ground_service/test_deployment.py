@@ -168,6 +168,14 @@ def test_every_process_has_the_same_settings() -> None:
     assert all(set(environment_of(name)) <= known for name in PROCESSES)
 
 
+def test_the_pools_of_all_processes_fit_into_the_connections_of_the_database() -> None:
+    text = (ROOT / "ground_service/store/database.py").read_text()
+    each = sum(int(re.search(rf"{name}=(\d+)", text)[1]) for name in ("pool_size", "max_overflow"))
+    processes = sum(int(default_of(str(SERVICES[name].get("scale", 1)))) for name in PROCESSES)
+    permitted = int(re.search(r"max_connections=(\d+)", (ROOT / "deploy/postgres.sh").read_text())[1])
+    assert each * processes <= permitted - 10
+
+
 def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None:
     backup = SERVICES["backup"]
     assert backup["profiles"] == ["backup"] and backup["restart"] == "no"

@@ -367,10 +367,12 @@ def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass
     # A finished ingest does not wait. The jobs of the other ages are older than the test.
     assert read_condition(either, None).ingest_lag_s == 0.0
     waiting, done = (enter_job(either, "plan", {}) for _ in range(2))
+    verdict = enter_job(either, "regression", {})  # it waits for its replays, which is no reason for a call
     run_job(either, done)
     now, jobs, ingests = utc_now_ns(), repository.JOBS, repository.INGESTS
     with either.database.writing() as connection:
         connection.execute(jobs.update().where(jobs.c.id == waiting).values(created_utc_ns=now - 1000 * S))
+        connection.execute(jobs.update().where(jobs.c.id == verdict).values(created_utc_ns=now - 9000 * S))
         connection.execute(jobs.update().where(jobs.c.id == done).values(created_utc_ns=now - 9000 * S))
         connection.execute(ingests.update().values(state="running", received_utc_ns=now - 2000 * S))
         connection.execute(repository.CORRELATIONS.delete())

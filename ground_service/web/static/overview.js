@@ -1,10 +1,22 @@
-import { finished, get, request } from "./api.js";
+import { finished, get, request, send } from "./api.js";
 import { acting, byId, element, figure, notice, parameterName, show, stateMark, table, timeText, trouble, watch } from "./page.js";
 
 const number = (label, value, note) =>
   element("div", {}, element("dt", {}, label), element("dd", { class: "number" }, value), element("dd", { class: "note" }, note));
 
 const alarmName = (alarm) => parameterName(alarm.name, alarm.unit);
+
+function repeatButton(row) {
+  const made = element("button", { type: "button", "data-needs": "operator", "aria-label": `Repeat ${row.kind} of ${timeText(row.created)}` }, "Repeat");
+  made.addEventListener(
+    "click",
+    acting(async () => {
+      await send("POST", `jobs/${row.id}/repeat`);
+      await load();
+    }),
+  );
+  return made;
+}
 
 async function load() {
   const [passes, windows, jobs, alarms] = await Promise.all([
@@ -70,6 +82,7 @@ async function load() {
         ["Entered", (row) => timeText(row.created)],
         ["State", (row) => (row.state === "running" ? element("progress", { max: 1, value: row.progress, "aria-label": row.kind }) : stateMark(row.state))],
         ["", (row) => row.error ?? ""],
+        ["", (row) => (row.state === "failed" ? repeatButton(row) : "")],
       ],
       jobs.items,
       "None.",

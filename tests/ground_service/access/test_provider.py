@@ -24,6 +24,7 @@ from ground_service.errors import Conflict, SettingsError
 from ground_service.settings import Settings, load_settings
 from ground_service.worker.upkeep import tidy
 from tests.ground_service.access.openid import CLIENT, SECRET, OpenIdProvider, running_provider
+from tests.serving import token_valid
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -228,7 +229,7 @@ def test_a_user_who_lost_the_role_loses_the_sessions_and_tokens(client, provider
     provider.claims["roles"] = []
     refused(answered(client, provider), "role")
     assert client.get("/api/v1/session").status_code == 401
-    assert not users.token_valid(client.app.state.ground, token)
+    assert not token_valid(client.app.state.ground, token)
     assert client.app.state.ground.read(list_audit, AuditFilter(action="refuse sign-in")).total == 1
 
 
@@ -386,7 +387,7 @@ def test_sign_out_ends_the_session_here_and_leads_to_the_provider(client, provid
     answered(client, provider)
     secret = client.cookies[SESSION_COOKIE]
     assert client.delete("/api/v1/session", headers=OWN).status_code == 204
-    assert not users.token_valid(client.app.state.ground, secret)
+    assert not token_valid(client.app.state.ground, secret)
     place = client.get("/sign-in/ended").headers["location"]
     assert place.startswith(f"{provider.issuer}/end?client_id=linna&")
 
@@ -418,8 +419,8 @@ def test_the_provider_ends_the_session(client, provider, change):
     bearer = users.add_token(client.app.state.ground, "ann")
     client.cookies.clear()
     assert sign_out(client, logout_token(provider, **change)) == 200
-    assert not users.token_valid(client.app.state.ground, secret)
-    assert users.token_valid(client.app.state.ground, bearer)  # made by an administrator, not by a sign-in
+    assert not token_valid(client.app.state.ground, secret)
+    assert token_valid(client.app.state.ground, bearer)  # made by an administrator, not by a sign-in
     assert client.app.state.ground.read(list_audit, AuditFilter(action="end sessions by provider")).total == 1
 
 

@@ -12,6 +12,7 @@ from ground_service.access.security import SESSION_COOKIE
 from ground_service.app import create_app
 from ground_service.settings import Settings
 from ground_service.store import repository
+from tests.serving import token_valid
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -59,7 +60,7 @@ def test_a_session_ends_when_its_user_is_disabled_and_stays_ended(client: TestCl
     assert client.get("/api/v1/session").status_code == 401
     users.change_user(ground, "ann", state="active")
     assert client.get("/api/v1/session").status_code == 401
-    assert users.token_valid(ground, token)  # tokens of programs are valid again
+    assert token_valid(ground, token)  # tokens of programs are valid again
 
 
 def test_sign_out_ends_the_session_and_not_the_token(client: TestClient, token: str) -> None:

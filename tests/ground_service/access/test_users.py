@@ -21,11 +21,11 @@ from ground_service.access.service import (
     renew_token,
     revoke_token,
     token_sha256,
-    token_valid,
 )
 from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
 from ground_service.ground import Ground, open_ground
+from tests.serving import token_valid
 
 SECRET = "a-token-of-a-deployment-0123456789"
 

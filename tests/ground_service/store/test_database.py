@@ -227,3 +227,14 @@ def test_sqlite_can_be_opened_by_anything_else(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / "linna.db") as connection:
         connection.execute("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')")
     connection.close()
+
+
+def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(
+    new_postgres_database: Callable[[], str],
+) -> None:
+    url = new_postgres_database()
+    for unsafe in ("local", "remote_write", "off"):
+        database = open_database(f"{url}?options=-csynchronous_commit%3D{unsafe}")
+        with database.reading() as connection:
+            assert connection.execute(text("SHOW synchronous_commit")).scalar() == "on"
+        database.engine.dispose()

@@ -5,8 +5,9 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from ground_service.access.service import add_user, list_tokens, list_users, token_valid
+from ground_service.access.service import add_user, list_tokens, list_users
 from ground_service.ground import open_ground
+from tests.serving import token_valid
 
 
 @pytest.fixture(scope="module")

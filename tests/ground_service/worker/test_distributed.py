@@ -33,7 +33,7 @@ from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import app as app_module
 from ground_service.worker.app import queued_jobs, run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
-from ground_service.worker.jobs import _lock_key, run_job
+from ground_service.worker.jobs import run_job
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.schema import described_schema
 from tests.serving import wait_for
@@ -183,8 +183,7 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     with redis.Redis.from_url(redis_url) as broker:
         broker.delete(*broker.scan_iter())
     assert queued_jobs(settings) == []
-    key = _lock_key(lost)
-    with ground.database.alone(key) as mine, ground.database.alone(key) as second:
+    with ground.database.alone(lost) as mine, ground.database.alone(lost) as second:
         assert (mine, second) == (True, False)
         assert run_job(ground, lost).state == "queued"
     dispatcher.submit("report", {"pass_id": 4713})  # the queue is in use again

@@ -8,6 +8,9 @@ from typing import Any
 
 import pytest
 
+from ground_service.client.local import local_client
+from ground_service.client.problems import Conflict as ClientConflict
+from ground_service.clock import utc_now_ns
 from ground_service.errors import (
     Conflict,
     DatabaseUnavailable,
@@ -23,7 +26,10 @@ from ground_service.jobs.service import add_job, enter_job, unfinished_jobs
 from ground_service.store import repository
 from ground_service.store.states import JOB, move
 from ground_service.worker import jobs
+from ground_service.worker.condition import complaints, read_condition
+from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.jobs import run_job
+from ground_service.worker.scheduler import Scheduler
 
 Row = dict[str, Any]
 
@@ -69,6 +75,45 @@ def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
         row = run_job(ground, job)
     assert (row.state, row.error, row.attempts, len(tries)) == ("failed", shown, 1, 1)
     assert unfinished_jobs(ground) == []
+
+
+def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
+    either: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was acknowledged is done when its cause is gone, at most 85 minutes later without anybody."""
+    causes, waits_min = [FileNotFoundError("gone")] * 5, (1, 4, 16, 64)
+
+    def work(*_: Any) -> Row:
+        if causes:
+            raise causes.pop()
+        return {}
+
+    monkeypatch.setitem(jobs.WORK, "ingest", work)
+    monkeypatch.setitem(jobs.WORK, "report", work)
+    job, other = (enter_job(either, kind, {"pass_id": 1, "ingest_id": 1}) for kind in ("ingest", "report"))
+    scheduler = Scheduler(either, InlineDispatcher(either), lambda: None, {"retention_days": 90})
+    assert run_job(either, other).state == run_job(either, job).state == "failed"
+    condition = read_condition(either, None)
+    assert "1 ingests have failed; repeat them on the overview." in complaints(condition)
+    for attempt, minutes in enumerate(waits_min, start=1):
+        for passed_min, attempts in ((minutes - 0.5, attempt), (minutes, attempt + 1)):
+            since = utc_now_ns() - int(passed_min * 60e9)
+            with either.database.writing() as connection:
+                connection.execute(repository.JOBS.update().values(finished_utc_ns=since))
+            scheduler.tick()
+            assert row_of(either, job)["attempts"] == attempts
+    assert (row_of(either, job)["state"], row_of(either, other)["attempts"]) == ("done", 1)
+
+
+def test_a_failed_job_is_repeated_by_one_action(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+    assert run_job(ground, job).state == "failed"
+    monkeypatch.setitem(jobs.WORK, "nightly", lambda *_: {"repeated": True})
+    with local_client(ground, "ann") as client:
+        assert client.repeat_job(job).result == {"repeated": True}
+        with pytest.raises(ClientConflict, match="expected state failed, found done"):
+            client.repeat_job(job)
+        assert next(iter(client.list_audit(action="repeat job"))).actor == "ann"
 
 
 def test_the_traceback_of_an_unexpected_error_is_in_the_log(

@@ -22,6 +22,7 @@ from ground_service.store import repository
 from ground_service.store.events import publish
 from ground_service.worker.jobs import run_job
 from ground_service.worker.upkeep import nightly_job_id, tidy
+from tests.serving import token_valid
 from tmtc.dictionary import DICTIONARY
 
 DAY_NS = 86_400_000_000_000
@@ -103,7 +104,7 @@ def test_expired_sessions_are_deleted_and_tokens_are_kept(
     assert tidy(ground, 90)["sessions"] == 0
     # The expired token of the user remains listed; the new session and its token are in force.
     assert len(tokens) == 4 and len({one.id for one in users.list_tokens(ground)}) == 3
-    assert users.token_valid(ground, new) and not users.token_valid(ground, old)
+    assert token_valid(ground, new) and not token_valid(ground, old)
 
 
 def test_answers_are_kept_until_telemetry_is_new(
