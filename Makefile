@@ -83,6 +83,7 @@ release: docs
 	rm -rf dist/release
 	mkdir -p dist/release build
 	SOURCE_DATE_EPOCH="$$(git log -1 --format=%ct)" $(BIN)/python -m build --outdir dist/release
+	SOURCE_DATE_EPOCH="$$(git log -1 --format=%ct)" sh deploy/reproducible.sh dist/release/*.tar.gz
 	cat $(SHIPPED) | grep -v '^#' | sort -u > build/shipped.txt
 	$(BIN)/python -m cyclonedx_py requirements build/shipped.txt --pyproject pyproject.toml --of JSON -o dist/release/linna.cdx.json
 	$(BIN)/python deploy/licences.py $(SHIPPED) > dist/release/licences.txt

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shutil
 import subprocess
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -138,3 +140,24 @@ def test_make_release_builds_lists_and_signs() -> None:
         "LINNA_RELEASE_KEY",
     ):
         assert word in rule, word
+
+
+def test_a_source_distribution_has_the_same_octets_whenever_and_wherever_it_is_packed(tmp_path: Path) -> None:
+    made = []
+    for k in range(2):
+        folder = tmp_path / str(k)
+        (folder / "linna-0.1.0").mkdir(parents=True)
+        for name in ("b", "a")[:: 1 - 2 * k]:
+            (folder / "linna-0.1.0" / name).write_text(name)
+            (folder / "linna-0.1.0" / name).chmod(0o600 + 0o44 * k)
+            os.utime(folder / "linna-0.1.0" / name, (k, k))
+        shutil.make_archive(str(folder / "sdist"), "gztar", folder, "linna-0.1.0")
+        path = folder / "sdist.tar.gz"
+        command = ["sh", str(ROOT / "deploy/reproducible.sh"), str(path)]
+        subprocess.run(
+            command, check=True, env={"PATH": os.environ["PATH"], "SOURCE_DATE_EPOCH": "1700000000"}
+        )
+        made.append(path.read_bytes())
+    assert made[0] == made[1]
+    with tarfile.open(tmp_path / "0/sdist.tar.gz") as archive:
+        assert archive.getnames() == ["linna-0.1.0", "linna-0.1.0/a", "linna-0.1.0/b"]
