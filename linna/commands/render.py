@@ -29,18 +29,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "--sheet", bool, "a contact sheet of several frames")
     option(parser, "--views N", int, f"frames of a sheet (default: {SHEET_VIEWS})", default=SHEET_VIEWS)
     option(parser, "--draw-labels", bool, "draw the labels: cyan, lime, yellow by class (paper, Fig. 5)")
-    option(
-        parser,
-        "--label-rule",
-        ("exact", "paper"),
-        "exact rims, or the paper's local equirectangular map",
-        "exact",
-    )
     option(parser, "--terrain", TERRAINS, "instead of the scenario's")
     option(parser, "--photometry", LAWS, "instead of the scenario's; matt is the paper's Principled BSDF")
-    option(parser, "--tilt DEG", float, "from nadir toward image up, instead of the scenario's")
-    option(parser, "--yaw DEG", float, "azimuth of image up, instead of the scenario's")
-    option(parser, "--bits", int, "of the sensor, instead of the scenario's", choices=(8, 12, 16))
     finish(parser, run_render)
 
 
@@ -53,8 +43,6 @@ def run_render(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--out: expected an existing folder, found {arguments.out.parent}")
     if not 1 <= arguments.views <= 60:
         raise UsageError(f"--views: expected 1 to 60 frames, found {arguments.views}")
-    if arguments.tilt is not None and not abs(arguments.tilt) <= 60.0:
-        raise UsageError(f"--tilt: expected -60 to 60 degrees, found {arguments.tilt:g}")
     if arguments.sheet:
         return _run_sheet(arguments)
     if len(arguments.epoch) != 1:
@@ -74,7 +62,6 @@ def _run_frame(arguments: argparse.Namespace) -> int:
         parse_utc(arguments.epoch[0]),
         arguments.renderer,
         blender_python(),
-        arguments.label_rule,
     )
     save_png(draw_labels(frame.image, frame.labels) if arguments.draw_labels else frame.image, arguments.out)
     figures: dict[str, Any] = {
@@ -106,7 +93,7 @@ def _run_sheet(arguments: argparse.Namespace) -> int:
     world, epochs = _views(arguments)
     views = [view_at(world, utc_ns) for utc_ns in epochs]
     frames = [
-        take_frame(world, view, arguments.renderer, blender_python(), arguments.label_rule)
+        take_frame(world, view, arguments.renderer, blender_python())
         for view in progress(views, len(views), "render", "frames")
     ]
     pictures = [
@@ -135,8 +122,6 @@ def _scenario(arguments: argparse.Namespace) -> Any:
     replaced = {
         "terrain": {"source": arguments.terrain},
         "light": {"photometry": arguments.photometry},
-        "camera": {"tilt_deg": arguments.tilt, "yaw_deg": arguments.yaw},
-        "sensor": {"bits": arguments.bits},
     }
     sections = {
         name: dataclasses.replace(

@@ -25,7 +25,7 @@ from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.orbit.truth import require_above_ground
 from payload_emulator.sim.render import raymarch, renderer
 from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_scene
-from payload_emulator.sim.render.labels import Labels, label_frame, label_frame_as_the_paper
+from payload_emulator.sim.render.labels import Labels, label_frame
 from payload_emulator.sim.render.light import sun_angles
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.renderer import Rendering
@@ -76,7 +76,6 @@ def render_frame(
     utc_ns: int,
     renderer_name: str = "fast",
     blender_python: str = sys.executable,
-    label_rule: str = "exact",
 ) -> Frame:
     """The picture that the scenario's camera takes at an epoch, whatever the scenario's windows are.
 
@@ -89,7 +88,7 @@ def render_frame(
     """
     require_renderer(renderer_name)
     world = world_at(scenario, data, [utc_ns])
-    return take_frame(world, view_at(world, utc_ns), renderer_name, blender_python, label_rule)
+    return take_frame(world, view_at(world, utc_ns), renderer_name, blender_python)
 
 
 def require_renderer(name: str) -> None:
@@ -159,15 +158,8 @@ def take_frame(
     view: View,
     renderer_name: str = "fast",
     blender_python: str = sys.executable,
-    label_rule: str = "exact",
 ) -> Frame:
-    """The frame of a view: rendered, exposed, labelled.
-
-    Raises
-    ------
-    ScenarioError
-        The paper's labels were asked for of a camera that does not look straight down, image up to the north.
-    """
+    """The frame of a view: rendered, exposed, labelled."""
     pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
     law, filmic_png = Photometry(world.scenario.light.photometry), b""
     if renderer_name == "cycles":
@@ -179,30 +171,15 @@ def take_frame(
         rendering = {"fast": renderer.render, "raymarch": raymarch.render}[renderer_name](*pose, law)
     # The noise is drawn from a separate stream: light and noise of a view do not depend on each other.
     rng = np.random.default_rng((world.scenario.seed, view.utc_ns, 1))
-    metadata = metadata_of(world, view) | {"renderer": renderer_name, "label_rule": label_rule}
+    metadata = metadata_of(world, view) | {"renderer": renderer_name}
+    labels = label_frame(world.terrain, *pose[1:4], lit=rendering.lit, range_m=rendering.range_m)
     return Frame(
         take_picture(rendering.radiance, world.scenario.sensor, rng),
         metadata,
-        _label_rows(_labels(world, view, rendering, label_rule), world.terrain.catalogue.ids),
+        _label_rows(labels, world.terrain.catalogue.ids),
         world.data_names,
         rendering,
         filmic_png,
-    )
-
-
-def _labels(world: World, view: View, rendering: Rendering, rule: str) -> Labels:
-    lit, range_m = rendering.lit, rendering.range_m
-    if rule == "exact":
-        pose = (world.true_camera, view.position_mcmf_m, view.camera_from_mcmf)
-        return label_frame(world.terrain, *pose, lit=lit, range_m=range_m)
-    section = world.scenario.camera
-    if section.tilt_deg or section.yaw_deg:
-        raise ScenarioError(
-            "labels: expected a nadir camera with image up to the north for the paper's labels, found tilt "
-            f"{section.tilt_deg:g} deg and yaw {section.yaw_deg:g} deg"
-        )
-    return label_frame_as_the_paper(
-        world.terrain, world.camera, view.position_mcmf_m, lit=lit, range_m=range_m
     )
 
 

@@ -11,7 +11,7 @@ Errors that are common to a frame or last over many frames are parameters of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -147,15 +147,7 @@ class Sighting:
         return int(self.index.shape[0])
 
     def select(self, which: BoolArray | IntArray) -> Sighting:
-        return Sighting(
-            self.index[which],
-            self.uv_px[which],
-            self.diameter_px[which],
-            self.by_position[which],
-            self.by_attitude[which],
-            self.by_offset[which],
-            self.by_scale[which],
-        )
+        return Sighting(*(getattr(self, one.name)[which] for one in fields(self)))
 
 
 def in_view(landmarks: LandmarkMap, pose: Pose, camera: PinholeCamera, margin_px: float) -> Sighting:

@@ -5,7 +5,7 @@ Pixel centres lie at integer coordinates, u to the right, v down.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -59,17 +59,9 @@ class Detections:
 
     def select(self, which: NDArray[Any]) -> Detections:
         """Return the detections of a mask or of indices, in that order."""
-        return Detections(
-            self.u_px[which],
-            self.v_px[which],
-            self.diameter_px[which],
-            self.score[which],
-            self.sigma_px[which],
-            *(
-                None if values is None else values[which]
-                for values in (self.depth_ratio, self.size_class, self.diameter_m, self.persistence)
-            ),
-        )
+        columns = (getattr(self, one.name) for one in fields(self))
+        chosen: list[Any] = [None if values is None else values[which] for values in columns]
+        return Detections(*chosen)
 
     def with_prior_sizes(self, depth_m: FloatArray, focal_px: float) -> Detections:
         """Return the detections with apparent diameters of their priors at a depth (n,) along the boresight."""

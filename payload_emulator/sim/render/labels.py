@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf, project_mcmf
+from lunar.camera import PinholeCamera, project_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
@@ -189,53 +189,6 @@ def project_craters(
             else _sight_fraction(rim_uv, within, distance, range_m)
         ),
     )
-
-
-def label_frame_as_the_paper(
-    terrain: Terrain,
-    camera: PinholeCamera,
-    position_mcmf_m: npt.ArrayLike,
-    lit: npt.NDArray[np.float32] | None = None,
-    range_m: npt.NDArray[np.float32] | None = None,
-) -> Labels:
-    """The labels of a nadir picture with image up to the north, moved to where the paper's local map puts them.
-
-    What is known of visibility and light stays that of the true place.
-    """
-    position = np.asarray(position_mcmf_m, dtype=np.float64)
-    rotation = nadir_camera_from_mcmf(position)
-    exact = label_frame(terrain, camera, position, rotation, lit=lit, range_m=range_m)
-    u, v, diameter = project_as_the_paper(terrain.catalogue.select(exact.index), camera, position)
-    inside = camera.contains(np.stack([u, v], axis=-1))
-    return replace(
-        exact,
-        u_px=u,
-        v_px=v,
-        diameter_px=diameter,
-        major_px=diameter,
-        minor_px=diameter,
-        angle_rad=np.zeros(len(exact)),
-        inside=inside,
-    )
-
-
-def project_as_the_paper(
-    catalogue: CraterCatalogue, camera: PinholeCamera, position_mcmf_m: npt.ArrayLike
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixel coordinates u, v and diameters (n) by the paper's local equirectangular map on a smooth sphere.
-
-    For a nadir camera with image up to the north: no relief, no curvature, one scale for the whole picture.  Kept to
-    measure what those simplifications cost; `project_craters` is the exact geometry.
-    """
-    latitude, longitude, altitude = (
-        float(value) for value in spherical_from_mcmf(np.asarray(position_mcmf_m))
-    )
-    turn = 2.0 * math.pi
-    east = (catalogue.longitude_rad - longitude + math.pi) % turn - math.pi
-    scale = camera.focal_px * MOON_RADIUS_M / altitude
-    u = camera.centre_px[0] + scale * math.cos(latitude) * east
-    v = camera.centre_px[1] - scale * (catalogue.latitude_rad - latitude)
-    return u, v, camera.focal_px * catalogue.diameter_m / altitude
 
 
 def _rim_points(

@@ -20,8 +20,6 @@ from payload_emulator.training.evaluate.scoring import FrameDetections, Tally, t
 
 FEWEST_PAIRS = 20
 """A mean error of fewer craters says nothing to a quarter of a pixel: one of them may be two pixels off."""
-
-_BIAS_CELLS = 4  # per side of the bias map: finer cells hold too few craters for a tenth of a pixel
 _ROUNDS = 400
 _ALTERNATIONS = 12
 
@@ -118,10 +116,8 @@ def _resampled_means(errors: FloatArray, frame: IntArray) -> FloatArray:
     return means
 
 
-def without_registration(
-    tallied: Tally, threshold: float, m_per_px: FloatArray
-) -> tuple[Tally, list[dict[str, float | int]]]:
-    """A tally whose errors lack the displacement of the catalogue from the ground, and that displacement by block.
+def without_registration(tallied: Tally, threshold: float, m_per_px: FloatArray) -> Tally:
+    """A tally whose errors lack the displacement of the catalogue from the ground.
 
     Terrain and catalogue differ by tens of metres that are the same for all frames of a block of ground, whatever the
     Sun. Their mean over the block is estimated together with the means of the octants, whose own mean is taken as zero:
@@ -149,47 +145,8 @@ def without_registration(
             octants[:, axis] = np.bincount(octant, weights=rest[:, axis], minlength=8) / count
         octants -= octants[np.bincount(octant, minlength=8) > 0].mean(axis=0) if used.size else 0.0
     moved = error - offset[place] * step[:, None]
-    rows: list[dict[str, float | int]] = [
-        {
-            "block": int(blocks[k]),
-            "pairs": int(pairs[k]),
-            "east_m": float(offset[k, 0]),
-            "north_m": float(-offset[k, 1]),
-        }
-        for k in np.flatnonzero(pairs >= 2 * FEWEST_PAIRS)
-    ]
     left = replace(tallied, error_u=moved[:, 0], error_v=moved[:, 1])
-    return left.select(judged, np.ones(tallied.crater_id.size, dtype=bool)), rows
-
-
-def bias_map(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> list[dict[str, Any]]:
-    """Mean signed error in cells of the image, row by row from the top left."""
-    found = right(tallied, threshold)
-    width, height = truths[0].width_px, truths[0].height_px
-    column = np.clip(tallied.detection_u * _BIAS_CELLS // width, 0, _BIAS_CELLS - 1)
-    row = np.clip(tallied.detection_v * _BIAS_CELLS // height, 0, _BIAS_CELLS - 1)
-    return [
-        {
-            "u_px": (j + 0.5) * width / _BIAS_CELLS - 0.5,
-            "v_px": (i + 0.5) * height / _BIAS_CELLS - 0.5,
-            **_mean_error(tallied, found & (row == i) & (column == j)),
-        }
-        for i in range(_BIAS_CELLS)
-        for j in range(_BIAS_CELLS)
-    ]
-
-
-def _mean_error(tallied: Tally, chosen: BoolArray) -> dict[str, float | int]:
-    count = int(chosen.sum())
-    if not count:
-        nan = float("nan")
-        return {"pairs": 0, "du_px": nan, "dv_px": nan, "standard_error_px": nan}
-    return {
-        "pairs": count,
-        "du_px": float(np.mean(tallied.error_u[chosen])),
-        "dv_px": float(np.mean(tallied.error_v[chosen])),
-        "standard_error_px": float(np.std(tallied.error_u[chosen]) / np.sqrt(count)),
-    }
+    return left.select(judged, np.ones(tallied.crater_id.size, dtype=bool))
 
 
 def radial_scale(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> dict[str, float]:

@@ -16,7 +16,6 @@ from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.data.visibility import VISIBILITY_EDGES, VISIBLE
 from payload_emulator.training.evaluate.localisation import (
     bias_by_octant,
-    bias_map,
     bias_overall,
     middle,
     radial_scale,
@@ -41,7 +40,6 @@ LOWLAND_M = -1_000.0
 _ALTITUDE_EDGES_KM = (12.0, 20.0, 30.0, 40.0, 50.0)
 _ELEVATION_EDGES_DEG = (3.0, 6.0, 9.0, 12.0, 15.0, 30.0, 60.0)
 _RADIUS_EDGES_PX = (0.0, 90.0, 150.0, 210.0, 270.0, 370.0)
-_DIAMETER_EDGES_PX = (10.0, 16.0, 24.0, 32.0, 48.0, 96.0, 400.0)
 _CLEAR_DEPTH_RATIOS = (0.06, 0.10)
 _CURVE_THRESHOLDS = tuple(round(0.10 + 0.05 * k, 2) for k in range(17))
 RADIUS_RULE = MatchRule(radii=0.5)
@@ -101,7 +99,6 @@ def score(
         "micro": _with_interval(strict, threshold),
         "micro_half_radius": strict_radius.figures(threshold).to_dict(),
         "ignore_aware": _with_interval(fair, threshold),
-        "ignore_aware_half_radius": fair_radius.figures(threshold).to_dict(),
         "strict_3_to_30_km": wide.figures(threshold).to_dict(),
         "ignore_aware_3_to_30_km": wide_fair.figures(threshold).to_dict(),
         "average_precision_half_radius": _average_precisions(truths, found, strict_radius, fair_radius),
@@ -117,9 +114,6 @@ def score(
             | {"ignore_aware": _recall_above(fair, low, threshold)}
             for low in _CLEAR_DEPTH_RATIOS
         ],
-        "recall_by_diameter_px": _recall_by(
-            fair, fair.crater_diameter_px, _DIAMETER_EDGES_PX, threshold, "diameter_px"
-        ),
         "degradation_state": _state(fair, threshold),
         "by_altitude_km": _by_frame(
             pair, threshold, np.array([s.altitude_km for s in scenes]), _ALTITUDE_EDGES_KM
@@ -141,7 +135,6 @@ def score(
         "bias_px_by_sun_octant": octants,
         "bias_px": bias_overall(strict, threshold, truths, octants),
         **_registered_bias(strict, threshold, truths, scenes),
-        "bias_map": bias_map(strict, threshold, truths),
         "radial_scale": radial_scale(fair, threshold, truths),
         "sigma_calibration": {
             **_calibration(fair, threshold),
@@ -199,13 +192,10 @@ def _class(
 ) -> dict[str, Any]:
     strict = tally(truths, found, classes=(k,))
     fair = tally(truths, found, classes=(k,), ignore_aware=True)
-    near = tally(truths, found, classes=(k,), rule=RADIUS_RULE).figures(threshold)
     return {
         **_with_interval(strict, threshold),
         "size_class": k,
         "ignore_aware": fair.figures(threshold).to_dict(),
-        "precision_half_radius": near.precision,
-        "recall_half_radius": near.recall,
         "paper": PAPER_TABLE_2[k] if k < 3 else None,
     }
 
@@ -250,12 +240,11 @@ def _registered_bias(
     m_per_px = np.array([scene.m_per_px for scene in scenes])
     if not np.isfinite(m_per_px).all():
         return {}
-    moved, registration = without_registration(strict, threshold, m_per_px)
+    moved = without_registration(strict, threshold, m_per_px)
     octants = bias_by_octant(moved, threshold, truths)
     return {
         "bias_px_by_sun_octant_registered": octants,
         "bias_px_registered": bias_overall(moved, threshold, truths, octants),
-        "registration_m": registration,
     }
 
 
@@ -390,7 +379,6 @@ def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
         "states": ["degraded", "worn", "fresh"],
         "confusion": table.tolist(),
         "agreement": float(np.trace(table) / count) if count else float("nan"),
-        "fresh_called_degraded": float(table[2, 0] / max(table[2].sum(), 1)),
         "depth_ratio_median_error": float(np.median(np.abs(said - true))) if count else float("nan"),
         "craters": count,
     }

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -98,14 +98,7 @@ class Pairs:
     crater: IntArray
 
     def select(self, which: BoolArray) -> Pairs:
-        return Pairs(
-            self.error_px[which],
-            self.features[which],
-            self.directions[which],
-            self.ground_m_per_px[which],
-            self.place[which],
-            self.crater[which],
-        )
+        return Pairs(*(getattr(self, one.name)[which] for one in fields(self)))
 
 
 def plain_model(model_octets: bytes) -> bytes:
@@ -250,16 +243,9 @@ def _thresholds(
 
 
 def _ordered(part: FrameDetections, order: IntArray) -> FrameDetections:
-    return FrameDetections(
-        part.u_px[order],
-        part.v_px[order],
-        part.diameter_px[order],
-        part.diameter_m[order],
-        part.score[order],
-        part.sigma_px[order],
-        None if part.depth_ratio is None else part.depth_ratio[order],
-        None if part.size_class is None else part.size_class[order],
-    )
+    columns = (getattr(part, one.name) for one in fields(part))
+    ordered: list[Any] = [None if values is None else values[order] for values in columns]
+    return FrameDetections(*ordered)
 
 
 def _pairs(

@@ -4,7 +4,7 @@ Two threads of one process, each with its own replica on half of the batch, trai
 replica on two OpenMP threads: the network's operations are too small to be split, and waiting threads spin.
 `set_environment` must have been called before torch is imported for the allocator settings to count.
 
-Files of a run: checkpoint.pt (last state, resumable), best.pt (weights of the best validation), curves.csv, curves.png,
+Files of a run: checkpoint.pt (last state, resumable), best.pt (weights of the best validation), curves.csv,
 run.json (settings and provenance).
 """
 
@@ -31,7 +31,7 @@ from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.data.landmarks import Landmarks, with_landmarks
 from payload_emulator.training.data.refits import RefittedRims, refitted_frame
-from payload_emulator.training.model.curves import append_curve, draw_curves
+from payload_emulator.training.model.curves import append_curve
 
 if TYPE_CHECKING:
     from payload_emulator.training.model.model import ModelConfig
@@ -113,7 +113,6 @@ def train(
         learns_blindly=not validation, report=report,
     )  # fmt: skip
     files.save(state, {})
-    draw_curves(run)
     return {
         "best": {"f1": state.best_f1, "step": state.best_step},
         "steps": state.step,

@@ -10,8 +10,6 @@ from lunar.frames import axis_rotation, mcmf_from_spherical
 from payload_emulator.sim.render import raymarch
 from payload_emulator.sim.render.labels import (
     label_frame,
-    label_frame_as_the_paper,
-    project_as_the_paper,
     project_craters,
 )
 from payload_emulator.sim.render.light import sun_direction_mcmf
@@ -143,22 +141,6 @@ def test_frame_labels_point_into_the_terrains_catalogue(procedural):
     assert np.isfinite(measured.rim_height_m).all()
 
 
-def test_the_papers_labels_agree_below_the_camera_and_drift_off_toward_the_edge():
-    position = mcmf_from_spherical(0.0, 0.0, 40e3)
-    rotation = nadir_camera_from_mcmf(position)
-    offset = np.degrees(np.array([1e3, 60e3]) / MOON_RADIUS_M)
-    catalogue = make_catalogue(
-        [0.0, 0.0], np.radians(offset), [5000.0, 5000.0], source="t", rim_height_m=[0.0, 0.0]
-    )
-    exact = project_craters(catalogue, CAMERA, position, rotation)
-    u, v, _ = project_as_the_paper(catalogue, CAMERA, position)
-    assert u[0] == pytest.approx(exact.u_px[0], abs=0.01)
-    assert v == pytest.approx(exact.v_px, abs=0.01)
-    # At 60 km the Moon has fallen by 1036 m below the plane that the paper's map lies in: u is short by 1036 / 41036.
-    flat = CAMERA.focal_px * 60.0 / 40.0
-    assert u[1] - exact.u_px[1] == pytest.approx(flat * 1036.0 / 41036.0, rel=0.03)
-
-
 def test_ground_in_front_of_a_rim_takes_it_out_of_sight():
     position = mcmf_from_spherical(0.0, 0.0, 20e3)
     rotation = nadir_camera_from_mcmf(position)
@@ -173,17 +155,6 @@ def test_ground_in_front_of_a_rim_takes_it_out_of_sight():
     # 24 rim points; one or two lie on the line between the halves.
     assert seen[0] == 1.0 and seen[1] == pytest.approx(0.5, abs=0.09) and seen[2] == 0.0
     assert math.isnan(project_craters(catalogue, CAMERA, position, rotation).sight_fraction[0])
-
-
-def test_the_papers_labels_of_a_frame_name_the_same_craters_elsewhere(procedural):
-    position = mcmf_from_spherical(math.radians(10.0), math.radians(20.0), 30e3)
-    exact = label_frame(procedural, CAMERA, position, nadir_camera_from_mcmf(position))
-    flat = label_frame_as_the_paper(procedural, CAMERA, position)
-    np.testing.assert_array_equal(exact.index, flat.index)
-    off = np.hypot(exact.u_px - flat.u_px, exact.v_px - flat.v_px)[exact.inside]
-    # Relief and curvature at 120 degrees: pixels, not fractions of one.
-    assert 1.0 < np.median(off) < 30.0
-    np.testing.assert_array_equal(flat.major_px, flat.minor_px)
 
 
 def test_the_ellipse_of_a_crater_at_the_edge_is_that_of_perspective():

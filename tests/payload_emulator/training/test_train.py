@@ -46,7 +46,6 @@ def test_a_run_leaves_checkpoints_curves_and_provenance(finished):
         "checkpoint.pt",
         "best.pt",
         "curves.csv",
-        "curves.png",
         "run.json",
     }
     document = json.loads((run / "run.json").read_text())
