@@ -211,7 +211,8 @@ def open_database(url: str) -> Database:
             json_serializer=_json_text,
         )
         event.listen(engine, "handle_error", _refuse_values)
-        event.listen(engine, "connect", _prepare_postgresql)
+        # Before SQLAlchemy reads texts, which another encoding returns as octets.
+        event.listen(engine, "connect", _prepare_postgresql, insert=True)
         event.listen(engine, "checkin", _note_use)
         event.listen(engine, "checkout", functools.partial(_test_idle, engine))
         return Database(engine)
@@ -402,6 +403,10 @@ def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
 
 def _prepare_postgresql(connection: Any, _record: object) -> None:
     """Request durable commits."""
+    encoding = connection.info.parameter_status("server_encoding")
+    if encoding != "UTF8":
+        reason = f"expected a database with the encoding UTF8, found {encoding}"
+        raise DatabaseUnavailable(f"{connection.info.host}/{connection.info.dbname}", reason)
     with connection.cursor() as cursor:
         cursor.execute("SHOW synchronous_commit")
         if cursor.fetchone()[0] not in SAFE_COMMITS:

@@ -107,16 +107,23 @@ def restore(folder: Path, ground: Ground) -> dict[str, Any]:
     if filled is not None:
         raise Conflict(f"{ground.database.label}: expected an empty service, found rows in {filled}")
     try:
-        with _upgraded(folder, manifest) as source, source.snapshot() as connection:
-            names = file_names(connection)
-            for sha256 in names:
-                _check_file(FileArchive(folder / FILES), sha256)
+        with checked(folder) as (connection, names):
             for sha256 in names:
                 _copy_file(FileArchive(folder / FILES), ground.files, sha256)
             _copy_rows(connection, ground.database)
     except OSError as error:
         raise storage_error(error, ground.home) from None
     return manifest
+
+
+@contextmanager
+def checked(folder: Path) -> Iterator[tuple[Connection, list[str]]]:
+    """Yield the database of a backup and the names of its files, all of them checked; raises as `restore`."""
+    with _upgraded(folder, _manifest(folder)) as source, source.snapshot() as connection:
+        names = file_names(connection)
+        for sha256 in names:
+            _check_file(FileArchive(folder / FILES), sha256)
+        yield connection, names
 
 
 @contextmanager

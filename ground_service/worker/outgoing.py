@@ -10,6 +10,7 @@ import asyncio
 import ipaddress
 import smtplib
 import socket
+import ssl
 import threading
 from collections.abc import Mapping, Sequence
 from email.message import EmailMessage
@@ -100,12 +101,12 @@ def post(
 
 
 def send_mail(server: str, message: EmailMessage, networks: Sequence[Network], deadline_s: float) -> None:
-    """Send a message over a mail server HOST:PORT.
+    """Send a message over a mail server HOST:PORT, encrypted if the server offers it (STARTTLS).
 
     Raises
     ------
     NotDelivered
-        If the address is not permitted, or the server refuses the message.
+        If the address is not permitted, is public and offers no encryption, or the server refuses the message.
     Unreachable
         If the server does not take it in time.
     """
@@ -122,6 +123,12 @@ def send_mail(server: str, message: EmailMessage, networks: Sequence[Network], d
     clock.start()
     try:
         client.connect(address, int(port))
+        client.ehlo()
+        if client.has_extn("starttls"):
+            client._host = host  # type: ignore[attr-defined]  # the name in its certificate
+            client.starttls(context=ssl.create_default_context())
+        elif ipaddress.ip_address(address).is_global:
+            raise NotDelivered(f"{host}: expected a mail server with STARTTLS, found one without")
         client.send_message(message)
         client.quit()
     except smtplib.SMTPResponseException as error:

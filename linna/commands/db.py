@@ -167,8 +167,10 @@ def run_backup(arguments: argparse.Namespace) -> int:
 
 
 def run_restore(arguments: argparse.Namespace) -> int:
-    from ground_service.worker.backup import restore
+    from ground_service.worker.backup import checked, restore
 
+    with checked(arguments.folder):
+        pass  # before a database is made for it
     with open_service(arguments) as ground:
         manifest = restore(arguments.folder, ground)
         label = ground.database.label

@@ -238,3 +238,16 @@ def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(
         with database.reading() as connection:
             assert connection.execute(text("SHOW synchronous_commit")).scalar() == "on"
         database.engine.dispose()
+
+
+def test_a_database_of_another_encoding_is_refused_in_one_line(
+    new_postgres_database: Callable[[], str],
+) -> None:
+    """Its texts come back as octets."""
+    url = new_postgres_database()
+    engine = open_database(url).engine.execution_options(isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text("CREATE DATABASE octets ENCODING 'SQL_ASCII' LOCALE 'C' TEMPLATE template0"))
+    engine.dispose()
+    with pytest.raises(DatabaseUnavailable, match=r"octets: .* encoding UTF8, found SQL_ASCII$"):
+        prepare_database(url.rpartition("/")[0] + "/octets", upgrade=True)

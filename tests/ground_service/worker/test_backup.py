@@ -23,6 +23,7 @@ from ground_service.store.models import METADATA
 from ground_service.store.rows import table_digests
 from ground_service.worker.backup import backup, restore
 from ground_service.worker.integrity import verify
+from linna import cli
 
 NS = 1_000_000_000
 START = 2_000_000_000 * NS
@@ -123,6 +124,15 @@ def test_a_changed_row_of_a_backup_is_not_restored(
         with pytest.raises(InvalidInput, match=re.escape(reason)):
             restore(saved, other)
         assert rows_of_an_empty_service(other)
+
+
+def test_a_restore_that_is_refused_makes_no_database(
+    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    next(path for path in (saved / "files").rglob("*") if path.is_file()).write_bytes(b"changed")
+    assert cli.run(["db", "restore", str(saved), "--home", str(tmp_path / "new")]) == 2
+    assert "expected octets with SHA-256" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import socket
 import socketserver
+import ssl
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -71,6 +75,7 @@ class Mailbox:
     def __init__(self) -> None:
         self.received: list[tuple[list[str], str]] = []
         self.refusal = ""
+        self.tls: ssl.SSLContext | None = None
         mailbox = self
 
         class Handler(socketserver.StreamRequestHandler):
@@ -91,6 +96,14 @@ class Mailbox:
                         self.say("250 ok")
                     elif verb == "QUIT":
                         self.say("221 bye")
+                        return
+                    elif verb == "EHLO" and mailbox.tls is not None:
+                        self.say("250-mailbox")
+                        self.say("250 STARTTLS")
+                    elif verb == "STARTTLS" and mailbox.tls is not None:
+                        self.say("220 go on")
+                        with contextlib.suppress(ssl.SSLError):
+                            mailbox.tls.wrap_socket(self.request, server_side=True)
                         return
                     else:
                         self.say("250 ok")
@@ -189,6 +202,24 @@ def local(tmp_path: Path) -> Iterator[Ground]:
     """A service that may send to this machine."""
     with open_ground(tmp_path / "home") as opened:
         yield replace(opened, networks=HERE)
+
+
+@pytest.mark.parametrize("offers_tls", [False, True])
+def test_a_public_mail_server_needs_tls_with_its_certificate(
+    mailbox: Mailbox, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, offers_tls: bool
+) -> None:
+    """What is sent to the internet is neither readable on the way nor given to another server."""
+    if offers_tls:
+        environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
+        subprocess.run(["sh", "deploy/secrets.sh"], check=True, env=environment, capture_output=True)
+        mailbox.tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        mailbox.tls.load_cert_chain(tmp_path / "tls/certificate", tmp_path / "tls/key")
+    monkeypatch.setattr(outgoing.ipaddress.IPv4Address, "is_global", property(lambda _: True))
+    channel = Channel(email=("a@b.example",), smtp=mailbox.address)
+    told = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
+    with pytest.raises(NotDelivered, match=told):
+        send(tmp_path, channel, "id", "subject", {}, wait=no_wait)
+    assert mailbox.received == []
 
 
 class Dripping(socketserver.StreamRequestHandler):
