@@ -246,7 +246,8 @@ def _rewrite_manifest(folder: Path, change: Any) -> None:
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())
     for name in manifest["files"]:
-        manifest["files"][name]["sha256"] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        octets = (folder / name).read_bytes()
+        manifest["files"][name] |= {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
     change(manifest)
     path.write_text(json.dumps(manifest))
 

@@ -96,7 +96,7 @@ def test_a_websocket_refuses_query_keys_it_does_not_know(client: TestClient, pat
 
 def test_known_query_keys_are_taken(client: TestClient) -> None:
     assert client.get(f"{V1}/jobs?kind=report&limit=5&offset=0").status_code == 200
-    assert "expected one of none" in detail(client.get(f"{V1}/plan?limit=1"), 422)
+    assert "expected one of none" in detail(client.get(f"{V1}/links?limit=1"), 422)
 
 
 @pytest.mark.parametrize(
