@@ -35,29 +35,11 @@ from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import build_world
+from tests.scenarios import live_scenario
 from tests.serving import served, wait_for
 from tmtc.link import LinkSettings
 
-SCENARIO = """
-name = "live and archive"
-seed = 5
-[dynamics]
-gravity = "builtin"
-degree = 8
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 1500.0
-[camera]
-images = "reduced"
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["spherical"]
-filter_gravity = "builtin"
-filter_degree = 8
-"""
+SCENARIO = live_scenario("live and archive", 5, 1500.0)
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T01:40:00Z")
 FIRST, LAST = START + 180 * NS, START + 600 * NS

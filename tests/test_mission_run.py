@@ -27,28 +27,9 @@ from studies.mission_run.comparison import compare_reports, largest_relative
 from studies.mission_run.figures import windows_asked
 from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
+from tests.scenarios import commanded_scenario
 
-SCENARIO = """
-name = "half-a-day"
-seed = 3
-[orbit]
-epoch = "2029-08-07T00:00:00Z"
-[dynamics]
-gravity = "builtin"
-degree = 8
-[window]
-search = "none"
-duration_s = 60.0
-[camera]
-images = "reduced"
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["spherical"]
-[clock]
-offset_s = 0.4
-drift_ppm = 5.0
-"""
+SCENARIO = commanded_scenario("half-a-day", "[clock]\noffset_s = 0.4\ndrift_ppm = 5.0\n")
 DRIFT_PPM = 5.0
 
 Figures = dict[str, Any]

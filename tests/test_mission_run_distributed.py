@@ -25,27 +25,11 @@ from studies.harness.usage import family_cpu_s, family_memory
 from studies.mission_run.comparison import compare_reports, largest_relative
 from studies.mission_run.run import RunTerms, run_mission
 from studies.mission_run.spacecraft import SpacecraftProcess
+from tests.scenarios import commanded_scenario
 
 HOUR_NS = 3_600_000_000_000
 
-SCENARIO = """
-name = "half-a-day"
-seed = 3
-[orbit]
-epoch = "2029-08-07T00:00:00Z"
-[dynamics]
-gravity = "builtin"
-degree = 8
-[window]
-search = "none"
-duration_s = 60.0
-[camera]
-images = "reduced"
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["spherical"]
-"""
+SCENARIO = commanded_scenario("half-a-day")
 
 KILLED = (
     ("started", "database", 0.0),

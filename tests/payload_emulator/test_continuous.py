@@ -28,6 +28,7 @@ from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.starting import launch
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import open_world
+from tests.scenarios import commanded_scenario
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link import LinkSettings
@@ -37,32 +38,11 @@ HOUR_NS = 3600 * NS
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 CADU = LinkSettings().cadu_length
 
-SCENARIO = """
-name = "continuous"
-seed = 3
-[orbit]
-epoch = "2029-08-07T00:00:00Z"
-[dynamics]
-gravity = "builtin"
-degree = 8
-[window]
-search = "none"
-duration_s = 60.0
-[camera]
-images = "reduced"
-frame_interval_s = 15.0
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["spherical"]
-[clock]
-offset_s = 0.4
-drift_ppm = 5.0
-[link]
-stations = ["madrid"]
-rate_bps = 64000.0
-uplink_bps = 64000.0
-"""
+SCENARIO = commanded_scenario(
+    "continuous",
+    "[clock]\noffset_s = 0.4\ndrift_ppm = 5.0\n"
+    '[link]\nstations = ["madrid"]\nrate_bps = 64000.0\nuplink_bps = 64000.0\n',
+)
 
 SHORT = 'outages = ["madrid 2029-08-07T04:00:00Z 2029-08-07T23:00:00Z"]\n'
 """Ends the first contact, which begins at 03:27:55, after half an hour."""

@@ -18,6 +18,7 @@ from payload_emulator.session.parameter_file import parse_parameters
 from payload_emulator.session.recording import _line, _parse, step_input
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.spacecraft import Given, _with_clock_error
+from tests.scenarios import short_scenario
 
 TELEMETRY = """
 from tmtc.instruments import InstrumentTelemetry, Residual, sample_packet
@@ -151,23 +152,7 @@ print(json.dumps({
     "manifest": "[plummet]" in json.loads((out / "with" / "manifest.json").read_text())["scenario_toml"],
 }))
 """
-SCENARIO = """
-name = "short"
-seed = 7
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 60.0
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["anchored"]
-filter_gravity = "builtin"
-filter_degree = 8
-"""
+SCENARIO = short_scenario(60.0)
 
 
 @pytest.fixture(scope="module")

@@ -35,31 +35,13 @@ from payload_emulator.session.station_ports import RECORD_HEADER, TelecommandBuf
 from payload_emulator.session.viewing import turn_message
 from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.board.link import Receiver
+from tests.scenarios import live_scenario
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link import LinkSettings
 from tmtc.uplink import UplinkEncoder
 
-SCENARIO = """
-name = "live"
-seed = 3
-[dynamics]
-gravity = "builtin"
-degree = 8
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 240.0
-[camera]
-images = "reduced"
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["spherical"]
-filter_gravity = "builtin"
-filter_degree = 8
-"""
+SCENARIO = live_scenario("live", 3, 240.0)
 NO_DATA = find_data(None)
 EPOCH = parse_utc("2029-08-07T01:40:00Z")
 

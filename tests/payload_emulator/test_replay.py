@@ -38,30 +38,13 @@ from payload_emulator.session.replay import (
 )
 from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.suite import SUITE, suite_scenarios
+from tests.scenarios import short_scenario
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.stream import cut_packets
 
 FRAMES = 5
-SCENARIO = """
-name = "short"
-seed = 7
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 75.0
-[terrain]
-source = "procedural"
-[navigation]
-filter_gravity = "builtin"
-filter_degree = 8
-[disturbances]
-outage_at_s = 25.0
-outage_duration_s = 15.0
-"""
+SCENARIO = short_scenario(75.0, "") + "[disturbances]\noutage_at_s = 25.0\noutage_duration_s = 15.0\n"
 NO_IMAGE = 2
 
 

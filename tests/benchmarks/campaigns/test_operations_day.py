@@ -6,27 +6,9 @@ from typing import Any
 import pytest
 
 from benchmarks.campaigns.operations_day import rehearse, went_well
+from tests.scenarios import live_scenario
 
-SCENARIO = """
-name = "live"
-seed = 3
-[dynamics]
-gravity = "builtin"
-degree = 8
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 360.0
-[camera]
-images = "reduced"
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["spherical"]
-filter_gravity = "builtin"
-filter_degree = 8
-"""
+SCENARIO = live_scenario("live", 3, 360.0)
 
 
 @pytest.mark.campaign

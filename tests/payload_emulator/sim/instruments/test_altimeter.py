@@ -19,26 +19,11 @@ from payload_emulator.session.recording import load_record
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.sim.instruments import Situation, Surroundings
 from payload_emulator.sim.instruments.altimeter import AltimeterSection, beam, ground_ranges_m, measure
+from tests.scenarios import short_scenario
 from tmtc.downlink import decode
 
 ALTITUDE_M = 30_000.0
-SCENARIO = """
-name = "short"
-seed = 7
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 45.0
-[terrain]
-source = "procedural"
-[navigation]
-estimators = ["anchored"]
-filter_gravity = "builtin"
-filter_degree = 8
-"""
+SCENARIO = short_scenario(45.0)
 
 
 class Ground:

@@ -1,0 +1,52 @@
+"""Texts of small scenarios without data products, for tests of several packages."""
+
+_WINDOW = """
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = {duration_s}
+[terrain]
+source = "procedural"
+"""
+_FILTER = """filter_gravity = "builtin"
+filter_degree = 8
+"""
+
+
+def live_scenario(name: str, seed: int, duration_s: float) -> str:
+    """Return a window of reduced images for the spherical estimator in gravity of degree 8."""
+    return (
+        f'name = "{name}"\nseed = {seed}\n[dynamics]\ngravity = "builtin"\ndegree = 8\norientation = "iau"'
+        f'{_WINDOW.format(duration_s=duration_s)}[camera]\nimages = "reduced"\n'
+        f'[navigation]\nestimators = ["spherical"]\n{_FILTER}'
+    )
+
+
+def short_scenario(duration_s: float, estimators: str = 'estimators = ["anchored"]\n') -> str:
+    """Return a window of a few rendered images; it ends in the section `navigation`."""
+    return (
+        'name = "short"\nseed = 7\n[dynamics]\ngravity = "builtin"\norientation = "iau"'
+        f"{_WINDOW.format(duration_s=duration_s)}[navigation]\n{estimators}{_FILTER}"
+    )
+
+
+def commanded_scenario(name: str, further: str = "") -> str:
+    """Return a flight of reduced images whose windows the ground commands."""
+    return f"""
+name = "{name}"
+seed = 3
+[orbit]
+epoch = "2029-08-07T00:00:00Z"
+[dynamics]
+gravity = "builtin"
+degree = 8
+[window]
+search = "none"
+duration_s = 60.0
+[camera]
+images = "reduced"
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+{further}"""
