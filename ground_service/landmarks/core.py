@@ -137,7 +137,11 @@ def places_of_pass(
     offset, scale, error_m, size, size_sigma = _calibration(controls, reference_sigma_m, frames)
     moved = [_calibrated(one, offset, scale, error_m, size, size_sigma) for one in found]
     return PassPlaces(
-        tuple(replace(one, looks=int(np.count_nonzero(in_view(one, frames)))) for one in moved),
+        tuple(
+            # A place at the edge may be seen in a frame outside which its mean lies.
+            replace(one, looks=len(np.union1d(np.flatnonzero(in_view(one, frames)), owner[one.rows])))
+            for one in moved
+        ),
         len(free),
         len(controls),
         offset,

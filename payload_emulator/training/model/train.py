@@ -69,7 +69,8 @@ def train(
     Raises
     ------
     DatasetError
-        No training frames, data sets of different cameras, rims of other craters, or a run begun with other rims.
+        No training or no validation frames, data sets of different cameras, rims of other craters, or a run begun with
+        other rims.
     """
     import cv2
     import torch
@@ -79,7 +80,7 @@ def train(
 
     frames, moved = _training_frames(datasets, landmarks, rims)
     validation = [(d, f) for d in datasets for f in d.frames("val")]
-    _check_datasets(datasets, frames, parameters)
+    _check_datasets(datasets, frames, validation, parameters)
     run.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     torch.manual_seed(parameters.seed)
@@ -110,7 +111,7 @@ def train(
     team = _Team(network, replicas, device, parameters)
     _optimise(
         team, feeder, files, state, lambda: _validate(average, validation, parameters.validation_frames, device),
-        learns_blindly=not validation, report=report,
+        report=report,
     )  # fmt: skip
     files.save(state, {})
     return {
@@ -149,10 +150,14 @@ def _training_frames(
 
 
 def _check_datasets(
-    datasets: Sequence[Dataset], frames: Sequence[tuple[Dataset, Frame]], parameters: TrainParameters
+    datasets: Sequence[Dataset],
+    frames: Sequence[tuple[Dataset, Frame]],
+    validation: Sequence[tuple[Dataset, Frame]],
+    parameters: TrainParameters,
 ) -> None:
-    if not frames:
-        raise DatasetError("training: expected frames of the split 'train', found none")
+    for split, present in (("train", frames), ("val", validation)):
+        if not present:
+            raise DatasetError(f"training: expected frames of the split '{split}', found none")
     if len({(d.width_px, d.height_px, round(d.focal_px, 3)) for d in datasets}) > 1:
         raise DatasetError("training: expected data sets of one camera, found several")
     in_colour = parameters.preparation is Preparation.normalise_first
@@ -185,13 +190,9 @@ def _optimise(
     state: _Progress,
     validate: Callable[[], dict[str, float]],
     *,
-    learns_blindly: bool,
     report: Callable[[str], None],
 ) -> None:
-    """Take steps until the budget is spent or validations bring no gain; validate and save at intervals.
-
-    Without validation frames (``learns_blindly``) the newest weights count as the best.
-    """
+    """Take steps until the budget is spent or validations bring no gain; validate and save at intervals."""
     parameters = team.parameters
     shown = _Shown()
     began = time.monotonic() - state.seconds
@@ -217,7 +218,7 @@ def _optimise(
                 f"validation at {state.seconds / 60:.1f} min: F1 {figures['f1']:.3f} (P {figures['precision']:.3f} "
                 f"R {figures['recall']:.3f} loc {figures['loc_px']:.2f} px, threshold {figures['threshold']:.2f})"
             )
-            if learns_blindly or figures["f1"] >= state.best_f1:
+            if figures["f1"] >= state.best_f1:
                 state.best_f1, state.best_step, state.stale = figures["f1"], state.step, 0
                 files.write(files.run / "best.pt", state, figures, {})
             else:
@@ -463,8 +464,6 @@ def _validate(
     from payload_emulator.training.evaluate.evaluate import detect_with_network
     from payload_emulator.training.evaluate.scoring import best_threshold, tally
 
-    if not validation:
-        return {"f1": 0.0, "precision": 0.0, "recall": 0.0, "loc_px": float("nan"), "threshold": 0.4}
     chosen = [validation[k] for k in np.unique(np.linspace(0, len(validation) - 1, limit).astype(int))]
     found = [detect_with_network(network, dataset, frame, device) for dataset, frame in chosen]
     truths = [frame_truth(dataset, frame) for dataset, frame in chosen]

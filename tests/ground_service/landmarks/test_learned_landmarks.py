@@ -100,6 +100,19 @@ def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinn
         assert min(one.sigma_east_m, one.sigma_north_m, one.sigma_up_m) >= 20.0
 
 
+def test_a_place_is_in_view_of_every_frame_that_saw_it(
+    ground: Ground, thinned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if its mean place lies just outside the image: here it always does."""
+    folder, _, _ = thinned
+    first, _ = both_passes(ground, folder)
+    nowhere = "ground_service.landmarks.core.in_view"
+    monkeypatch.setattr(nowhere, lambda _, frames: np.zeros(len(frames.position_mcmf_m), dtype=np.bool_))
+    update_landmarks(ground, first)
+    found = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
+    assert found and all(one.looks == one.sightings > 0 for one in found)
+
+
 def test_a_pass_that_is_searched_again_counts_once(ground: Ground, thinned) -> None:
     folder, _, _ = thinned
     first, second = both_passes(ground, folder)

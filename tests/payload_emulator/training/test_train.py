@@ -203,14 +203,18 @@ def test_a_least_emphasis_without_meaning_is_refused(share):
         replace(SHORT, least_emphasis=share)
 
 
-def test_a_data_set_without_training_frames_is_refused(make_blob_dataset, tmp_path):
-    empty = make_blob_dataset(tmp_path / "set", {"test": 1})
-    with pytest.raises(DatasetError, match="split 'train'"):
+@pytest.mark.parametrize(("splits", "lacking"), [({"test": 1}, "train"), ({"train": 1}, "val")])
+def test_a_data_set_without_training_or_validation_frames_is_refused(
+    make_blob_dataset, tmp_path, splits, lacking
+):
+    empty = make_blob_dataset(tmp_path / "set", splits)
+    with pytest.raises(DatasetError, match=f"split '{lacking}', found none"):
         train([empty], tmp_path / "run", SHORT)
+    assert not (tmp_path / "run").exists()
 
 
 def test_data_sets_of_two_cameras_are_refused(blob_dataset, make_blob_dataset, tmp_path):
-    other = make_blob_dataset(tmp_path / "set", {"train": 1})
+    other = make_blob_dataset(tmp_path / "set", {"train": 1, "val": 1})
     other.index["camera"]["fov_deg"] = 90.0
     with pytest.raises(DatasetError, match="data sets of one camera, found several"):
         train([blob_dataset, other], tmp_path / "run", SHORT)
