@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import docs_site
 from ground_service.web import documentation, pages
@@ -128,6 +129,33 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
     assert done.returncode == 0, (tmp_path / "log").read_text()[-3000:]
     if name == "first-spacecraft.md":
         _check_first_spacecraft(tmp_path)
+    if name == "own-build.md":
+        told, found = (
+            re.search(r"^fail: recall falls by ([\d.]+) .*$", text, re.MULTILINE)
+            for text in ((DOCS / "tutorials" / name).read_text(), (tmp_path / "log").read_text())
+        )
+        assert told and found and float(found[1]) == pytest.approx(float(told[1]), abs=0.02)
+        assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", told[0])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> None:
+    (workflow,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "ci.md").read_text(), re.DOTALL)
+    steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["gates"]["steps"]]
+    script = [step for step in steps if "linna regress" in step]
+    assert [step.count("linna regress") for step in script] == [1, 1, 1]
+    (tmp_path / "build.toml").write_text('name = "same"\n')
+    text = "\n".join(["set -e", *script]).replace("--out passes", "--frames 6 --out passes")
+    with (tmp_path / "log").open("w") as log:
+        known = environment(tmp_path / "data")
+        done = subprocess.run(
+            ["bash", "-c", text], cwd=tmp_path, env=known, stdout=log, stderr=log, check=False
+        )
+    told = (tmp_path / "log").read_text()
+    assert done.returncode == 0, told[-3000:]
+    assert "pass: identical in every octet on 12 frames" in told
+    assert "</testsuite>" in (tmp_path / "junit.xml").read_text() and (tmp_path / "report.html").exists()
 
 
 def _check_first_spacecraft(folder: Path) -> None:

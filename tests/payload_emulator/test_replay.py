@@ -307,6 +307,9 @@ def test_the_shipped_suite_has_a_pass_of_every_kind() -> None:
     assert any(scenario.disturbances.outage_duration_s > 0.0 for scenario in scenarios)
     assert all(scenario.window.duration_s == 10 * scenario.camera.frame_interval_s for scenario in scenarios)
     assert len({scenario.name for scenario in scenarios}) == 12
+    # By the names as `linna regress suite` lists them, or by file.
+    low = suite_scenarios(["low", str(SUITE / "low.toml")])
+    assert [one.name for one in low] == ["suite-low", "suite-low"]
 
 
 def test_the_dictionary_of_the_archive_decodes_its_downlink(archive: Path) -> None:

@@ -202,3 +202,14 @@ def test_commands_compare_and_analyse_builds_over_archives(
         "regression",
         "analysis",
     }  # replays run within the job of the verdict
+
+
+def test_the_suite_states_what_its_passes_can_detect_before_anything_is_run(capsys) -> None:
+    assert run(["regress", "suite", "low", "plains", "--frames", "49", "--seeds", "2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["passes"] == [
+        {"scenario": name, "frames": 49} for name in ("low", "low-1", "plains", "plains-1")
+    ]
+    rows = {one["metric"]: one for one in found["detectable"]}
+    assert (rows["detector.recall"]["frames"], rows["detector.recall"]["minutes"]) == (196, 1.0)
+    assert 0.03 < rows["detector.recall"]["change"] < 0.15
