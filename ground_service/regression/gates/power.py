@@ -17,7 +17,8 @@ SPREAD = {
 }
 """Standard error of the change by a threshold of 0.3, times the root of the number of frames.
 
-Measured over the 42 windows of `python -m benchmarks.gate_error_rates`; for a network of similar quality it is a fifth."""
+Measured over the 42 windows of `python -m benchmarks.gate_error_rates`. For a network of similar quality it is a fifth.
+"""
 
 MINUTES_PER_FRAME = 0.005
 """Time of a candidate from stored frames on one core."""
