@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
 MARK = re.compile(
-    r"^ *<!-- (?P<kind>file|run|tour)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n *```\w+\n"
+    r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n *```\w+\n"
     r"(?P<text>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
@@ -115,10 +115,13 @@ def environment(home: Path) -> dict[str, str]:
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", [name for name in TUTORIALS if name != "first-pass.md"])
 def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) -> None:
-    script = ["set -e", "trap 'kill $(jobs -p) || true' EXIT"]
+    script, expected = ["set -e", "trap 'kill $(jobs -p) || true' EXIT"], list[str]()
     for mark in MARK.finditer((DOCS / "tutorials" / name).read_text()):
         if mark["kind"] == "file":
             (tmp_path / mark["name"]).write_text(mark["text"])
+            continue
+        if mark["kind"] == "output":
+            expected += mark["text"].splitlines()
             continue
         allowed = f' || [[ ",{mark["status"]}," == *",$?,"* ]]' if mark["status"] else ""
         script += [line.strip() + allowed for line in mark["text"].splitlines()]
@@ -126,7 +129,9 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
     with (tmp_path / "log").open("w") as log:
         command, known = ["bash", "-c", "\n".join(script)], environment(tmp_path / "data")
         done = subprocess.run(command, cwd=tmp_path, env=known, stdout=log, stderr=log, check=False)
-    assert done.returncode == 0, (tmp_path / "log").read_text()[-3000:]
+    printed = (tmp_path / "log").read_text()
+    assert done.returncode == 0, printed[-3000:]
+    assert [line for line in expected if line.strip() not in printed] == []
     if name == "first-spacecraft.md":
         _check_first_spacecraft(tmp_path)
     if name == "own-build.md":

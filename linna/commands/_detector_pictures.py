@@ -21,6 +21,7 @@ def configure(verbs: Any) -> None:
     option(detect, "--altitude-km", float, "above the ground; gives size classes", None)
     option(detect, "--fov-deg", float, "", 120.0)
     option(detect, "--threshold", float, "", None)
+    option(detect, "--picture F.png", Path, "the image with the rims of its craters; of one image")
     _add_search(detect)
     finish(detect, _detect)
 
@@ -131,12 +132,15 @@ def _detect(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.flight.vision.picture_search import search_picture, sun_at_azimuth
     from payload_emulator.session.picture_files import read_picture
+    from payload_emulator.training.evaluate.sheets import draw_detections, format_detections, save_png
 
     if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
         raise UsageError(
             f"--altitude-km: expected a positive number of kilometres, found {arguments.altitude_km:g}"
         )
     _check_fov(arguments.fov_deg)
+    if arguments.picture and len(arguments.images) > 1:
+        raise UsageError(f"--picture: expected one image, found {len(arguments.images)}")
     detector = OnnxDetector(
         model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
     )
@@ -154,9 +158,9 @@ def _detect(arguments: argparse.Namespace) -> int:
         if sun is None and item["quality"] == "ok":
             log(f"{path}: {_sun_sentence(item['sun'])}")
         images.append(item)
-    text = "\n".join(
-        f"{item['file']}: {item['quality']}, {len(item['detections'])} craters" for item in images
-    )
+        if arguments.picture:
+            save_png(draw_detections(image, item["detections"]), arguments.picture)
+    text = "\n".join(map(format_detections, images))
     return emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
 
 

@@ -254,3 +254,17 @@ def test_training_gets_the_rims_and_the_least_emphasis(tmp_path, trained):
 def test_training_refuses_what_it_cannot_use(tmp_path, capsys, trained, words, expected):
     assert run(["detector", "train", str(tmp_path), "--out", str(tmp_path / "run"), *words]) == 2
     assert expected in capsys.readouterr().err and not trained
+
+
+def test_detect_lists_the_craters_and_draws_them(write_image, capsys, tmp_path):
+    import cv2
+
+    path, picture = write_image("a.png", speckled()), tmp_path / "found.png"
+    assert run(["detector", "detect", str(path), "--threshold", "0.05", "--picture", str(picture)]) == 0
+    heading, _, *rows = capsys.readouterr().out.splitlines()
+    diameters = [float(row.split()[2]) for row in rows]
+    assert heading == f"{path}: ok, {len(rows)} craters" and diameters == sorted(diameters, reverse=True)
+    drawn = cv2.imread(str(picture))
+    assert (drawn[..., 0] != drawn[..., 2]).sum() > 10 * len(rows) > 0
+    assert run(["detector", "detect", str(path), str(path), "--picture", str(picture)]) == 2
+    assert "expected one image, found 2" in capsys.readouterr().err

@@ -54,6 +54,32 @@ def draw_labels(image: Picture, labels: Sequence[dict[str, Any]]) -> Rgb:
     return drawn
 
 
+def draw_detections(image: Picture, detections: Sequence[dict[str, Any]]) -> Rgb:
+    """A copy of the picture, (H, W) or (H, W, 3), with the circles of detections on it."""
+    labels = [
+        row
+        | {"class": max(row["class"], 0), "inside": True}
+        | {"ellipse": {"major_px": row["diameter_px"], "minor_px": row["diameter_px"], "angle_deg": 0.0}}
+        for row in detections
+    ]
+    return draw_labels(np.dstack([image] * 3) if image.ndim == 2 else image, labels)
+
+
+def format_detections(item: dict[str, Any]) -> str:
+    """Rows of the detections in a file, the largest first."""
+    rows = sorted(item["detections"], key=lambda row: -row["diameter_px"])
+    lines = [f"{item['file']}: {item['quality']}, {len(rows)} craters"]
+    if rows:
+        lines += ["    u px    v px  diameter px  score  class"]
+    return "\n".join(
+        lines
+        + [
+            f"{row['u_px']:8.1f}{row['v_px']:8.1f}{row['diameter_px']:13.1f}{row['score']:7.2f}{row['class']:7}"
+            for row in rows
+        ]
+    )
+
+
 def contact_sheet(pictures: Sequence[Rgb], captions: Sequence[str], columns: int) -> Rgb:
     """Pictures (H, W, 3) of one size in rows, each with a line of text under it."""
     cells = [_captioned(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
