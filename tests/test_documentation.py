@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
 MARK = re.compile(
-    r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n *```\w+\n"
-    r"(?P<text>.*?)^ *```$",
+    r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n"
+    r" *```\w+\n(?P<text>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
 
