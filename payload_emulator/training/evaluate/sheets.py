@@ -54,7 +54,7 @@ def draw_labels(image: Picture, labels: Sequence[dict[str, Any]]) -> Rgb:
     return drawn
 
 
-def draw_detections(image: Picture, detections: Sequence[dict[str, Any]]) -> Rgb:
+def draw_detections(image: Any, detections: Sequence[dict[str, Any]]) -> Rgb:
     """A copy of the picture, (H, W) or (H, W, 3), with the circles of detections on it."""
     labels = [
         row
@@ -62,7 +62,7 @@ def draw_detections(image: Picture, detections: Sequence[dict[str, Any]]) -> Rgb
         | {"ellipse": {"major_px": row["diameter_px"], "minor_px": row["diameter_px"], "angle_deg": 0.0}}
         for row in detections
     ]
-    return draw_labels(np.dstack([image] * 3) if image.ndim == 2 else image, labels)
+    return draw_labels(image[..., None].repeat(3, -1) if image.ndim == 2 else image, labels)
 
 
 def format_detections(item: dict[str, Any]) -> str:
