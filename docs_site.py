@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import argparse
 import base64
+import dataclasses
+import html
 import importlib
+import inspect
 import json
 import os
 import re
 import sys
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,6 +55,10 @@ def on_files(files: Any, config: Any) -> Any:
         ("reference/cli.md", cli_page()),
         ("reference/http.md", http_page()),
         ("reference/configuration.md", configuration_page()),
+        ("reference/scenario.md", scenario_page()),
+        ("explanation/programs.svg", layers_svg("")),
+        ("explanation/emulator.svg", layers_svg("payload_emulator")),
+        ("explanation/ground.svg", layers_svg("ground_service")),
     ):
         files.append(File.generated(config, path, content=content))
     folder = Path(os.environ.get("NOTEBOOK_OUTPUTS") or NOTEBOOKS)
@@ -220,6 +228,90 @@ def configuration_page() -> str:
         shown = f"`{default}`" if default not in ("", "()") else "none"
         lines.append(f"| `LINNA_{name.upper()}` | {shown} | {_cell(field.description or '')} |")
     return "\n".join(lines) + "\n"
+
+
+def scenario_page() -> str:
+    """Return every key of a scenario with its type and default, from the classes that read it."""
+    from payload_emulator.session.scenario import Scenario
+    from payload_emulator.sim.instruments import simulated_instruments
+
+    lines = [
+        "# Scenario keys",
+        "",
+        "Generated from the program. A scenario is a TOML file: see [your own scenario](../tutorials/own-scenario.md). "
+        "`linna emulate NAME` flies a shipped one. A key that is not stated has its default, an unknown key is refused "
+        "with the nearest known one.",
+        *_keys("Top of the file", Scenario, ""),
+    ]
+    for section in dataclasses.fields(Scenario):
+        kind = section.default_factory
+        if dataclasses.is_dataclass(kind):
+            lines += _keys(f"`[{section.name}]`", kind, inspect.getdoc(kind) or "")
+    for name, instrument in simulated_instruments().items():
+        lines += _keys(f"`[{name}]`", instrument.settings, inspect.getdoc(instrument.settings) or "")
+    return "\n".join(lines) + "\n"
+
+
+def _keys(heading: str, kind: Any, text: str) -> list[str]:
+    rows = []
+    for key in dataclasses.fields(kind):
+        if key.default_factory is not dataclasses.MISSING:
+            continue
+        default = "required" if key.default is dataclasses.MISSING else f"`{json.dumps(key.default)}`"
+        # Types are texts where annotations are deferred.
+        stated = key.type if isinstance(key.type, str) else getattr(key.type, "__name__", str(key.type))
+        rows.append(f"| `{key.name}` | {_cell(stated.replace('Literal', 'one of '))} | {default} |")
+    return [
+        "",
+        f"## {heading}",
+        *(["", text] if text else []),
+        "",
+        "| key | type | default |",
+        "|---|---|---|",
+        *rows,
+    ]
+
+
+def layers_svg(container: str) -> str:
+    """Return the layers of a package (of all packages: "") as SVG, from the import contracts that the tests check."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    (layers,) = (
+        one["layers"] for one in contracts if "layers" in one and one.get("containers", [""]) == [container]
+    )
+    parts, top = [], 0
+    for layer in layers:
+        names = [name.strip() for name in layer.split("|")]
+        rows = [names[start : start + 3] for start in range(0, len(names), 3)]
+        parts.append(
+            f'<rect x="1" y="{top + 1}" width="378" height="{26 * len(rows) + 6}" rx="4" fill="none" stroke="#78909c"/>'
+        )
+        for number, row in enumerate(rows):
+            width = 370 / len(row)
+            for place, name in enumerate(row):
+                x, y = 5 + place * width, top + 5 + 26 * number
+                parts.append(
+                    f'<rect x="{x + 1:.0f}" y="{y}" width="{width - 2:.0f}" height="24" rx="3" fill="#e3edf5"/>'
+                    f'<text x="{x + width / 2:.0f}" y="{y + 17}" text-anchor="middle">{html.escape(name)}</text>'
+                )
+        top += 26 * len(rows) + 16
+        parts.append(f'<path d="M190 {top - 9}v7m-4 -4l4 4l4 -4" stroke="#78909c" fill="none"/>')
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 380 {top - 6}" width="380" font-family="sans-serif" '
+        f'font-size="14" fill="#102027">{"".join(parts[:-1])}</svg>'
+    )
+
+
+def generated_figures() -> dict[str, str]:
+    """Return the sentences with figures that pages contain, by the name of their block."""
+    from tmtc.xtce.export import format_xtce
+
+    def sizes(unrolled: bool) -> str:
+        text = format_xtce(unrolled=unrolled)
+        return f"{text.count('<SequenceContainer '):,} containers, {len(text.encode()) / 1e6:.2f} MB"
+
+    return {"xtce": f"`linna tm xtce` writes {sizes(False)}; with `--unrolled` {sizes(True)}."}
 
 
 def _cell(text: str) -> str:

@@ -181,3 +181,18 @@ def test_reference_pages_name_every_setting() -> None:
 
     page = docs_site.configuration_page()
     assert all(f"LINNA_{name.upper()}" in page for name in Settings.model_fields)
+
+
+def test_the_page_of_scenario_keys_states_types_and_defaults() -> None:
+    page = docs_site.scenario_page()
+    assert "| `fov_deg` | float | `120.0` |" in page.split("## `[camera]`")[1].split("\n## ")[0]
+    assert "| `name` | str | required |" in page and "## `[altimeter]`" in page
+
+
+def test_figures_of_pages_are_those_of_the_program() -> None:
+    blocks = [
+        (name, line)
+        for page in DOCS.rglob("*.md")
+        for name, line in re.findall(r"<!-- generated: (\w+) -->\n(.*)", page.read_text())
+    ]
+    assert dict(blocks) == docs_site.generated_figures()
