@@ -29,6 +29,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
     "data": ("data", "list, fetch and verify the public data products"),
     "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
+    "camera": ("camera", "probability of craters in the footprint over the field of view"),
     "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
     "identify": ("identify", "rates of crater identification and of wrong identifications"),
     "render": ("render", "render one frame of a scenario"),

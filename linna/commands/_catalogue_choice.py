@@ -8,6 +8,11 @@ if TYPE_CHECKING:
     from lunar.catalogue import CraterCatalogue
 
 SYNTHETIC = ("paper-density", "paper-density-synthetic", "paper-density-uniform")
+CATALOGUE_HELP = (
+    "catalogue (CSV, plain or gzip), or paper-density: the paper's class counts, from the available real catalogue, "
+    "with random craters in its empty tiles (paper-density-synthetic: all random, few in the maria; "
+    "paper-density-uniform: all random); default: the most complete catalogue of the data folder"
+)
 
 
 def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:

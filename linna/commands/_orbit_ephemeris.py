@@ -1,8 +1,9 @@
-"""`linna orbit compare` and `convert`: what is done with ephemeris files."""
+"""`linna orbit compare`, `interpolate` and `convert`: what is done with ephemeris files."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,16 @@ def configure_compare(commands: Any) -> None:
     option(compare, "b B", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
     option(compare, "--step S", float, "seconds between epochs (default: the states of A)")
     finish(compare, run_compare)
+
+
+def configure_interpolate(commands: Any) -> None:
+    """Add `interpolate` to the subparsers of `linna orbit`."""
+    interpolate = commands.add_parser("interpolate", help="states of an ephemeris at given UTC epochs")
+    option(interpolate, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(
+        interpolate, "--epochs FILE", str, "UTC epochs, one a line (- reads standard input)", required=True
+    )
+    finish(interpolate, run_interpolate)
 
 
 def configure_convert(commands: Any) -> None:
@@ -63,6 +74,55 @@ def run_compare(arguments: argparse.Namespace) -> int:
         f"rms radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
     )
     return emit(arguments, figures, text=text)
+
+
+def run_interpolate(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from linna.data import data_folder
+    from lunar.datafolder import default_orientation
+    from lunar.ground_track import ground_track
+    from lunar.messages.ephemeris_files import load_ephemeris
+    from lunar.timescales import format_utc
+
+    ephemeris = load_ephemeris(arguments.ephemeris)
+    epochs = np.array(_read_epochs(arguments.epochs), dtype=np.int64)
+    orientation = default_orientation(data_folder())
+    position_m, velocity_m_s = ephemeris.at(epochs)
+    track = ground_track(ephemeris, orientation, epochs)
+    states = [
+        {
+            "epoch": format_utc(int(epoch), 9 if epoch % 1_000_000 else 3),
+            "position_km": (position_m[k] / 1e3).tolist(),
+            "velocity_km_s": (velocity_m_s[k] / 1e3).tolist(),
+            "latitude_deg": float(np.degrees(track.latitude_rad[k])),
+            "longitude_deg": float(np.degrees(track.longitude_rad[k])),
+            "altitude_km": float(track.altitude_m[k]) / 1e3,
+        }
+        for k, epoch in enumerate(epochs)
+    ]
+    lines = ["epoch,x_km,y_km,z_km,vx_km_s,vy_km_s,vz_km_s,latitude_deg,longitude_deg,altitude_km"]
+    lines += [
+        ",".join(
+            [
+                state["epoch"],
+                *(f"{v:.9f}" for v in state["position_km"]),
+                *(f"{v:.12f}" for v in state["velocity_km_s"]),
+                f"{state['latitude_deg']:.8f},{state['longitude_deg']:.8f},{state['altitude_km']:.6f}",
+            ]
+        )
+        for state in states
+    ]
+    return emit(
+        arguments,
+        {
+            "states": states,
+            "frame": "ICRF, Moon-centred",
+            "orientation": orientation.name,
+            "data": [f"lunar orientation {orientation.name}"],
+        },
+        text="\n".join(lines),
+    )
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
@@ -119,3 +179,25 @@ def _epochs(step_s: float | None, ephemeris: Any) -> Any:
     if not step_s > 0.0:
         raise UsageError(f"--step: expected seconds above 0, found {step_s:g}")
     return even_epochs(ephemeris, step_s)
+
+
+def _read_epochs(name: str) -> list[int]:
+    """UTC epochs of a file, one a line; blank lines and what follows a # are left out."""
+    from lunar.ephemeris import read_text
+    from lunar.errors import DataFileError, TimeFormatError
+    from lunar.timescales import parse_utc
+
+    text = sys.stdin.read() if name == "-" else read_text(name, "a list of UTC epochs")
+    epochs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        wanted = line.partition("#")[0].strip()
+        if not wanted:
+            continue
+        try:
+            epochs.append(parse_utc(wanted))
+        except TimeFormatError:
+            expected = "a UTC epoch like 2029-08-07T00:00:00.000Z"
+            raise DataFileError(name, f"line {number}", expected, repr(wanted)) from None
+    if not epochs:
+        raise DataFileError(name, "", "at least one UTC epoch", "none")
+    return epochs

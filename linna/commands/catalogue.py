@@ -6,17 +6,22 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
 from linna.commands._ground import add_operator_options, ground_client
 from linna.commands._region import parse_region
 from linna.output import emit, finish
 from linna.parser import option
 
 if TYPE_CHECKING:
-    pass
+    from lunar.arrays import FloatArray
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    stats = commands.add_parser("stats", help="size classes of a crater catalogue")
+    option(stats, "catalogue FILE", str, CATALOGUE_HELP, nargs="?")
+    option(stats, "--seed", int, "seed of a synthetic catalogue", 1)
+    finish(stats, run_stats)
     _configure_curate(
         commands.add_parser(
             "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
@@ -67,6 +72,29 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
     option(curate, "--max-diameter KM", float, "default: 30 km", 30.0)
     option(curate, "--depth-ratio R", float, "least depth over diameter", 0.03)
     finish(curate, run_curate)
+
+
+def run_stats(arguments: argparse.Namespace) -> int:
+    from lunar.catalogue import PAPER_CLASS_COUNTS, class_counts
+
+    catalogue = open_catalogue(arguments.catalogue, arguments.seed)
+    counts = [int(count) for count in class_counts(catalogue)]
+    figures = {
+        "class_counts": counts,
+        "class_counts_paper": list(PAPER_CLASS_COUNTS),
+        "class_share": [count / max(sum(counts), 1) for count in counts],
+        "total": len(catalogue),
+        "diameter_km": _range(catalogue.diameter_m / 1e3),
+        "source": catalogue.source,
+        "data": [f"crater catalogue {catalogue.source}"],
+    }
+    lines = [f"{catalogue.source}: {len(catalogue)} craters"]
+    names = ("5-10 km", "10-15 km", "15-30 km")
+    lines += [
+        f"class {k} ({name}): {count} (paper {paper})"
+        for k, (name, count, paper) in enumerate(zip(names, counts, PAPER_CLASS_COUNTS, strict=True))
+    ]
+    return emit(arguments, figures, text="\n".join(lines))
 
 
 def run_curate(arguments: argparse.Namespace) -> int:
@@ -131,3 +159,9 @@ def run_curate(arguments: argparse.Namespace) -> int:
         f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
     ]
     return emit(arguments, figures, text="\n".join(lines))
+
+
+def _range(values: FloatArray) -> dict[str, float]:
+    if len(values) == 0:
+        return {"min": float("nan"), "max": float("nan")}
+    return {"min": float(values.min()), "max": float(values.max())}

@@ -28,6 +28,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(check, "folder DIR", Path)
     finish(check, _check)
+    stats = verbs.add_parser(
+        "stats", help="frames by split, crater instances by class, compared with the paper"
+    )
+    option(stats, "folder DIR", Path)
+    finish(stats, _stats)
 
 
 def _build(arguments: argparse.Namespace) -> int:
@@ -82,6 +87,14 @@ def _check(arguments: argparse.Namespace) -> int:
         return 1
     figures = summarise(arguments.folder)
     return emit(arguments, figures | {"whole": True, "problems": []}, f"{_text(figures)}\nwhole")
+
+
+def _stats(arguments: argparse.Namespace) -> int:
+    from linna.output import emit
+    from payload_emulator.training.data.summary import summarise
+
+    figures = summarise(arguments.folder)
+    return emit(arguments, figures, _text(figures))
 
 
 def _text(figures: dict[str, Any]) -> str:

@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_evaluate(verbs)
     _add_compare(verbs)
     _detector_pictures.configure(verbs)
-    _add_info(verbs)
+    _add_bench_and_info(verbs)
 
 
 def _add_train(verbs: Any) -> None:
@@ -181,7 +181,13 @@ def _add_compare(verbs: Any) -> None:
     finish(compare, _compare)
 
 
-def _add_info(verbs: Any) -> None:
+def _add_bench_and_info(verbs: Any) -> None:
+    bench = verbs.add_parser("bench", help="latency and memory on this machine")
+    add_model(bench)
+    option(bench, "--threads", int, "", 1)
+    option(bench, "--frames", int, "", 100)
+    finish(bench, _bench)
+
     info = verbs.add_parser("info", help="what a model says of itself")
     add_model(info)
     finish(info, _info)
@@ -320,6 +326,13 @@ def _compare(arguments: argparse.Namespace) -> int:
         lambda frames: progress(frames, len(frames), "compare", "frames"),
     )
     return emit(arguments, document, format_comparison(document))
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from linna.output import emit
+    from payload_emulator.training.model.bench import bench
+
+    return emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
 
 
 def _info(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`linna orbit`: propagate a scenario to an ephemeris; compare and convert ephemerides."""
+"""`linna orbit`: propagate a scenario to an ephemeris; compare, interpolate and convert ephemerides."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from linna.commands._orbit_ephemeris import configure_compare, configure_convert
+from linna.commands._orbit_ephemeris import configure_compare, configure_convert, configure_interpolate
 from linna.commands._orbit_visibility import configure_visibility
 from linna.output import emit, finish, log, save
 from linna.parser import option
@@ -22,8 +22,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(propagate, "--days D", _positive, "span in days", 30.0)
     option(propagate, "--step S", _positive, "seconds between states", 30.0)
     option(propagate, "--out F.oem", Path, "ephemeris to write", required=True)
+    option(propagate, "--gravity FILE", str, "coefficient file, or 'builtin'")
+    option(propagate, "--degree N", int, "degree of the gravity field")
+    option(propagate, "--integrator", ("rkn86", "dop853"), "another one than the scenario's")
+    option(propagate, "--no-maneuvers", bool, "let the orbit drift freely")
     finish(propagate, run_propagate)
     configure_compare(commands)
+    configure_interpolate(commands)
     configure_convert(commands)
     configure_visibility(commands)
 
@@ -37,7 +42,7 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     if not out.parent.is_dir():
         raise FileNotFoundError(2, os.strerror(2), str(out.parent))
-    scenario = load_scenario(arguments.scenario)
+    scenario = _with_choices(load_scenario(arguments.scenario), arguments)
     data = data_folder()
     model = force_model(scenario, data)
     started = time.perf_counter()
@@ -61,6 +66,19 @@ def _positive(text: str) -> float:
     if not (value > 0.0 and math.isfinite(value)):
         raise argparse.ArgumentTypeError(f"expected a number over 0, found {text!r}")
     return value
+
+
+def _with_choices(scenario: Any, arguments: argparse.Namespace) -> Any:
+    import dataclasses
+
+    changes = {"gravity": arguments.gravity, "degree": arguments.degree, "integrator": arguments.integrator}
+    dynamics = dataclasses.replace(
+        scenario.dynamics, **{key: value for key, value in changes.items() if value is not None}
+    )
+    maneuvers = dataclasses.replace(
+        scenario.maneuvers, enabled=scenario.maneuvers.enabled and not arguments.no_maneuvers
+    )
+    return dataclasses.replace(scenario, dynamics=dynamics, maneuvers=maneuvers)
 
 
 def _figures(orbit: Any, states: Any, wall_s: float) -> dict[str, Any]:

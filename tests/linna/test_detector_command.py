@@ -180,8 +180,9 @@ def test_a_missing_model_file_is_named(tmp_path, capsys):
     assert "none.onnx" in capsys.readouterr().err
 
 
-def test_a_folder_without_a_data_set_is_refused(tmp_path, capsys):
-    assert run(["dataset", "check", str(tmp_path)]) == 2
+@pytest.mark.parametrize("verb", [["dataset", "stats"], ["dataset", "check"]])
+def test_a_folder_without_a_data_set_is_refused(verb, tmp_path, capsys):
+    assert run([*verb, str(tmp_path)]) == 2
     assert "expected a data set" in capsys.readouterr().err
 
 
@@ -268,3 +269,10 @@ def test_detect_lists_the_craters_and_draws_them(write_image, capsys, tmp_path):
     assert (drawn[..., 0] != drawn[..., 2]).sum() > 10 * len(rows) > 0
     assert run(["detector", "detect", str(path), str(path), "--picture", str(picture)]) == 2
     assert "expected one image, found 2" in capsys.readouterr().err
+
+
+def test_bench_reports_latency_memory_and_size(capsys):
+    assert run(["detector", "bench", "--frames", "5", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert {"median_ms", "p99_ms", "peak_rss_mb", "model_bytes"} <= set(figures)
+    assert figures["model_bytes"] <= 6_000_000

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from linna import cli
+from lunar.catalogue import PAPER_CLASS_COUNTS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
 from lunar.messages.oem import save_oem
@@ -112,3 +113,52 @@ def test_a_station_that_cannot_be_read_is_one_line(oem_path, capsys, station):
     assert "expected NAME=LATITUDE,LONGITUDE" in error_line(
         capsys, "orbit", "visibility", oem_path, "--station", station
     )
+
+
+def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, capsys):
+    epochs = tmp_path / "epochs.txt"
+    epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
+    figures = run_json(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    first, second = figures["states"]
+    assert set(first) == {
+        *("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km"),
+    }
+    assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
+    assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
+    assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
+    assert abs(first["latitude_deg"]) < 0.1
+    assert cli.run(["orbit", "interpolate", str(oem_path), "--epochs", str(epochs)]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+
+
+def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(
+    oem_path, tmp_path, capsys
+):
+    epochs = tmp_path / "epochs.txt"
+    epochs.write_text("2029-09-07T00:00:00Z\n")
+    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    assert "found 2029-09-07T00:00:00.000Z; nothing is extrapolated" in line
+    epochs.write_text("2029-08-07T00:00:00Z\nnoon\n")
+    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    assert "epochs.txt: line 2: expected a UTC epoch" in line and line.endswith("found 'noon'")
+    epochs.write_text("# none\n")
+    assert "at least one UTC epoch" in error_line(
+        capsys, "orbit", "interpolate", oem_path, "--epochs", epochs
+    )
+
+
+def test_catalogue_stats_counts_the_classes_of_the_papers_density(capsys):
+    figures = run_json(capsys, "catalogue", "stats", "paper-density")
+    assert figures["class_counts"] == list(PAPER_CLASS_COUNTS)
+    assert figures["total"] == sum(PAPER_CLASS_COUNTS)
+    assert figures["source"].startswith("synthetic")
+
+
+def test_the_fov_study_gives_the_probabilities_and_the_smallest_field_of_view(oem_path, capsys):
+    words = ("camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density")
+    figures = run_json(capsys, *words)
+    assert figures["fov_deg"] == list(range(10, 161, 10))
+    assert set(figures["probability_at_least"]) == {"1", "3", "5"}
+    enough = [p > 0.9 for p in figures["probability_at_least"]["3"]]
+    assert figures["selected_fov_deg"] == figures["fov_deg"][enough.index(True)]
+    assert "--needed: expected" in error_line(capsys, *words, "--needed", "0")

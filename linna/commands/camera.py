@@ -1,0 +1,90 @@
+"""`linna camera`: the choice of the field of view."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
+from linna.output import emit, finish, log
+from linna.parser import option
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    study = commands.add_parser(
+        "fov-study", help="probability of craters in the footprint over the field of view"
+    )
+    option(study, "--ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)", required=True)
+    option(study, "--catalogue F", str, CATALOGUE_HELP)
+    option(study, "--seed", int, "seed of a synthetic catalogue", 1)
+    option(study, "--step S", float, "seconds between positions (default: every state of the file)")
+    option(study, "--fov-step DEG", float, "default: 10 degrees", 10.0)
+    option(study, "--needed N", int, "craters needed", 3)
+    option(study, "--threshold P", float, "probability to exceed", 0.9)
+    finish(study, run_fov_study)
+
+
+def run_fov_study(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from lunar.datafolder import default_orientation
+    from lunar.fov_study import PAPER_COUNTS, study_field_of_view
+    from lunar.frames import mcmf_from_spherical
+    from lunar.ground_track import even_epochs, ground_track
+    from lunar.messages.ephemeris_files import load_ephemeris
+
+    if not 0.0 < arguments.fov_step <= 150.0:
+        raise UsageError(f"--fov-step: expected a step of 0 to 150 degrees, found {arguments.fov_step:g}")
+    if not 0.0 <= arguments.threshold < 1.0:
+        raise UsageError(f"--threshold: expected a probability of 0 to 1, found {arguments.threshold:g}")
+    if not 1 <= arguments.needed <= 50:
+        raise UsageError(f"--needed: expected 1 to 50 craters, found {arguments.needed}")
+    if arguments.step is not None and not arguments.step > 0.0:
+        raise UsageError(f"--step: expected seconds above 0, found {arguments.step:g}")
+    ephemeris = load_ephemeris(arguments.ephemeris)
+    catalogue = open_catalogue(arguments.catalogue, arguments.seed)
+    orientation = default_orientation(data_folder())
+    epochs = None if arguments.step is None else even_epochs(ephemeris, arguments.step)
+    track = ground_track(ephemeris, orientation, epochs)
+    log(f"{len(track.utc_ns)} positions, {len(catalogue)} craters of {catalogue.source}")
+    study = study_field_of_view(
+        mcmf_from_spherical(track.latitude_rad, track.longitude_rad, track.altitude_m),
+        catalogue,
+        np.arange(10.0, 160.0 + 1e-9, arguments.fov_step).tolist(),
+        tuple(sorted({*PAPER_COUNTS, arguments.needed})),
+        arguments.needed,
+        arguments.threshold,
+    )
+    figures = {
+        "fov_deg": study.fov_deg,
+        "probability_at_least": {str(n): values for n, values in study.probability_at_least.items()},
+        "selected_fov_deg": study.selected_fov_deg,
+        "selected_every_altitude_deg": study.selected_every_altitude_deg,
+        "needed": study.needed,
+        "threshold": study.threshold,
+        "positions": study.positions,
+        "positions_covered": study.positions_covered,
+        "craters": study.craters,
+        "altitude_km": {
+            "min": float(track.altitude_m.min()) / 1e3,
+            "mean": float(track.altitude_m.mean()) / 1e3,
+            "max": float(track.altitude_m.max()) / 1e3,
+        },
+        "source": study.source,
+        "orientation": orientation.name,
+        "data": [f"crater catalogue {study.source}", f"lunar orientation {orientation.name}"],
+    }
+    covered = f"{study.positions_covered} of {study.positions} positions lie where the catalogue is complete"
+    counts = list(study.probability_at_least)
+    lines = ["  FoV  " + "  ".join(f"P(>={n:2d})" for n in counts)]
+    for k, fov_deg in enumerate(study.fov_deg):
+        row = "  ".join(f"{study.probability_at_least[n][k]:7.4f}" for n in counts)
+        lines.append(f"{fov_deg:5g}  {row}")
+    chosen = "none" if np.isnan(study.selected_fov_deg) else f"{study.selected_fov_deg:g} deg"
+    lines.append(
+        f"smallest with P(>={study.needed}) > {study.threshold:g}: {chosen}; {covered}; {study.source}"
+    )
+    return emit(arguments, figures, text="\n".join(lines))
