@@ -146,6 +146,11 @@ class Settings(BaseSettings):
     backups: Path | None = Field(
         default=None, description="Folder of backups, whose age the metrics and the status state"
     )
+    audit_heads: Path | None = Field(
+        default=None,
+        description="Folder of another machine in which the nightly job writes the head of the audit chain, signed "
+        "with the key in secrets/audit under LINNA_HOME",
+    )
     log_format: Literal["text", "json"] = Field(default="text", description="Form of the log on stderr")
     allowed_hosts: Words = Field(
         default=(),
@@ -241,12 +246,13 @@ class Settings(BaseSettings):
         return value
 
     @property
-    def kept(self) -> dict[str, int]:
+    def kept(self) -> dict[str, Any]:
         """Arguments of the nightly job: for how long, or up to which size, data are kept."""
         return {
             "retention_days": self.retention_days,
             "archive_days": self.archive_days,
             "archive_limit_mib": self.archive_limit_mib,
+            "audit_heads": None if self.audit_heads is None else str(self.audit_heads),
         }
 
     def resolved_database_url(self) -> str:

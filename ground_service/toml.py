@@ -29,20 +29,20 @@ def read_table(text: str | bytes, source: str, what: str) -> dict[str, Any]:
         raise InvalidInput(source, "", what, _met(error)) from None
 
 
-def read_json(octets: str | bytes, source: str, what: str = "JSON", limit_octets: int = 16 << 20) -> Any:
+def read_json(octets: str | bytes, source: str, limit_octets: int = 16 << 20) -> Any:
     """Return the value of a JSON text.
 
     Raises
     ------
     InvalidInput
-        The text is too long or not JSON; `what` names the expected content.
+        The text is too long or not JSON.
     """
     if len(octets) > limit_octets:
         raise InvalidInput(source, "", f"at most {limit_octets} octets", str(len(octets)))
     try:
         return json.loads(octets)
     except (ValueError, RecursionError) as error:
-        raise InvalidInput(source, "", what, _met(error)) from None
+        raise InvalidInput(source, "", "JSON", _met(error)) from None
 
 
 def _met(error: Exception) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.access import store
-from ground_service.access.model import DAYS_LIMIT, Role, Session, Token, TokenRecord, User, UserRecord
+from ground_service.access.model import DAYS_LIMIT, Role, Session, Token, User, UserRecord
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, StoreError
 from ground_service.ground import Ground
@@ -246,7 +246,7 @@ def authenticate(ground: Ground, token: str) -> Caller:
     NotAuthorised
         If the token is unknown, expired or revoked, or if its user is disabled.
     """
-    found = _find_token(ground, token)
+    found = ground.read(store.find_token, token_sha256(token))
     if found is None or found.revoked_utc_ns is not None:
         raise NotAuthorised("token: expected one that 'linna user add' gave out, found another")
     if found.state != "active":
@@ -372,11 +372,6 @@ def _add_user(connection: Connection, name: str, role: str, now: int) -> UserRec
 def _set_role(connection: Connection, user: UserRecord, role: str) -> None:
     if user.role != role:
         store.change_user(connection, user, "role", user.role, role)
-
-
-def _find_token(ground: Ground, token: str) -> TokenRecord | None:
-    with ground.database.reading() as connection:
-        return store.find_token(connection, token_sha256(token))
 
 
 def _note_use(ground: Ground, token_id: int, now: int) -> None:

@@ -57,7 +57,7 @@ _NUMBERS = {
 """Least and greatest value of what a manifest may state; NaN is neither."""
 
 
-def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None] | None = None) -> int:
+def import_archive(ground: Ground, folder: Path) -> int:
     """Import a pass archive; the id of its pass. Importing the same archive again changes nothing.
 
     Every file is checked against the hash that the manifest gives before anything is stored. The telemetry goes
@@ -70,8 +70,6 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     """
     folder = Path(folder)
     manifest, digest = read_manifest(folder)
-    say = progress or (lambda _text: None)
-    say("checking the archive")
     names = checked_files(folder, manifest)
     start_utc_ns, stop_utc_ns = _interval(folder, manifest)
     mission, text = _mission(folder, manifest)
@@ -98,7 +96,6 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
             actor="archive",
         )
     if "downlink.cadu" in stored:
-        say("ingesting the downlink")
         ingest_stored(
             ground,
             stored["downlink.cadu"],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -88,7 +88,7 @@ class _Findings:
 
 
 def verify(
-    ground: Ground, *, rebuild: bool = False, expected_head: audit.Head | None = None, say: Say | None = None
+    ground: Ground, *, rebuild: bool = False, heads: Sequence[audit.Head] = (), say: Say | None = None
 ) -> Verification:
     """Check the integrity of an archive, in one snapshot of the database, without changes.
 
@@ -96,8 +96,8 @@ def verify(
     ----------
     rebuild
         Ingest all raw files again into a scratch database and compare what is derived from them.
-    expected_head
-        Head of the audit chain that was stored elsewhere: its entry must be in the chain.
+    heads
+        Heads of the audit chain that were stored elsewhere: their entries must be in the chain.
     """
     found = _Findings()
     tell = say or (lambda _text: None)
@@ -105,7 +105,7 @@ def verify(
         tell("database")
         _check_database(connection, found)
         tell("audit chain")
-        head = _check_audit(connection, expected_head, found)
+        head = _check_audit(connection, heads, found)
         tell("files")
         good = _check_files(connection, ground.files, found)
         tell("packets")
@@ -133,15 +133,15 @@ def _check_database(connection: Connection, found: _Findings) -> None:
         found.damage(table, key, f"expected the row of {parent} that it names, found none")
 
 
-def _check_audit(connection: Connection, expected: audit.Head | None, found: _Findings) -> audit.Head | None:
+def _check_audit(connection: Connection, heads: Sequence[audit.Head], found: _Findings) -> audit.Head | None:
     found.count("audit", audit.count_entries(connection))
     for broken in audit.broken_entries(connection):
         found.damage("audit", broken.number, broken.reason)
-    if expected is not None and expected.number > 0:
-        stored = audit.read_entry_sha256(connection, expected.number)
-        if stored != expected.sha256:
+    for head in heads:
+        stored = audit.read_entry_sha256(connection, head.number)
+        if head.number > 0 and stored != head.sha256:
             what = "another" if stored is not None else "none"
-            found.damage("audit", expected.number, f"expected the entry of the stored head, found {what}")
+            found.damage("audit", head.number, f"expected the entry of the stored head, found {what}")
     return audit.read_head(connection)
 
 

@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 from ground_service.clock import utc_now_ns
@@ -85,12 +86,10 @@ def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dic
     return {"rows": rows + apply_definition(ground, vehicle)}
 
 
-def _automation(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
-    return run_actions(ground, int(arguments["event"]))
-
-
-def _notification(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
-    return run_actions(ground, int(arguments["event"]), notify=True)
+def _automation(
+    ground: Ground, arguments: Mapping[str, Any], _job_id: str, notify: bool = False
+) -> dict[str, Any]:
+    return run_actions(ground, int(arguments["event"]), notify=notify)
 
 
 WORK: dict[str, Work] = {
@@ -106,7 +105,7 @@ WORK: dict[str, Work] = {
     "redecode": _redecode,
     "re-evaluation": _reevaluate,
     "automation": _automation,
-    "notification": _notification,
+    "notification": partial(_automation, notify=True),
 }
 """Functions of the jobs by kind (`jobs.KINDS`). Each may be run twice with the same arguments and job without harm."""
 

@@ -51,7 +51,7 @@ def send(
     InvalidInput
         The key of the signature is missing.
     """
-    key = None if channel.signing_secret is None else _key(home, channel.signing_secret)
+    key = None if channel.signing_secret is None else key_of(home, channel.signing_secret)
     reason = ""
     for attempt in range(1, ATTEMPTS + 1):
         try:
@@ -101,7 +101,8 @@ def _mail(channel: Channel, identity: str, subject: str, content: Mapping[str, A
     return message
 
 
-def _key(home: Path, name: str) -> bytes:
+def key_of(home: Path, name: str) -> bytes:
+    """Return the key in a file of the folder `secrets` of the service."""
     path = home / SECRETS / name
     try:
         key = path.read_bytes().strip()

@@ -11,6 +11,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding.service import note_timeouts
@@ -57,7 +58,7 @@ class Scheduler:
         ground: Ground,
         dispatcher: Dispatcher,
         drain: Callable[[], object],
-        kept: Mapping[str, int],
+        kept: Mapping[str, Any],
         *,
         plan_hourly: bool = True,
     ) -> None:

@@ -10,19 +10,23 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from ground_service.access.audit_log import audit_head, parse_head
 from ground_service.access.store import delete_answers, delete_ended_sessions
 from ground_service.clock import utc_now_ns
+from ground_service.errors import InvalidInput
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
 from ground_service.performance.service import make_due_reports
 from ground_service.regression.archives import let_go, remove_unfinished
-from ground_service.store import events
+from ground_service.store import audit, events
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
+from ground_service.worker.notifications import key_of, signature
 from lunar.timescales import format_utc
 
 RETENTION_DAYS = 90
@@ -48,6 +52,8 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     removed["archives"] = remove_archives(
         ground, int(arguments.get("archive_days", 0)), int(arguments.get("archive_limit_mib", 0))
     )
+    if arguments.get("audit_heads"):
+        keep_head(ground, Path(arguments["audit_heads"]))
     with ground.database.reading() as connection:
         vehicles = all_vehicles(connection)
     found: list[dict[str, Any]] = []
@@ -116,3 +122,26 @@ def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
         ground.files.remove_leftovers() + remove_leftovers(ground.home, UNPACKING) + remove_unfinished(ground)
     )
     return removed
+
+
+def keep_head(ground: Ground, folder: Path) -> None:
+    """Write the signed head of the audit chain into a file of today; later ones of the day are further lines."""
+    head = audit_head(ground)
+    line = f"{head.number}:{head.sha256}"
+    with (folder / f"{format_utc(utc_now_ns())[:10]}.head").open("a") as stream:
+        stream.write(f"{line} {signature(key_of(ground.home, 'audit'), line.encode())}\n")
+
+
+def kept_heads(ground: Ground, folder: Path) -> list[audit.Head]:
+    """Return the heads in a folder of `keep_head`.
+
+    Raises
+    ------
+    InvalidInput
+        There is none, or one was not signed with the key of this service.
+    """
+    key = key_of(ground.home, "audit")
+    lines = [line.split() for path in folder.glob("*.head") for line in path.read_text().splitlines()]
+    if not lines or any([head, signature(key, head.encode())] != [head, *signed] for head, *signed in lines):
+        raise InvalidInput(str(folder), "", "heads signed with the key of this service", "others or none")
+    return [parse_head(head) for head, _ in lines]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 from linna.commands._ground import add_service_options, open_service
 from linna.output import emit, finish, log
@@ -21,9 +22,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(
         parser,
-        "--head NUMBER:SHA256",
+        "--head HEAD",
         str,
-        "head of the audit chain that was stored elsewhere ('linna audit head')",
+        "head of the audit chain that was stored elsewhere (NUMBER:SHA256 of 'linna audit head'), or the folder "
+        "LINNA_AUDIT_HEADS",
     )
     add_service_options(parser)
     finish(parser, run)
@@ -32,11 +34,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.access.audit_log import parse_head
     from ground_service.worker.integrity import verify
+    from ground_service.worker.upkeep import kept_heads
 
-    head = parse_head(arguments.head) if arguments.head is not None else None
+    given = arguments.head or ""
+    heads = [parse_head(given)] if given and not Path(given).is_dir() else []
     began = time.monotonic()
     with open_service(arguments) as ground:
-        result = verify(ground, rebuild=arguments.rebuild, expected_head=head, say=log)
+        if given and not heads:
+            heads = kept_heads(ground, Path(given))
+        result = verify(ground, rebuild=arguments.rebuild, heads=heads, say=log)
     figures = {**result.model_dump(), "wall_s": round(time.monotonic() - began, 3)}
     lines = [f"{one.kind} {one.key}: {one.reason}" for one in result.damaged[:LINES]]
     if result.damaged_total > len(lines):

@@ -13,10 +13,14 @@ import pytest
 from sqlalchemy import delete, text, update
 from sqlalchemy.exc import DBAPIError
 
+from ground_service.access.service import add_user
 from ground_service.errors import AuditBroken, GroundError
+from ground_service.ground import Ground
 from ground_service.store import audit
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.models import AUDIT, AUDIT_HEAD
+from ground_service.worker.upkeep import nightly
+from linna import cli
 
 PROCESSES, EACH = 4, 25
 
@@ -198,3 +202,34 @@ def test_the_lock_is_only_held_at_the_end(migrated_postgres: Callable[[], str]) 
     assert actors == ["quick", "slow"]
     assert broken(database) == []
     database.engine.dispose()
+
+
+def test_a_chain_that_was_cut_is_found_by_the_heads_of_another_machine(
+    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Triggers that were made again hide the cut from everything inside the database."""
+    (ground.home / "secrets").mkdir()
+    (ground.home / "secrets/audit").write_text("key")
+    heads = tmp_path / "heads"
+    heads.mkdir()
+    for name in ("ann", "bob"):
+        add_user(ground, name, "viewer")
+        nightly(ground, {"audit_heads": str(heads)})
+    command = ["verify", "--home", str(ground.home), "--head", str(heads)]
+    assert cli.run(command) == 0
+    with ground.database.writing() as connection:
+        made = connection.execute(text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'")).all()
+        for name, _ in made:
+            connection.execute(text(f"DROP TRIGGER {name}"))
+        connection.execute(text("DELETE FROM audit WHERE id = 2"))
+        connection.execute(text("UPDATE audit_head SET number = 1, sha256 = (SELECT sha256 FROM audit)"))
+        for _, sql in made:
+            connection.execute(text(sql))
+    assert cli.run(command[:3]) == 0
+    capsys.readouterr()
+    assert cli.run(command) == 1
+    assert "audit 2: expected the entry of the stored head, found none" in capsys.readouterr().out
+    [file] = heads.iterdir()
+    file.write_text(file.read_text().splitlines()[0].replace("1:", "0:") + "\n")
+    assert cli.run(command) == 2
+    assert "expected heads signed with the key of this service" in capsys.readouterr().err
