@@ -107,13 +107,12 @@ def requeue(connection: Connection, job_id: str, attempt: int) -> None:
         Another process has started a new attempt.
     """
     where = {"attempts": attempt}
-    interrupted = ("running",)
     move(
         connection,
         JOB,
         job_id,
         "queued",
-        expected=interrupted,
+        expected=("running",),
         where=where,
         attempts=attempt - 1,
         progress=0.0,

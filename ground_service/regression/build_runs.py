@@ -169,8 +169,9 @@ def read_performance(path: Path) -> dict[str, Any] | None:
     """Return the costs that a build reports of itself; None if they are not finite times of the contract's form."""
     try:
         with path.open("rb") as stream:
-            octets = stream.read(PERFORMANCE_LIMIT_OCTETS + 1)
-        given = read_json(octets, PERFORMANCE, limit_octets=PERFORMANCE_LIMIT_OCTETS)
+            given = read_json(
+                stream.read(PERFORMANCE_LIMIT_OCTETS + 1), PERFORMANCE, PERFORMANCE_LIMIT_OCTETS
+            )
         stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
         yardstick = [float(value) for value in given.get("yardstick", [])]
         every = np.array([*yardstick, *itertools.chain(*stages.values())])

@@ -147,10 +147,15 @@ def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
     written, printed = work / "written", work / "printed.txt"
     for folder in (work / "build", written):
         folder.mkdir()
-    private, data = (ground.home,), ground.data.root
     try:
         report = run_confined(
-            RENDERING, work, written, printed, runner=ground.runner, private=private, data=data
+            RENDERING,
+            work,
+            written,
+            printed,
+            runner=ground.runner,
+            private=(ground.home,),
+            data=ground.data.root,
         )
     except SandboxRefused as error:
         raise RenderingFailed(archive.name, str(error)) from None
