@@ -167,7 +167,7 @@ def install(app: FastAPI) -> None:
         if isinstance(error, StateConflict):
             return problem(409, "conflict", told, request, state=error.found)
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
-        if status < 500 or is_local:
+        if status < 500 or is_local or status == HTTPStatus.NOT_IMPLEMENTED:  # names a library, no path
             return problem(status, title, told, request)
         # The message may contain paths or addresses: it is logged with the id of the request.
         request_id = getattr(request.state, "request_id", None)

@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from studies.paper import make_paper
 
     started = time.monotonic()
+    log(f"this takes about {'22 minutes' if arguments.quick else 'an hour'}; the same command continues it")
     data = data_folder()
     report = make_paper(_workshop(arguments, data), quick=arguments.quick)
     html, pdf = render_pages(report)

@@ -1,6 +1,7 @@
 """A disk that is full or read-only: clear words, nothing lost, and the service says that it is not ready."""
 
 import errno
+import importlib.util
 import os
 import tempfile
 import warnings
@@ -102,3 +103,9 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
     client.post(f"{V1}/telemetry", content=(synthetic_pass.folder / "downlink.cadu").read_bytes())
     with ground.database.reading() as connection:
         assert archive_hash(connection, 1) == found
+
+
+def test_a_missing_library_is_named_with_its_remedy(client: TestClient, monkeypatch: Any) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    answer = client.post(f"{V1}/exports", json={"pass_id": 1, "format": "spk"})
+    assert answer.status_code == 501 and "install linna[spice]" in answer.json()["detail"]
