@@ -45,7 +45,6 @@ def test_the_site_builds_without_a_warning_and_has_the_generated_reference(site:
             if name.split()[1] == group:
                 assert f">{name}<" in commands, name
     assert "/api/v1/passes" in (site / "reference" / "http.html").read_text()
-    assert "LINNA_UPLOAD_LIMIT_MIB" in (site / "reference" / "configuration.html").read_text()
 
 
 def test_pages_load_nothing_from_elsewhere(site: Path) -> None:

@@ -160,8 +160,11 @@ def _detect(arguments: argparse.Namespace) -> int:
         images.append(item)
         if arguments.picture:
             save_png(draw_detections(image, item["detections"]), arguments.picture)
-    text = "\n".join(map(format_detections, images))
-    return emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
+    return emit(
+        arguments,
+        {"images": images, "model_sha256": detector.sha256},
+        "\n".join(map(format_detections, images)),
+    )
 
 
 def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:

@@ -47,12 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
     from reports.render import render_pages
     from studies.paper import make_paper
 
-    started = time.monotonic()
     log(f"this takes about {'22 minutes' if arguments.quick else 'an hour'}; the same command continues it")
-    data = data_folder()
+    started, data = time.monotonic(), data_folder()
     report = make_paper(_workshop(arguments, data), quick=arguments.quick)
     html, pdf = render_pages(report)
-    out: Path = arguments.out
+    out = arguments.out
     (out / "paper.html").write_text(html, encoding="utf-8")
     (out / "paper.pdf").write_bytes(pdf)
     figures: dict[str, Any] = {
@@ -67,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     (out / "paper.json").write_text(as_json(figures) + "\n", encoding="utf-8")
     figures["wall_s"] = round(time.monotonic() - started, 1)
-    return emit(arguments, figures, text=_text(figures))
+    return emit(arguments, figures, _text(figures))
 
 
 def _workshop(arguments: argparse.Namespace, data: Any) -> Any:

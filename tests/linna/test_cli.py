@@ -37,12 +37,6 @@ def test_help_imports_no_numerical_library() -> None:
     assert result.stdout.strip().endswith("[]")
 
 
-@pytest.mark.parametrize("group", sorted(cli.GROUPS))
-def test_each_group_explains_itself(group: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run([group, "--help"]) == 0
-    assert f"linna {group}" in capsys.readouterr().out
-
-
 def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["dmo"]) == 2
     captured = capsys.readouterr()
