@@ -160,11 +160,8 @@ def _detect(arguments: argparse.Namespace) -> int:
         images.append(item)
         if arguments.picture:
             save_png(draw_detections(image, item["detections"]), arguments.picture)
-    return emit(
-        arguments,
-        {"images": images, "model_sha256": detector.sha256},
-        "\n".join(map(format_detections, images)),
-    )
+    text = "\n".join(map(format_detections, images))
+    return emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
 
 
 def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from linna.output import emit, finish, log, progress
+from linna.output import as_json, emit, finish, log, progress
 from linna.parser import option
 
 
@@ -48,7 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     from studies.paper import make_paper
 
     log(f"this takes about {'22 minutes' if arguments.quick else 'an hour'}; the same command continues it")
-    started, data = time.monotonic(), data_folder()
+    started = time.monotonic()
+    data = data_folder()
     report = make_paper(_workshop(arguments, data), quick=arguments.quick)
     html, pdf = render_pages(report)
     out = arguments.out
@@ -62,8 +63,6 @@ def run(arguments: argparse.Namespace) -> int:
         "not_available": dict(report.not_available),
         "data": list(report.data_sources),
     }
-    from linna.output import as_json
-
     (out / "paper.json").write_text(as_json(figures) + "\n", encoding="utf-8")
     figures["wall_s"] = round(time.monotonic() - started, 1)
     return emit(arguments, figures, _text(figures))
