@@ -134,10 +134,15 @@ def repeat_ingests(connection: Connection, now_utc_ns: int) -> None:
     """Queue the failed ingests again whose next attempt is due: what was acknowledged is not given up."""
     due = (
         and_(JOBS.c.attempts == k, JOBS.c.finished_utc_ns <= now_utc_ns - wait_ns)
-        for k, wait_ns in enumerate(REPEAT_NS, start=1)
+        for k, wait_ns in enumerate(REPEAT_NS, 1)
     )
-    failed = (JOBS.c.kind == "ingest", JOBS.c.state == "failed", or_(*due))
-    move_all(connection, JOB, failed, "queued", progress=0.0)
+    move_all(
+        connection,
+        JOB,
+        (JOBS.c.kind == "ingest", JOBS.c.state == "failed", or_(*due)),
+        "queued",
+        progress=0.0,
+    )
 
 
 def end_attempt(

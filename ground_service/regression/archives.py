@@ -446,7 +446,7 @@ def frame_inputs(folder: Path, *, steps: bool = False) -> list[dict[str, Any]]:
     rows = []
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()):
-            row = read_json(line, f"line {number + 1}")
+            row = read_json(line, INPUTS)
             if not isinstance(row["frame"], int) or not isinstance(row["shape"], list):
                 raise ValueError(f"line {number + 1}")
             if row["frame"] >= 0 or steps:

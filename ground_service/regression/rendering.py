@@ -165,8 +165,9 @@ def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
         return ""
     refusal = _refusal(report["exit_status"], tail(printed))
     if not refusal or refusal.startswith(LACKING):
-        cause = refusal or report["cause"] or f"exit status {report['exit_status']}"
-        raise RenderingFailed(archive.name, cause)
+        raise RenderingFailed(
+            archive.name, refusal or report["cause"] or f"exit status {report['exit_status']}"
+        )
     return f"the frames cannot be rendered: {_told(_ARCHIVE.sub('archive', refusal))}"
 
 

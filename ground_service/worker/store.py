@@ -8,8 +8,6 @@ from sqlalchemy import ColumnElement, Connection, exists, func, select
 
 from ground_service.store import repository
 
-PLANNED = ("regression", "analysis", "replay", "rendering")
-
 
 @dataclass(frozen=True, slots=True)
 class WorkCounts:
@@ -37,7 +35,10 @@ def count_work(connection: Connection) -> WorkCounts:
         {state: int(count) for state, count in by_ingest},
         int(connection.execute(select(func.count()).select_from(passes)).scalar_one()),
         # The work of regressions is planned: a verdict waits for its replays.
-        oldest(jobs.created_utc_ns, (jobs.state == "queued") & jobs.kind.not_in(PLANNED)),
+        oldest(
+            jobs.created_utc_ns,
+            (jobs.state == "queued") & jobs.kind.not_in(("regression", "analysis", "replay", "rendering")),
+        ),
         oldest(ingests.received_utc_ns, ingests.state.not_in(("done", "failed"))),
     )
 

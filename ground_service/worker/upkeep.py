@@ -132,16 +132,19 @@ def keep_head(ground: Ground, folder: Path) -> None:
         stream.write(f"{line} {signature(key_of(ground.home, 'audit'), line.encode())}\n")
 
 
-def kept_heads(ground: Ground, folder: Path) -> list[audit.Head]:
-    """Return the heads in a folder of `keep_head`.
+def kept_heads(ground: Ground, given: str) -> list[audit.Head]:
+    """Return the head that is given as NUMBER:SHA256, or the heads in a folder of `keep_head`.
 
     Raises
     ------
     InvalidInput
         There is none, or one was not signed with the key of this service.
     """
+    folder = Path(given)
+    if not folder.is_dir():
+        return [parse_head(given)]
     key = key_of(ground.home, "audit")
     lines = [line.split() for path in folder.glob("*.head") for line in path.read_text().splitlines()]
-    if not lines or any([head, signature(key, head.encode())] != [head, *signed] for head, *signed in lines):
-        raise InvalidInput(str(folder), "", "heads signed with the key of this service", "others or none")
+    if not lines or any([signature(key, head.encode())] != signed for head, *signed in lines):
+        raise InvalidInput(given, "", "heads signed with the key of this service", "others or none")
     return [parse_head(head) for head, _ in lines]

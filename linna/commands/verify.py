@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 
 from linna.commands._ground import add_service_options, open_service
 from linna.output import emit, finish, log
@@ -24,24 +23,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--head HEAD",
         str,
-        "head of the audit chain that was stored elsewhere (NUMBER:SHA256 of 'linna audit head'), or the folder "
-        "LINNA_AUDIT_HEADS",
+        "stored head of the audit chain, NUMBER:SHA256 ('linna audit head'), or a folder LINNA_AUDIT_HEADS",
     )
     add_service_options(parser)
     finish(parser, run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.access.audit_log import parse_head
     from ground_service.worker.integrity import verify
     from ground_service.worker.upkeep import kept_heads
 
-    given = arguments.head or ""
-    heads = [parse_head(given)] if given and not Path(given).is_dir() else []
-    began = time.monotonic()
+    head, began = arguments.head, time.monotonic()
     with open_service(arguments) as ground:
-        if given and not heads:
-            heads = kept_heads(ground, Path(given))
+        heads = kept_heads(ground, head) if head else []
         result = verify(ground, rebuild=arguments.rebuild, heads=heads, say=log)
     figures = {**result.model_dump(), "wall_s": round(time.monotonic() - began, 3)}
     lines = [f"{one.kind} {one.key}: {one.reason}" for one in result.damaged[:LINES]]

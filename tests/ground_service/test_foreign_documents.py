@@ -77,10 +77,8 @@ def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path: Path) -
     ("change", "told"),
     [
         ({"camera": {"width_px": 10**9, "height_px": 512}}, "camera.width_px: expected a number from 1 to"),
-        ({"camera": {"height_px": -1}}, "camera.height_px: expected"),
         ({"camera": {"fov_deg": float("nan")}}, "camera.fov_deg: expected"),
         ({"cadence_s": -1}, "cadence_s: expected"),
-        ({"frames_expected": float("inf")}, "frames_expected: expected"),
         ({"octets": -1}, "expected -1 octets as in the manifest"),
         ({"receptions": b"packet_ticks\n1\n"}, "receptions.csv, line 1: expected a column sequence_count"),
     ],

@@ -226,7 +226,6 @@ def test_a_chain_that_was_cut_is_found_by_the_heads_of_another_machine(
         for _, sql in made:
             connection.execute(text(sql))
     assert cli.run(command[:3]) == 0
-    capsys.readouterr()
     assert cli.run(command) == 1
     assert "audit 2: expected the entry of the stored head, found none" in capsys.readouterr().out
     [file] = heads.iterdir()
