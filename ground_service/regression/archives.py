@@ -220,8 +220,7 @@ def write_flight_view(archive: Path, folder: Path) -> None:
 def coding_of(manifest: dict[str, Any]) -> str:
     """Coding of the downlink of a pass, as its scenario says."""
     try:
-        scenario = read_table(str(manifest.get("scenario_toml") or ""), "scenario", "TOML")
-        return str(scenario["link"]["coding"])
+        return str(read_table(str(manifest.get("scenario_toml") or ""), "scenario", "TOML")["link"]["coding"])
     except (InvalidInput, KeyError, TypeError):
         return "rs"
 

@@ -405,8 +405,10 @@ def _prepare_postgresql(connection: Any, _record: object) -> None:
     """Request durable commits."""
     encoding = connection.info.parameter_status("server_encoding")
     if encoding != "UTF8":
-        reason = f"expected a database with the encoding UTF8, found {encoding}"
-        raise DatabaseUnavailable(f"{connection.info.host}/{connection.info.dbname}", reason)
+        raise DatabaseUnavailable(
+            f"{connection.info.host}/{connection.info.dbname}",
+            f"expected a database with the encoding UTF8, found {encoding}",
+        )
     with connection.cursor() as cursor:
         cursor.execute("SHOW synchronous_commit")
         if cursor.fetchone()[0] not in SAFE_COMMITS:
