@@ -115,7 +115,7 @@ def run_confined(
     """
     if runner is not None:
         return _run_by_runner(runner, request, staged, written, printed)
-    host.check_private(private, [data] if request.reads_data and data else ())
+    host.check_private(private, [data] if data else ())
     return _run_in_sandbox(request, staged, written, printed, data)
 
 
