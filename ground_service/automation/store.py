@@ -15,11 +15,9 @@ from ground_service.missions.model import Mission
 from ground_service.missions.rules import Channel, Rule
 from ground_service.missions.store import ARCHIVE_ACTOR, get_mission, newest_of_spacecraft
 from ground_service.planning import store as planning
-from ground_service.planning.progress import HEARD_TICKS, MARGIN_NS
+from ground_service.planning.progress import HEARD_TICKS, span_of
 from ground_service.store import repository
 from ground_service.store.states import AUTOMATION_ACTION, move
-from ground_service.timekeeping.core import ticks_of_utc_ns
-from ground_service.timekeeping.store import load_correlations
 
 ACTIONS = repository.AUTOMATION_ACTIONS
 
@@ -77,11 +75,10 @@ def delivered_windows(connection: Connection, vehicle: int, until_utc_ns: int) -
     Telemetry from after their end was received, so that the rest of theirs is not expected any more.
     """
     found = []
-    correlations = load_correlations(connection, vehicle)
     for window in planning.open_windows(connection, vehicle):
         if window.pass_id is None or window.stop.utc_ns > until_utc_ns:
             continue
-        after = ticks_of_utc_ns(window.stop.utc_ns + MARGIN_NS, correlations)
+        after = span_of(connection, window).stop_ticks
         if planning.has_reports_between(connection, vehicle, after, after + HEARD_TICKS):
             occurrence = window_of(connection, window.id)
             if occurrence is not None and occurrence.window_state in ("executed", "downlinked"):

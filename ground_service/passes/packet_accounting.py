@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,16 @@ from ground_service.ingest.store import Received, recordings_of_vehicle
 from ground_service.passes import sample_store
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
 from ground_service.passes.model import PassRecord
-from ground_service.passes.span import PassSpan
+from ground_service.passes.span import STARTED, STOPPED, PassSpan
 from ground_service.store import telemetry
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import get_vehicle
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
-from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
 from tmtc.link import LinkSettings
 from tmtc.link_plan import LinkSection
 
 IntArray = NDArray[np.int64]
-
-_EVENT_CODES = {name: code for code, name in DICTIONARY.labels("event_info", "event_id").items()}
-STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
 
 COMPLETENESS_BINS = 60
 GAP_POINTS = 256
@@ -62,7 +58,7 @@ def packet_accounting(
         here = headers["apid"] == apid
         accounts[apid] = account_sequence(headers["ticks"][here], headers["sequence_count"][here])
         lost = np.concatenate([lost, *(_spread(gap) for gap in accounts[apid].gaps)])
-    images = _images(connection, record, span)
+    images = _images(connection, span)
     in_gaps = accounts[APID_DETECTIONS].lost if APID_DETECTIONS in accounts else 0
     edges = _frames_at_edges(record.manifest.get("frames_expected"), images, in_gaps)
     damaged = {} if raw is None else raw.crc_errors
@@ -238,11 +234,9 @@ class _Images:
     after_last_made: int | None
 
 
-def _images(connection: Connection, record: PassRecord, span: PassSpan) -> _Images:
+def _images(connection: Connection, span: PassSpan) -> _Images:
     images = sample_store.sample_arrays(connection, span, "detections", ("ticks", "frame_number"))
-    # An observation ends at the first frame time at or after its planned end: up to one cadence after the span.
-    later = replace(span, stop_ticks=span.stop_ticks + cadence_ticks(record))
-    events = sample_store.sample_arrays(connection, later, "events", ("event_id", "frame_number"))
+    events = sample_store.sample_arrays(connection, span, "events", ("event_id", "frame_number"))
     started = events["frame_number"][events["event_id"] == STARTED]
     stopped = events["frame_number"][events["event_id"] == STOPPED]
     return _Images(
@@ -252,12 +246,6 @@ def _images(connection: Connection, record: PassRecord, span: PassSpan) -> _Imag
         int(started.min()) if started.size else None,
         int(stopped.max()) if stopped.size else None,
     )
-
-
-def cadence_ticks(record: PassRecord) -> int:
-    """Return the interval of the frames of a pass; 0 if it is not stated."""
-    cadence_s = record.manifest.get("cadence_s")
-    return 0 if cadence_s is None else round(cadence_s * TICKS_PER_SECOND)
 
 
 def _frames_at_edges(planned: object, images: _Images, in_gaps: int) -> int | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,7 +33,7 @@ from ground_service.passes.model import (
     SpacecraftEvent,
     Trend,
 )
-from ground_service.passes.packet_accounting import cadence_ticks, packet_accounting
+from ground_service.passes.packet_accounting import packet_accounting
 from ground_service.passes.parameters import series_source, state_unit
 from ground_service.passes.sample_store import detection_frames, detection_samples
 from ground_service.passes.series import (
@@ -46,7 +46,7 @@ from ground_service.passes.series import (
 )
 from ground_service.passes.span import (
     LAST_TICKS,
-    PASS_MARGIN_NS,
+    REACH_NS,
     PassSpan,
     pass_span,
     vehicle_span,
@@ -57,6 +57,7 @@ from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
+from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from reports.values import PacketAccounting
@@ -124,13 +125,12 @@ def completeness_document(ground: Ground, pass_id: int) -> bytes:
             found = packet_accounting(ground.files, connection, record, span)
             return Completeness.of_accounting(found).model_dump_json().encode()
 
-        stop = span.stop_ticks + cadence_ticks(record)
         where = (span.vehicle, span.start_ticks, span.stop_ticks)
         return cache.answer(
             ("completeness", pass_id),
             make,
             start_ticks=span.start_ticks,
-            stop_ticks=stop,
+            stop_ticks=span.stop_ticks,
             state=results_state(connection, *where),
         )
 
@@ -139,9 +139,24 @@ def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassR
     """Return a pass, its interval of on-board time, and the cached answers on its vehicle."""
     record = store.get_pass(connection, pass_id)
     cache = Cache(ground, connection, record.vehicle_id)
-    # An empty interval: telemetry does not change it.
-    span = cache.answer(("span", pass_id), lambda: pass_span(connection, record), start_ticks=1, stop_ticks=0)
-    return record, span, cache
+    return record, _span(connection, cache, record), cache
+
+
+def _span(connection: Connection, cache: Cache, record: PassRecord) -> PassSpan:
+    """Return the interval of a pass, which reports of observations near it and other windows can change."""
+    near = vehicle_span(
+        connection, record.vehicle_id, record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
+    )
+    windows = store.approved_windows(
+        connection, record.vehicle_id, record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
+    )
+    return cache.answer(
+        ("span", record.id),
+        lambda: pass_span(connection, record),
+        start_ticks=near.start_ticks,
+        stop_ticks=near.stop_ticks,
+        state=tuple(windows),
+    )
 
 
 def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Event]:
@@ -160,25 +175,25 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
         found, total = sample_store.event_page(
             connection, span, asked, severities=asked.severity, name=asked.name
         )
-        passes = store.passes_of_vehicle(connection, vehicle, reported=False)
+        cache = Cache(ground, connection, vehicle)
+        spans = {
+            one.id: _span(connection, cache, one)
+            for one in store.passes_of_vehicle(connection, vehicle, reported=False)
+            if any(
+                one.start_utc_ns - REACH_NS <= event.utc_ns <= one.stop_utc_ns + REACH_NS for event in found
+            )
+        }
+
+    def pass_at(utc_ns: int) -> int | None:
+        """Return the newest of the passes that a time belongs to."""
+        ticks = ticks_of_utc_ns(utc_ns, span.correlations)
+        return max(
+            (key for key, one in spans.items() if one.start_ticks <= ticks <= one.stop_ticks), default=None
+        )
+
     return asked.page(
-        (
-            SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=_pass_at(passes, one.utc_ns))
-            for one in found
-        ),
+        (SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=pass_at(one.utc_ns)) for one in found),
         total,
-    )
-
-
-def _pass_at(passes: Sequence[PassRecord], utc_ns: int) -> int | None:
-    """Return the newest of the passes that a time belongs to."""
-    return next(
-        (
-            one.id
-            for one in reversed(passes)
-            if one.start_utc_ns - PASS_MARGIN_NS <= utc_ns <= one.stop_utc_ns + PASS_MARGIN_NS
-        ),
-        None,
     )
 
 

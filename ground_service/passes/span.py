@@ -1,18 +1,32 @@
-"""On-board time interval of a pass."""
+"""On-board time interval of a pass: what its event reports say, and the housekeeping around it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.ingest.redecode import readable_version
+from ground_service.passes import store
 from ground_service.passes.model import PassRecord
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.arrays import IntArray
+from tmtc.codes import EVENTS
+from tmtc.cuc import TICKS_PER_SECOND
+
+_EVENT_CODES = {name: code for code, name in EVENTS}
+STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
+
+HOUSEKEEPING_NS = 60_000_000_000
+"""Housekeeping this far before and after the observations of a pass belongs to it, if no other observation is near."""
+
+REACH_NS = 3_600_000_000_000
+"""Event reports this far outside the planned time of a pass are read."""
+
+LAST_TICKS = (1 << 48) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +44,75 @@ class PassSpan:
         return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]
 
 
-PASS_MARGIN_NS = 60_000_000_000
-"""Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """An observation by its event reports, on-board time; None where a report is missing, `planned` 0 if not stated."""
+
+    start: int | None
+    stop: int | None
+    planned: int = 0
 
 
-LAST_TICKS = (1 << 48) - 1
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """Planned on-board time of a window or pass; `window_id` None: a pass that was defined without a window."""
+
+    start: int
+    stop: int
+    window_id: int | None = None
+
+
+def observations(events: Iterable[tuple[int, int, int]]) -> list[Observation]:
+    """Return the observations of event reports (on-board time, event, planned end), in order of time.
+
+    A start during an observation begins another one: the payload takes the new end and cadence from then on.
+    """
+    found: list[Observation] = []
+    going: Observation | None = None
+    for ticks, event, planned in sorted(events, key=lambda one: (one[0], one[1] == STARTED)):
+        if event == STARTED:
+            if going is not None:
+                found.append(Observation(going.start, ticks - 1, going.planned))
+            going = Observation(ticks, None, planned)
+        else:
+            found.append(
+                Observation(None, ticks) if going is None else Observation(going.start, ticks, going.planned)
+            )
+            going = None
+    return found if going is None else [*found, going]
+
+
+def belongs_to(one: Observation, mine: Planned, others: Sequence[Planned], margin: int) -> bool:
+    """Return whether an observation is of `mine`, and not of one of the other windows.
+
+    An observation has one window: that with the nearest start and end, of equally near ones the last entered. A pass
+    without a window has every observation whose middle it contains.
+
+    Parameters
+    ----------
+    margin
+        Largest distance of an observation from the planned time of its window, ticks.
+    """
+
+    def apart(window: Planned) -> tuple[int, int]:
+        planned = one.planned or window.stop
+        if one.start is None:
+            return abs((one.stop or planned) - window.stop), -(window.window_id or 0)
+        return abs(one.start - window.start) + abs(planned - window.stop), -(window.window_id or 0)
+
+    if one.start is None:
+        inside = (mine.start + mine.stop) // 2 <= (one.stop or 0) <= mine.stop + margin
+    elif mine.window_id is None:
+        return mine.start <= (one.start + (one.stop or one.planned or one.start)) // 2 <= mine.stop
+    else:
+        inside = mine.start - margin <= one.start <= mine.stop + margin
+    return inside and all(apart(mine) <= apart(other) for other in others)
+
+
+def observation_events(connection: Connection, span: PassSpan) -> list[tuple[int, int, int]]:
+    """Return on-board time, event and planned end of the reports of start and end of observations in an interval."""
+    where = span.vehicle, span.dictionary_version, span.start_ticks, span.stop_ticks
+    return store.event_values(connection, *where, (STARTED, STOPPED))
 
 
 def vehicle_span(
@@ -52,12 +130,69 @@ def vehicle_span(
 
 
 def pass_span(connection: Connection, record: PassRecord) -> PassSpan:
-    """The stretch of on-board time of a pass, a margin included."""
-    correlations = load_correlations(connection, record.vehicle_id)
-    return PassSpan(
-        vehicle=record.vehicle_id,
-        start_ticks=ticks_of_utc_ns(record.start_utc_ns - PASS_MARGIN_NS, correlations),
-        stop_ticks=ticks_of_utc_ns(record.stop_utc_ns + PASS_MARGIN_NS, correlations),
-        correlations=correlations,
-        dictionary_version=readable_version(connection, record.vehicle_id),
+    """Return the interval of a pass."""
+    window_id, cadence_s = record.manifest.get("window_id"), record.manifest.get("cadence_s")
+    times = record.start_utc_ns, record.stop_utc_ns
+    return observed_span(connection, record.vehicle_id, *times, window_id=window_id, cadence_s=cadence_s)
+
+
+def observed_span(
+    connection: Connection,
+    vehicle: int,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+    *,
+    window_id: int | None,
+    cadence_s: float | None,
+) -> PassSpan:
+    """Return the interval of the observations of a window, or of a pass without one, with the housekeeping around them.
+
+    Its limits are the event reports of start and end. Where one is missing, the limit is the planned end that the other
+    states, or the planned time. Housekeeping around it is left out where frames or events of another observation are.
+    """
+    correlations = load_correlations(connection, vehicle)
+
+    def ticks_of(utc_ns: int) -> int:
+        return ticks_of_utc_ns(utc_ns, correlations)
+
+    version = readable_version(connection, vehicle)
+    mine = Planned(ticks_of(start_utc_ns), ticks_of(stop_utc_ns), window_id)
+    start, stop = ticks_of(start_utc_ns - HOUSEKEEPING_NS), ticks_of(stop_utc_ns + HOUSEKEEPING_NS)
+    first, last = ticks_of(start_utc_ns - REACH_NS), ticks_of(stop_utc_ns + REACH_NS)
+    others = [
+        Planned(ticks_of(start), ticks_of(stop), key)
+        for key, start, stop in store.approved_windows(
+            connection, vehicle, start_utc_ns - REACH_NS, stop_utc_ns + REACH_NS
+        )
+        if key != window_id
+    ]
+    found = observations(
+        observation_events(connection, PassSpan(vehicle, first, last, correlations, version))
     )
+    own = [one for one in found if belongs_to(one, mine, others, stop - mine.stop)]
+    foreign = [
+        ticks for one in found if one not in own for ticks in (one.start, one.stop) if ticks is not None
+    ]
+    if not own:
+        middle = (mine.start + mine.stop) // 2
+        start = max([start, *(ticks + 1 for ticks in foreign if ticks < middle)])
+        stop = min([stop, *(ticks - 1 for ticks in foreign if ticks >= middle)])
+        return PassSpan(vehicle, start, stop, correlations, version)
+    begin, end = own[0].start, own[-1].stop
+    if begin is None:
+        begin = max([start, *(ticks + 1 for ticks in foreign if ticks < mine.stop)])
+    if end is None:
+        end = (own[-1].planned or mine.stop) + round((cadence_s or 0.0) * TICKS_PER_SECOND)
+        end = min([end, *(ticks - 1 for ticks in foreign if ticks > begin)])
+
+    def is_free(first: int, last: int) -> bool:
+        """Return whether no event and no frame lies between two times, both included."""
+        return not any(first <= ticks <= last for ticks in foreign) and not store.has_frames(
+            connection, vehicle, version, first, last
+        )
+
+    if start < begin and not is_free(start, begin - 1):
+        start = begin
+    if stop > end and not is_free(end + 1, stop):
+        stop = end
+    return PassSpan(vehicle, min(start, begin), max(stop, end), correlations, version)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
@@ -14,6 +14,9 @@ from ground_service.store import repository
 _PASSES = repository.PASSES
 _FRAMES = repository.PASS_FRAMES
 _REPORTS_LISTED = 20
+
+SCIENCE = ("detections", "navigation_states", "frame_outcomes")
+"""Samples that each image has."""
 
 
 def get_pass(connection: Connection, pass_id: int) -> PassRecord:
@@ -176,6 +179,53 @@ def passes_with_images(
     )
     rows = connection.execute(query.order_by(_PASSES.c.start_utc_ns, _PASSES.c.id)).mappings()
     return [PassRecord.of(row) for row in rows]
+
+
+def approved_windows(
+    connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int
+) -> list[tuple[int, int, int]]:
+    """Return number, start and end (UTC, ns) of the approved windows of a vehicle that overlap an interval."""
+    windows = repository.WINDOWS
+    query = select(windows.c.id, windows.c.start_utc_ns, windows.c.stop_utc_ns).where(
+        windows.c.vehicle_id == vehicle,
+        windows.c.decision == "approved",
+        windows.c.start_utc_ns <= stop_utc_ns,
+        windows.c.stop_utc_ns >= start_utc_ns,
+    )
+    return [(int(key), int(start), int(stop)) for key, start, stop in connection.execute(query)]
+
+
+def event_values(
+    connection: Connection,
+    vehicle: int,
+    version: int,
+    start_ticks: int,
+    stop_ticks: int,
+    events: Sequence[int],
+) -> list[tuple[int, int, int]]:
+    """Return on-board time, number and first value (0: none) of the reports of some events in an interval."""
+    table = repository.SAMPLES["events"]
+    query = select(table.c.ticks, table.c.event_id, table.c.value_1).where(
+        table.c.vehicle_id == vehicle,
+        table.c.dictionary_version == version,
+        table.c.ticks.between(start_ticks, stop_ticks),
+        table.c.event_id.in_(events),
+    )
+    return [(int(ticks), int(event), int(value or 0)) for ticks, event, value in connection.execute(query)]
+
+
+def has_frames(connection: Connection, vehicle: int, version: int, start_ticks: int, stop_ticks: int) -> bool:
+    """Return whether results of images were received with an on-board time in an interval."""
+    for kind in SCIENCE:
+        table = repository.SAMPLES[kind]
+        query = select(table.c.ticks).where(
+            table.c.vehicle_id == vehicle,
+            table.c.dictionary_version == version,
+            table.c.ticks.between(start_ticks, stop_ticks),
+        )
+        if connection.execute(query.limit(1)).first() is not None:
+            return True
+    return False
 
 
 def decoding_state(connection: Connection, vehicle: int) -> Hashable:

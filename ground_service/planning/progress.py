@@ -16,21 +16,13 @@ from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.core import account_sequence
 from ground_service.missions import store as missions
+from ground_service.passes.span import STARTED, STOPPED, PassSpan, observation_events, observed_span
 from ground_service.planning import store
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.window_states import WindowFacts, state_of
 from ground_service.store import telemetry
 from ground_service.store.counters import lock_spacecraft
-from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
-from ground_service.timekeeping.store import load_correlations
-from lunar.constants import NANOSECONDS_PER_SECOND
-from tmtc.codes import EVENTS
 
-MARGIN_NS = 60 * NANOSECONDS_PER_SECOND
-"""Reports of the start and the stop may be this far from the planned times."""
-
-_EVENT_CODES = {name: code for code, name in EVENTS}
-STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
 REASON_LENGTH = 500
 HEARD_TICKS = 7 * 86_400 << 16
 AWAITED_TICKS = 12 * 3600 << 16
@@ -48,9 +40,8 @@ def advance_windows(ground: Ground, vehicle: int) -> int:
     changed: list[tuple[int, str]] = []
     with ground.database.writing() as connection:
         lock_spacecraft(connection, vehicle)
-        correlations = load_correlations(connection, vehicle)
         for window in store.open_windows(connection, vehicle):
-            state = _advance(connection, window, correlations)
+            state = _advance(connection, window)
             if state is not None:
                 changed.append((window.id, state))
         for window_id, state in changed:
@@ -79,11 +70,9 @@ def note_reason(ground: Ground, window_id: int, reason: str) -> None:
             store.change_window(connection, window, reason=reason[:REASON_LENGTH])
 
 
-def _advance(
-    connection: Connection, window: WindowRecord, correlations: tuple[TimeCorrelation, ...]
-) -> str | None:
+def _advance(connection: Connection, window: WindowRecord) -> str | None:
     """Return the new state of a window; None if it has not changed, or the window was decided meanwhile."""
-    facts = _facts(connection, window, correlations)
+    facts = _facts(connection, window)
     state, reason = state_of(facts)
     values: dict[str, Any] = {}
     if facts.frames > 0 and window.pass_id is None and state != "failed":
@@ -97,13 +86,23 @@ def _advance(
     return None if state == window.state else state
 
 
-def _facts(
-    connection: Connection, window: WindowRecord, correlations: tuple[TimeCorrelation, ...]
-) -> WindowFacts:
+def span_of(connection: Connection, window: WindowRecord) -> PassSpan:
+    """Return the interval of on-board time of a window."""
+    return observed_span(
+        connection,
+        window.vehicle_id,
+        window.start.utc_ns,
+        window.stop.utc_ns,
+        window_id=window.id,
+        cadence_s=window.cadence_s,
+    )
+
+
+def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
     vehicle, predecessor = window.vehicle_id, window.predecessor_id
-    start = ticks_of_utc_ns(window.start.utc_ns - MARGIN_NS, correlations)
-    stop = ticks_of_utc_ns(window.stop.utc_ns + MARGIN_NS, correlations)
-    events = store.event_ids(connection, vehicle, start, stop)
+    span = span_of(connection, window)
+    start, stop = span.start_ticks, span.stop_ticks
+    events = {event for _, event, _ in observation_events(connection, span)}
     frames = store.received_frames(connection, vehicle, start, stop)
     heard_after = store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS)
     awaited = (

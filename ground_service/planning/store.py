@@ -12,6 +12,7 @@ from ground_service.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version
+from ground_service.passes import store as passes
 from ground_service.planning.core import Commitment
 from ground_service.planning.model import (
     AssessedWindow,
@@ -22,14 +23,13 @@ from ground_service.planning.model import (
     WindowUploads,
 )
 from ground_service.planning.window_states import COMMITTED, PlannedSpan
-from ground_service.store import repository, telemetry
+from ground_service.store import repository
 from ground_service.store.repository import page
 from ground_service.store.states import change_if
 
 WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
 
 _REPORTS = ("housekeeping", "events", "verifications")
-_SCIENCE = ("detections", "navigation_states", "frame_outcomes")
 
 AnyWindow = TypeVar("AnyWindow", bound=Window)
 
@@ -197,31 +197,22 @@ def windows_between(
 
 def add_pass(connection: Connection, window: WindowRecord, mission_id: int | None, now_utc_ns: int) -> int:
     """Add the pass of the telemetry of a window; return its id."""
-    return int(
-        repository.add(
-            connection,
-            repository.PASSES,
-            vehicle_id=window.vehicle_id,
-            name=window.name,
-            start_utc_ns=window.start.utc_ns,
-            stop_utc_ns=window.stop.utc_ns,
-            archive_digest=None,
-            manifest={
-                "window_id": window.id,
-                "cadence_s": window.cadence_s,
-                "frames_expected": window.predicted.frames,
-                **(
-                    {}
-                    if window.uploads is None
-                    else window.uploads.model_dump(mode="json", exclude_unset=True)
-                ),
-            },
-            ephemeris_id=window.ephemeris_id,
-            catalogue_sha256=None,
-            attitude_sha256=None,
-            mission_id=mission_id,
-            created_utc_ns=now_utc_ns,
-        )
+    uploads = {} if window.uploads is None else window.uploads.model_dump(mode="json", exclude_unset=True)
+    return passes.add_pass(
+        connection,
+        vehicle_id=window.vehicle_id,
+        name=window.name,
+        start_utc_ns=window.start.utc_ns,
+        stop_utc_ns=window.stop.utc_ns,
+        mission_id=mission_id,
+        now_utc_ns=now_utc_ns,
+        manifest={
+            "window_id": window.id,
+            "cadence_s": window.cadence_s,
+            "frames_expected": window.predicted.frames,
+            **uploads,
+        },
+        ephemeris_id=window.ephemeris_id,
     )
 
 
@@ -236,17 +227,10 @@ def has_report(connection: Connection, pass_id: int) -> bool:
     return repository.find(connection, repository.REPORTS, pass_id=pass_id) is not None
 
 
-def event_ids(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> set[int]:
-    """Return the numbers of the events that were reported in a span."""
-    version = readable_version(connection, vehicle)
-    found = telemetry.samples(connection, "events", vehicle, start_ticks, stop_ticks, version, ("event_id",))
-    return set(found["event_id"])
-
-
 def received_frames(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> int:
     """Return the number of images of a span in the science packet with the most of them."""
     counts = []
-    for kind in _SCIENCE:
+    for kind in passes.SCIENCE:
         table = repository.SAMPLES[kind]
         query = select(func.count(func.distinct(table.c.ticks))).where(
             *_readable(connection, kind, vehicle), table.c.ticks.between(start_ticks, stop_ticks)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from ground_service.app import create_app
+from ground_service.passes.span import Observation, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
@@ -282,3 +283,58 @@ def test_of_two_decisions_the_second_is_told_the_state_that_won(client: TestClie
     answer = client.patch(f"{V1}/windows/{key}", json={"state": "approved"})
     assert (answer.status_code, answer.json()["state"]) == (409, "failed")
     assert client.post(f"{V1}/windows/{key}/uplink").json()["state"] == "failed"
+
+
+def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestClient) -> None:
+    """Adjacent windows, one that was interrupted and begun again, and one whose images were lost."""
+    spans = ((60, 120), (120, 180), (200, 260), (270, 330))
+    keys = [approved(client, *span, cadence_s=10) for span in spans]
+    sequencer, packets = PacketSequencer(), []
+
+    def send(name: str, seconds: float, values: dict[str, Any]) -> None:
+        ticks, apid = int(ticks_from_utc_ns(START + int(seconds * NS))), DICTIONARY.packet(name).apid
+        packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=sequencer.next(apid)))
+
+    def event(name: str, seconds: float, frame: int, until: float = 0.0) -> None:
+        planned = float(ticks_from_utc_ns(START + int(until * NS))) if until else 0.0
+        values = {"event_id": name, "frame_number": frame, "value_1": planned, "value_2": 0.0}
+        send("event_info", seconds, values)
+
+    def observe(first: int, times: range, stop: float | None, until: float, lost: int = 0) -> None:
+        event("observation_started", times[0], first, until)
+        for k, seconds in enumerate(times):
+            image = {"frame_number": first + k, "image_ticks": int(ticks_from_utc_ns(START + seconds * NS))}
+            send("detections", seconds + 1, {**image, "image_quality": 0, "items": []})
+        del packets[len(packets) - lost :]
+        if stop is not None:
+            event("observation_stopped", stop, first + len(times))
+
+    observe(0, range(60, 120, 10), None, 120)  # the next window begins at its end
+    observe(6, range(120, 180, 10), 181, 180)
+    observe(12, range(200, 230, 10), 225, 260)  # aborted, and begun again
+    observe(15, range(240, 270, 10), 262, 260)
+    observe(18, range(270, 330, 10), 331, 330, lost=4)
+    event("mode_changed", 900, 24)
+    stream = encode_cadus(packets, spacecraft_id=76)
+    assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
+    found = [client.get(f"{V1}/windows/{key}").json() for key in keys]
+    counts = []
+    for one in found:
+        account = client.get(f"{V1}/passes/{one['pass_id']}/completeness").json()
+        images = next(row for row in account["by_apid"] if row["name"] == "detections")
+        counts.append((images["packets"], images["lost_at_edges"]))
+    assert counts == [(6, 0), (6, 0), (6, 0), (2, 4)]
+    assert len({one["pass_id"] for one in found}) == 4
+
+
+def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last() -> None:
+    first, later, same = Planned(0, 100, 1), Planned(30, 130, 2), Planned(0, 100, 3)
+    begun = Observation(30, 131, 130)
+    assert not belongs_to(begun, first, [later], 60) and belongs_to(begun, later, [first], 60)
+    again = Observation(0, 100, 100)
+    assert not belongs_to(again, first, [same], 60) and belongs_to(again, same, [first], 60)
+    assert belongs_to(Observation(None, 104), first, [later], 60)
+    assert not belongs_to(Observation(None, 40), later, [], 60)  # the end of the one before
+    assert not belongs_to(Observation(191, 200, 200), later, [], 60)
+    whole = Planned(-50, 150)
+    assert belongs_to(begun, whole, [], 60) and not belongs_to(Observation(120, 300, 300), whole, [], 60)
