@@ -173,6 +173,19 @@ def chi2_quantile(probability: float, dof: NDArray[np.float64] | float) -> Float
     return np.asarray(2.0 * gammaincinv(np.where(freedom > 0.0, freedom, np.nan) / 2.0, probability))
 
 
+def per_degree(values: FloatArray, dof: FloatArray | IntArray) -> tuple[int, float, float]:
+    """Return of NEES or NIS (n,): known values, mean per degree of freedom, and share inside the 95 % bounds of one.
+
+    The mean is the sum of the values over that of their degrees, 1 for a consistent estimator.
+    """
+    known = np.isfinite(values) & (dof > 0)
+    value, freedom = values[known], np.asarray(dof, dtype=np.float64)[known]
+    if not len(value):
+        return 0, float("nan"), float("nan")
+    within = (value >= chi2_quantile(0.025, freedom)) & (value <= chi2_quantile(0.975, freedom))
+    return len(value), float(value.sum() / freedom.sum()), float(within.mean())
+
+
 def running_mean(values: FloatArray, window: int) -> FloatArray:
     """Mean of the finite values in a centred window, NaN where there is none, (n,)."""
     finite = np.isfinite(values)

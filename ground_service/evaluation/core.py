@@ -116,6 +116,8 @@ class PassInputs:
         Declared 1-sigma error of the reference in radial, transverse and normal.
     limits
         Limits of the verdict.
+    is_experiment
+        Whether the mission description states the error of the orbit that the pass starts from.
     no_mission
         Where the pass refers to no mission description: what is missing and the remedy.
     cpu_percent
@@ -148,6 +150,7 @@ class PassInputs:
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
     limits: Limits = field(default_factory=Limits)
+    is_experiment: bool = False
     no_mission: str = ""
     cpu_percent: float | None = None
     build: str = ""
@@ -194,7 +197,15 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     accounting = _frame_accounting(inputs)
     table = requirements(
         inputs.limits,
-        Evaluated(navigation, detector, accounting, inputs.packets, inputs.housekeeping, inputs.cpu_percent),
+        Evaluated(
+            navigation,
+            detector,
+            accounting,
+            inputs.packets,
+            inputs.housekeeping,
+            inputs.cpu_percent,
+            inputs.is_experiment,
+        ),
     )
     if inputs.no_mission:
         table = without_mission(table, inputs.no_mission)

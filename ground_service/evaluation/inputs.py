@@ -25,6 +25,7 @@ from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground
+from ground_service.missions.catalogues import read_catalogue
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
@@ -43,7 +44,7 @@ from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import Vehicle, get_vehicle
 from ground_service.timekeeping.model import Correlation
 from ground_service.timekeeping.store import correlations_in_force
-from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from lunar.frames import Orientation
 from lunar.messages.ephemeris_files import load_ephemeris
@@ -133,6 +134,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
             limits=Limits(**mission.requirements.model_dump()),
+            is_experiment=mission.experiment.orbit_error_m is not None,
             no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
             build=_onboard_build(connection, span),
             cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
@@ -412,7 +414,7 @@ def _catalogue(ground: Ground, record: PassRecord) -> CraterCatalogue | None:
         return None
     sources = [name for name in record.manifest.get("data_sources", ()) if "catalogue" in str(name)]
     return replace(
-        load_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass"
+        read_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass"
     )
 
 

@@ -53,7 +53,7 @@ def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
             raise InvalidInput(
                 mission.name, "catalogue.sha256", "a catalogue that the ground holds", stated.sha256[:16]
             )
-        return replace(_load(path), source=stated.source or f"catalogue {stated.sha256[:16]}")
+        return replace(read_catalogue(path), source=stated.source or f"catalogue {stated.sha256[:16]}")
     if stated.source is None:
         raise InvalidInput(
             mission.name, "catalogue", "the source or SHA-256 of a crater catalogue", "neither"
@@ -72,12 +72,13 @@ def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
 def _public(data: DataFolder, source: str) -> CraterCatalogue | None:
     for path in (data.catalogue_composite, data.catalogue_lu, data.catalogue_robbins):
         if path is not None:
-            found = _load(path)
+            found = read_catalogue(path)
             if found.source == source:
                 return found
     return None
 
 
-@functools.lru_cache(maxsize=3)
-def _load(path: Path) -> CraterCatalogue:
+@functools.lru_cache(maxsize=4)
+def read_catalogue(path: Path) -> CraterCatalogue:
+    """Return the craters of a file whose content does not change."""
     return load_catalogue(path)

@@ -333,7 +333,8 @@ class Requirements(Section):
     better_than
         Names of baselines whose median error must be larger than that of the estimator.
     consistency_inside_percent
-        Smallest share of NEES and of NIS values inside their two-sided 95 % bounds.
+        Share of the passes of a consistent filter whose mean NEES or NIS is inside the bounds for the number of its
+        independent draws. A mean above the upper bound is a failure.
     """
 
     estimator: Estimator | None = None
@@ -353,6 +354,20 @@ class Requirements(Section):
     storage_percent: Percent | None = None
     temperature_max_c: float | None = None
     temperature_min_c: float | None = None
+
+
+class Experiment(Section):
+    """Start of the windows for measuring how well the payload navigates without help.
+
+    Attributes
+    ----------
+    orbit_error_m, orbit_age_s
+        Error and age of the orbit that estimators start from. Without an error, they start from the best known orbit,
+        and propagating it is no rival.
+    """
+
+    orbit_error_m: Positive | None = None
+    orbit_age_s: NotNegative | None = None
 
 
 class Uploads(Section):
@@ -560,6 +575,7 @@ class Mission(Section):
     observation: Observation = Observation()
     world: DeclaredWorld = DeclaredWorld()
     requirements: Requirements = Requirements()
+    experiment: Experiment = Experiment()
     automation: Automation = Automation()
     approval: Approval = Approval()
     uploads: Uploads | None = None

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 KEPT = 64
 """Answers kept of a database."""
 
-LONGEST_OCTETS = 1 << 20
-"""Answers in octets longer than that are made each time."""
-
 CHANGES_KEPT = 1024
 """Changes of the data that are remembered, and the largest number of new events that are looked at."""
 
@@ -191,8 +188,7 @@ class Cache:
                 if found is None:
                     value = make()
                     found = _Answer(value, state, self._number, self._vehicle, start_ticks, stop_ticks)
-                    if not isinstance(value, bytes) or len(value) <= LONGEST_OCTETS:
-                        self._answers.keep(key, found)
+                    self._answers.keep(key, found)
         answer: T = found.value
         return answer
 

@@ -127,10 +127,10 @@ def get_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassDetail:
     return service.get_pass(ground, pass_id)
 
 
-@passes.get("/passes/{pass_id}/completeness", response_model=Completeness)
-def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Response:
+@passes.get("/passes/{pass_id}/completeness")
+def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Completeness:
     """Count the received and missing packets of a pass."""
-    return Response(service.completeness_document(ground, pass_id), media_type="application/json")
+    return Completeness.of_accounting(service.completeness(ground, pass_id))
 
 
 @passes.get("/passes/{pass_id}/detections")
@@ -152,8 +152,8 @@ def get_states(
 ) -> Response:
     """Return series of one estimator's states: minimum, maximum and mean per interval, gaps marked."""
     names = tuple(value) if value else ("latitude_deg", "longitude_deg", "altitude_m")
-    document = service.states_document(ground, pass_id, estimator, names, max_points)
-    return Response(document, media_type="application/json")
+    found = service.state_series(ground, pass_id, estimator, names, max_points)
+    return JSONResponse({"estimator": estimator, "series": [series_document(one) for one in found]})
 
 
 @passes.get("/passes/{pass_id}/events")
@@ -208,8 +208,7 @@ def get_parameter(
     ground: GroundOf, _: Viewer, pass_id: PassId, parameter: Parameter, max_points: MaxPoints = 1000
 ) -> Response:
     """Return the series of a housekeeping parameter of a pass."""
-    document = service.parameter_document(ground, pass_id, parameter, max_points)
-    return Response(document, media_type="application/json")
+    return JSONResponse(series_document(service.parameter_series(ground, pass_id, parameter, max_points)))
 
 
 @passes.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}", response_model=ParameterSeries)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,10 +17,10 @@ from ground_service.http.times import UtcTime, ns_of
 from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
+from ground_service.missions.catalogues import read_catalogue
 from ground_service.passes import sample_store, store
 from ground_service.passes.cache import Cache
 from ground_service.passes.model import (
-    Completeness,
     Crater,
     Detection,
     Event,
@@ -42,7 +39,6 @@ from ground_service.passes.series import (
     KindSamples,
     Series,
     SeriesReading,
-    series_document,
 )
 from ground_service.passes.span import (
     LAST_TICKS,
@@ -59,7 +55,6 @@ from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
-from lunar.catalogue import CraterCatalogue, load_catalogue
 from reports.values import PacketAccounting
 from tmtc.dictionary import DICTIONARY
 
@@ -110,25 +105,13 @@ def define_pass(
 
 
 def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
-    """Return the accounting of the received and missing packets of a pass."""
-    with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
-        return packet_accounting(ground.files, connection, record, pass_span(connection, record))
-
-
-def completeness_document(ground: Ground, pass_id: int) -> bytes:
-    """As `completeness`, as JSON of `Completeness`, kept until data of the pass are new."""
+    """Return the accounting of the received and missing packets of a pass, kept until data of it are new."""
     with ground.database.reading() as connection:
         record, span, cache = _opened(ground, connection, pass_id)
-
-        def make() -> bytes:
-            found = packet_accounting(ground.files, connection, record, span)
-            return Completeness.of_accounting(found).model_dump_json().encode()
-
         where = (span.vehicle, span.start_ticks, span.stop_ticks)
         return cache.answer(
             ("completeness", pass_id),
-            make,
+            lambda: packet_accounting(ground.files, connection, record, span),
             start_ticks=span.start_ticks,
             stop_ticks=span.stop_ticks,
             state=results_state(connection, *where),
@@ -240,7 +223,7 @@ def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Crater]:
         sha256 = store.get_pass(connection, pass_id).catalogue_sha256
     if sha256 is None:
         return asked.page([], 0)
-    catalogue = _loaded_catalogue(ground.files.path(sha256))
+    catalogue = read_catalogue(ground.files.path(sha256))
     order = np.lexsort((catalogue.ids, -catalogue.diameter_m))
     chosen = order[asked.offset : asked.offset + asked.limit]
     east = (np.degrees(catalogue.longitude_rad[chosen]) + 180.0) % 360.0 - 180.0
@@ -255,16 +238,10 @@ def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Crater]:
     return asked.page((Crater(**dict(zip(names, row, strict=True))) for row in rows), len(catalogue))
 
 
-@lru_cache(maxsize=4)
-def _loaded_catalogue(path: Path) -> CraterCatalogue:
-    """Return a catalogue of the archive, whose files are named by their content."""
-    return load_catalogue(path)
-
-
 def state_series(
     ground: Ground, pass_id: int, estimator: str, values: tuple[str, ...], max_points: int
 ) -> list[Series]:
-    """Series of values of one estimator's states.
+    """Series of values of one estimator's states, kept until data of the pass are new.
 
     Raises
     ------
@@ -273,68 +250,33 @@ def state_series(
     NotFound
         If there is no such pass or no such estimator.
     """
-    with ground.database.reading() as connection:
-        span = pass_span(connection, store.get_pass(connection, pass_id))
-        return _state_series(connection, span, estimator, values, max_points)
-
-
-def states_document(
-    ground: Ground, pass_id: int, estimator: str, values: tuple[str, ...], max_points: int
-) -> bytes:
-    """As `state_series`, as JSON, kept until data of the pass are new."""
-    with ground.database.reading() as connection:
-        _, span, cache = _opened(ground, connection, pass_id)
-
-        def make() -> bytes:
-            found = _state_series(connection, span, estimator, values, max_points)
-            return _json({"estimator": estimator, "series": [series_document(one) for one in found]})
-
-        return cache.answer(
-            ("states", pass_id, estimator, values, max_points),
-            make,
-            start_ticks=span.start_ticks,
-            stop_ticks=span.stop_ticks,
-        )
-
-
-def _state_series(
-    connection: Connection,
-    span: PassSpan,
-    estimator: str,
-    values: tuple[str, ...],
-    max_points: int,
-) -> list[Series]:
     unknown = [value for value in values if value not in STATE_VALUES]
     if unknown:
         raise InvalidInput("states", "value", ", ".join(STATE_VALUES), unknown[0][:80])
     codes = {name: code for code, name in DICTIONARY.labels("navigation_state", "estimator").items()}
-    if estimator not in codes:
-        raise NotFound("estimator", estimator[:80])
-    source = KindSamples("navigation_states", span.dictionary_version, codes[estimator])
-    reading = SeriesReading(connection, span, source, max_points)
-    found = reading.series({value: state_unit(value) for value in values})
+    with ground.database.reading() as connection:
+        _, span, cache = _opened(ground, connection, pass_id)
+        if estimator not in codes:
+            raise NotFound("estimator", estimator[:80])
+        source = KindSamples("navigation_states", span.dictionary_version, codes[estimator])
+        reading = SeriesReading(connection, span, source, max_points)
+        found = cache.answer(
+            ("states", pass_id, estimator, values, max_points),
+            lambda: reading.series({value: state_unit(value) for value in values}),
+            start_ticks=span.start_ticks,
+            stop_ticks=span.stop_ticks,
+        )
     by_name = {one.name: one for one in found}
     return [by_name[value] for value in values]
 
 
 def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: int) -> Series:
-    """The series of one parameter of a pass."""
-    with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
-        return _parameter_series(connection, pass_span(connection, record), parameter, max_points)
-
-
-def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points: int) -> bytes:
-    """As `parameter_series`, as JSON, kept until data of the pass are new."""
+    """The series of one parameter of a pass, kept until data of the pass are new."""
     with ground.database.reading() as connection:
         _, span, cache = _opened(ground, connection, pass_id)
-
-        def make() -> bytes:
-            return _json(series_document(_parameter_series(connection, span, parameter, max_points)))
-
         return cache.answer(
             ("parameter", pass_id, parameter, max_points),
-            make,
+            lambda: _parameter_series(connection, span, parameter, max_points),
             start_ticks=span.start_ticks,
             stop_ticks=span.stop_ticks,
             state=store.declared_state(connection, span.vehicle),
@@ -344,10 +286,6 @@ def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points:
 def _parameter_series(connection: Connection, span: PassSpan, parameter: str, max_points: int) -> Series:
     source, own_span, name, unit = series_source(connection, span, parameter)
     return SeriesReading(connection, own_span, source, max_points).series({name: unit})[0]
-
-
-def _json(document: Mapping[str, Any]) -> bytes:
-    return json.dumps(document, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
 def trend_series(

@@ -101,7 +101,8 @@ def belongs_to(one: Observation, mine: Planned, others: Sequence[Planned], margi
         return abs(one.start - window.start) + abs(planned - window.stop), -(window.window_id or 0)
 
     if one.start is None:
-        inside = (mine.start + mine.stop) // 2 <= (one.stop or 0) <= mine.stop + margin
+        least = mine.start if mine.window_id is None else (mine.start + mine.stop) // 2
+        inside = least <= (one.stop or 0) <= mine.stop + margin
     elif mine.window_id is None:
         return mine.start <= (one.start + (one.stop or one.planned or one.start)) // 2 <= mine.stop
     else:
@@ -187,7 +188,7 @@ def observed_span(
 
     def is_free(first: int, last: int) -> bool:
         """Return whether no event and no frame lies between two times, both included."""
-        return not any(first <= ticks <= last for ticks in foreign) and not store.has_frames(
+        return not any(first <= ticks <= last for ticks in foreign) and not store.received_frames(
             connection, vehicle, version, first, last
         )
 

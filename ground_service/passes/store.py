@@ -15,9 +15,6 @@ _PASSES = repository.PASSES
 _FRAMES = repository.PASS_FRAMES
 _REPORTS_LISTED = 20
 
-SCIENCE = ("detections", "navigation_states", "frame_outcomes")
-"""Samples that each image has."""
-
 
 def get_pass(connection: Connection, pass_id: int) -> PassRecord:
     """Return a pass."""
@@ -214,18 +211,20 @@ def event_values(
     return [(int(ticks), int(event), int(value or 0)) for ticks, event, value in connection.execute(query)]
 
 
-def has_frames(connection: Connection, vehicle: int, version: int, start_ticks: int, stop_ticks: int) -> bool:
-    """Return whether results of images were received with an on-board time in an interval."""
-    for kind in SCIENCE:
-        table = repository.SAMPLES[kind]
-        query = select(table.c.ticks).where(
+def received_frames(
+    connection: Connection, vehicle: int, version: int, start_ticks: int, stop_ticks: int
+) -> int:
+    """Return the number of images of an interval in the science packet with the most of them."""
+    tables = [repository.SAMPLES[kind] for kind in ("detections", "navigation_states", "frame_outcomes")]
+    queries = [
+        select(func.count(func.distinct(table.c.ticks))).where(
             table.c.vehicle_id == vehicle,
             table.c.dictionary_version == version,
             table.c.ticks.between(start_ticks, stop_ticks),
         )
-        if connection.execute(query.limit(1)).first() is not None:
-            return True
-    return False
+        for table in tables
+    ]
+    return max(int(connection.execute(query).scalar_one()) for query in queries)
 
 
 def decoding_state(connection: Connection, vehicle: int) -> Hashable:

@@ -6,13 +6,12 @@ The payload leaves its downlink a minute before the window, takes the tables, ob
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from ground_service.errors import Conflict
+from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.missions.model import Uploads
-from lunar.arrays import FloatArray
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import EphemerisCoverageError
@@ -42,15 +41,6 @@ PART_OCTETS = 16_000
 TicksOf = Callable[[int], int]
 Activity = tuple[int, str, dict[str, object]]
 """UTC of release, telecommand, arguments."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StartState:
-    """State (m, m/s, ICRF axes, Moon-centred) that the estimators of a window start from."""
-
-    utc_ns: int
-    position_icrf_m: FloatArray
-    velocity_icrf_m_s: FloatArray
 
 
 def gap_ns(uploads: Uploads | None) -> int:

@@ -17,6 +17,7 @@ from ground_service.ground import Ground
 from ground_service.ingest.core import account_sequence
 from ground_service.missions import store as missions
 from ground_service.passes.span import STARTED, STOPPED, PassSpan, observation_events, observed_span
+from ground_service.passes.store import received_frames
 from ground_service.planning import store
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.window_states import WindowFacts, state_of
@@ -103,7 +104,7 @@ def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
     span = span_of(connection, window)
     start, stop = span.start_ticks, span.stop_ticks
     events = {event for _, event, _ in observation_events(connection, span)}
-    frames = store.received_frames(connection, vehicle, start, stop)
+    frames = received_frames(connection, vehicle, span.dictionary_version, start, stop)
     heard_after = store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS)
     awaited = (
         frames == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, func, or_, select
+from sqlalchemy import Connection, or_, select
 from sqlalchemy.sql import Select
 
 from ground_service.commanding.store import ids_of_windows
@@ -227,36 +227,20 @@ def has_report(connection: Connection, pass_id: int) -> bool:
     return repository.find(connection, repository.REPORTS, pass_id=pass_id) is not None
 
 
-def received_frames(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> int:
-    """Return the number of images of a span in the science packet with the most of them."""
-    counts = []
-    for kind in passes.SCIENCE:
-        table = repository.SAMPLES[kind]
-        query = select(func.count(func.distinct(table.c.ticks))).where(
-            *_readable(connection, kind, vehicle), table.c.ticks.between(start_ticks, stop_ticks)
-        )
-        counts.append(int(connection.execute(query).scalar_one()))
-    return max(counts)
-
-
 def has_reports_between(connection: Connection, vehicle: int, after_ticks: int, until_ticks: int) -> bool:
     """Return whether the payload reported after a time until another (included); a bound excludes wild clocks."""
+    version = readable_version(connection, vehicle)
     for kind in _REPORTS:
-        ticks = repository.SAMPLES[kind].c.ticks
-        query = select(ticks).where(
-            *_readable(connection, kind, vehicle), ticks > after_ticks, ticks <= until_ticks
+        table = repository.SAMPLES[kind]
+        query = select(table.c.ticks).where(
+            table.c.vehicle_id == vehicle,
+            table.c.dictionary_version == version,
+            table.c.ticks > after_ticks,
+            table.c.ticks <= until_ticks,
         )
         if connection.execute(query.limit(1)).first() is not None:
             return True
     return False
-
-
-def _readable(connection: Connection, kind: str, vehicle: int) -> tuple[Any, ...]:
-    table = repository.SAMPLES[kind]
-    return (
-        table.c.vehicle_id == vehicle,
-        table.c.dictionary_version == readable_version(connection, vehicle),
-    )
 
 
 def _joined() -> Select[Any]:

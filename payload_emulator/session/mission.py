@@ -93,13 +93,13 @@ def default_ports(
     return {name: (telemetry + k, telecommand + k) for k, name in enumerate(stations)}
 
 
-def mission_text(world: World, data: DataFolder) -> str:
-    """Return the mission description of a world as TOML; unknown values are left out."""
-    scenario, camera, link = (
-        world.scenario,
-        world.scenario.camera,
-        LinkSettings(coding=world.scenario.link.coding),
-    )
+def mission_text(world: World, data: DataFolder, experiment: bool = True) -> str:
+    """Return the mission description of a world as TOML; unknown values are left out.
+
+    In an `experiment`, the estimators start from an orbit with the error of the scenario.
+    """
+    scenario, camera = world.scenario, world.scenario.camera
+    link = LinkSettings(coding=scenario.link.coding)
     flown_field = filter_field(scenario.navigation.filter_gravity, scenario.navigation.filter_degree, data)
     sections: dict[str, dict[str, Value]] = {
         "spacecraft": {"id": SPACECRAFT_ID, "name": SPACECRAFT_NAME},
@@ -155,6 +155,9 @@ def mission_text(world: World, data: DataFolder) -> str:
             "needs_daylight": scenario.light.mode != "paper",
         },
         "requirements": _requirements(scenario),
+        "experiment": {
+            "orbit_error_m": (scenario.navigation.initial_position_error_m if experiment else 0.0) or None
+        },
     }
     lines = ["schema_version = 1", f"name = {_toml(scenario.name)}"]
     for name, values in sections.items():
@@ -238,7 +241,7 @@ def live_mission_text(
         latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
         low_deg, high_deg = scenario.window.latitude_band_deg
         band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
-        lines = [mission_text(replace(world, frame_utc_ns=band), data).rstrip()]
+        lines = [mission_text(replace(world, frame_utc_ns=band), data, experiment=False).rstrip()]
         lines += [
             "",
             "[uploads]",
@@ -302,11 +305,6 @@ def _uploaded_tables(scenario: Scenario) -> list[str]:
     anchored = ["orientation"] if "anchored" in estimators else []
     odometry = ["anchor_ephemeris"] if set(estimators) - {"anchored"} else []
     return [*anchored, *odometry, *(["initial_state"] if anchored else [])]
-
-
-def save_mission(folder: Path, world: World, data: DataFolder) -> None:
-    """Write the mission description into an archive."""
-    (folder / MISSION_FILE).write_text(mission_text(world, data), encoding="utf-8")
 
 
 def save_attitudes(

@@ -281,9 +281,9 @@ class RequirementsSection:
     """Limits that the mission description states for verdicts; a negative limit is not stated.
 
     `estimator` names the estimator whose accuracy is judged; the default is the filter if it is used, otherwise the
-    first listed. Errors are 3-D position errors. Consistency is the share of NEES and NIS values inside their 95 %
-    bounds, which is 95 % for a consistent filter; 90 % allows for the few samples of one pass. The temperature is the
-    warning limit of the packet dictionary, the limits of other resources leave a fifth free.
+    first listed. Errors are 3-D position errors. Consistency is the share of passes of a consistent filter whose mean
+    NEES or NIS is inside its bounds. The temperature is the warning limit of the packet dictionary, the limits of other
+    resources leave a fifth free.
     """
 
     estimator: Literal["", "paper", "spherical", "anchored"] = ""

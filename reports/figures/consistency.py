@@ -15,6 +15,7 @@ from reports.statistics import (
     binned,
     chi2_quantile,
     error_3d_m,
+    per_degree,
     quantiles,
     reference_at,
     round_edges,
@@ -42,16 +43,20 @@ def squared_errors(one: NavigationSeries) -> tuple[str, FloatArray] | None:
     return None
 
 
+def quantities(one: NavigationSeries) -> list[tuple[str, FloatArray, FloatArray]]:
+    """Return name, values and degrees of freedom (n,; NaN where unknown) of squared errors and innovations."""
+    errors = squared_errors(one)
+    found = [] if errors is None else [(*errors, np.full(len(errors[1]), 3.0))]
+    if one.nis is not None and one.nis_dof is not None and np.isfinite(one.nis).any():
+        found.append(("NIS", one.nis, np.where(one.nis_dof > 0, one.nis_dof, np.nan)))
+    return found
+
+
 def draw_consistency(
     canvas: Canvas, one: NavigationSeries, styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]
 ) -> None:
     """Normalised errors and innovations, each divided by its degrees of freedom, with the 95 % bounds of one sample."""
-    parts: list[tuple[str, FloatArray, FloatArray]] = []
-    errors = squared_errors(one)
-    if errors is not None:
-        parts.append((f"{errors[0]} per degree of freedom", errors[1], np.full(len(errors[1]), 3.0)))
-    if one.nis is not None and one.nis_dof is not None and np.isfinite(one.nis).any():
-        parts.append(("NIS per degree of freedom", one.nis, np.maximum(one.nis_dof, 1).astype(np.float64)))
+    parts = quantities(one)
     gap = 0.34
     height = (canvas.height_in - _BOTTOM - 0.28 - gap * (len(parts) - 1)) / max(len(parts), 1)
     keep = time.inside(one.utc_ns)
@@ -64,7 +69,7 @@ def draw_consistency(
         scaled, freedom = value[keep] / dof[keep], dof[keep]
         finite = np.isfinite(scaled)
         axes.set_yscale("log")
-        axes.set_title(name)
+        axes.set_title(f"{name} per degree of freedom")
         typical = float(np.median(freedom[finite])) if finite.any() else 3.0
         low = float(chi2_quantile(0.025, typical)) / typical
         high = float(chi2_quantile(0.975, typical)) / typical
@@ -82,14 +87,11 @@ def draw_consistency(
         ]
         axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
         axes.set_yticks([], minor=True)
-        within = np.mean(
-            (value[keep][finite] >= chi2_quantile(0.025, freedom[finite]))
-            & (value[keep][finite] <= chi2_quantile(0.975, freedom[finite]))
-        )
+        count, mean, within = per_degree(value[keep], dof[keep])
         axes.text(
             1.015, 0.96,
-            f"mean {float(np.mean(scaled[finite])):.2f}\n{100 * float(within):.0f} % inside 95 "
-            f"%\n{int(finite.sum())} samples",
+            f"mean {mean:.2f}\n{100 * within:.0f} % inside 95 "
+            f"%\n{count} samples",
             transform=axes.transAxes, va="top", fontsize="small", color=color("muted"), linespacing=1.45,
         )  # fmt: skip
 

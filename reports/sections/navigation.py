@@ -7,12 +7,11 @@ from functools import partial
 
 import numpy as np
 
-from reports.arrays import FloatArray, IntArray
 from reports.document import Block, Cell, Column, Heading, Picture, Table
 from reports.figures import consistency, navigation
 from reports.sections.common import PassView, role_of, slug
 from reports.sections.summary import error_picture
-from reports.statistics import chi2_quantile, containment, error_3d_m, inside, quantiles
+from reports.statistics import containment, error_3d_m, inside, per_degree, quantiles
 from reports.text import NOT_A_VALUE, count_text, number_text
 from reports.values import NavigationSeries
 
@@ -281,36 +280,26 @@ _ERRORS_IN_WORDS = {
 
 
 def consistency_section(view: PassView) -> list[Block]:
-    series = tuple(
-        s
-        for s in view.estimates
-        if consistency.squared_errors(s) is not None
-        or (s.nis is not None and s.nis_dof is not None and np.isfinite(s.nis).any())
-    )
+    series = [one for one in view.estimates if consistency.quantities(one)]
     if not series:
         if not view.estimates:
             return []
         return [Heading("Filter consistency"), view.absent("consistency", "NEES and NIS")]
     blocks: list[Block] = [Heading("Filter consistency")]
     for one in series:
-        squared = consistency.squared_errors(one)
-        both = (
-            squared is not None
-            and one.nis is not None
-            and one.nis_dof is not None
-            and np.isfinite(one.nis).any()
-        )
+        names = [name for name, _, _ in consistency.quantities(one)]
+        errors = names[0] if names[0] != "NIS" else "NEES"
         blocks.append(
             Picture(
                 f"consistency-{slug(one.name)}",
-                f"{_ERRORS_IN_WORDS[squared[0] if squared else 'NEES']} and normalised innovation squared of "
+                f"{_ERRORS_IN_WORDS[errors]} and normalised innovation squared of "
                 f"{one.name}, each "
                 "divided by its degrees of "
                 "freedom, so that one is right. Dots: samples; line: running mean; band: where 95 % of the "
                 "samples of a consistent filter "
                 "lie. NIS alone cannot see an error common to all craters of a frame.",
-                f"{squared[0] if squared else 'NEES'} and NIS of {one.name} over time.",
-                3.4 if both else 2.1,
+                f"{errors} and NIS of {one.name} over time.",
+                3.4 if len(names) > 1 else 2.1,
                 partial(
                     consistency.draw_consistency,
                     one=one,
@@ -322,27 +311,15 @@ def consistency_section(view: PassView) -> list[Block]:
         )
     rows: list[tuple[Cell | str, ...]] = []
     for one in series:
-        squared = consistency.squared_errors(one)
-        candidates: list[tuple[str, FloatArray | None, FloatArray | IntArray | None]] = [
-            ("NIS", one.nis, one.nis_dof)
-        ]
-        if squared is not None:
-            candidates.insert(0, (*squared, np.full(len(one.utc_ns), 3.0)))
-        for name, value, dof in candidates:
-            if value is None or dof is None or not np.isfinite(value).any():
-                continue
-            good = np.isfinite(value) & (dof > 0)
-            freedom = np.asarray(dof, dtype=np.float64)[good]
-            inside_bounds = (value[good] >= chi2_quantile(0.025, freedom)) & (
-                value[good] <= chi2_quantile(0.975, freedom)
-            )
+        for name, value, dof in consistency.quantities(one):
+            count, mean, inside_bounds = per_degree(value, dof)
             rows.append(
                 (
                     Cell(one.name, swatch=role_of(view.styles[one.name][0])),
                     name,
-                    count_text(int(good.sum())),
-                    number_text(float(np.sum(value[good]) / np.sum(freedom)), 2),
-                    number_text(100.0 * float(np.mean(inside_bounds)), 1),
+                    count_text(count),
+                    number_text(mean, 2),
+                    number_text(100.0 * inside_bounds, 1),
                 )
             )
     if rows:

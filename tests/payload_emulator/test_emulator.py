@@ -125,13 +125,15 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
     archive: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
     from ground_service.evaluation.inputs import load_pass_inputs
+    from ground_service.ground import open_ground
     from ground_service.passes.archive_import import import_archive
     from ground_service.timekeeping.recorrelation import in_force
-    from ground_service.worker.follow_up import open_following
+    from ground_service.worker.follow_up import follow_in_process
 
     _, out = archive
     true = np.loadtxt(out / "frame_times.csv", delimiter=",", skiprows=1, dtype=np.int64)
-    with open_following(tmp_path / "home") as ground:
+    with open_ground(tmp_path / "home") as ground:
+        follow_in_process(ground)
         key = import_archive(ground, out)
         found = load_pass_inputs(ground, key).detections
         lines = in_force(ground, 1)

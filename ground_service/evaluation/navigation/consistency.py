@@ -1,13 +1,12 @@
-"""Consistency of an estimator by the standard definitions: NEES, NIS, their bounds, and the share inside the bounds.
+"""Consistency of an estimator by the standard definitions: NEES, NIS and their bounds.
 
 The normalised estimation error squared of an error e (d,) with covariance P (d, d) is e' P^-1 e, the normalised
 innovation squared that of an innovation with its covariance. For a consistent Gaussian estimator each is chi-square
 with d degrees of freedom, and the sum over n independent ones with n d.
 
-`nees` with full covariances gives one number per sample, `summary` the row of a table, and `met` whether a mean is
-inside its bounds (None: unknown). If only standard deviations are available, use `squared_normalised_errors` and print
-`DIAGONAL_NAME`: a sum over the diagonal has the mean of a NEES but not its distribution. Samples of one pass are not
-independent; `summary` estimates the number of independent samples from their autocorrelation, unless it is given.
+`nees` with full covariances gives one number per sample. If only standard deviations are available, use
+`squared_normalised_errors` and print `DIAGONAL_NAME`: a sum over the diagonal has the mean of a NEES but not its
+distribution. Samples of one pass are not independent: the bounds of their mean are for the number of independent ones.
 
 References
 ----------
@@ -15,8 +14,6 @@ Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,11 +73,6 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     return values.reshape(shape)
 
 
-def nis(innovation: ArrayLike, covariance: ArrayLike) -> FloatArray:
-    """Return the normalised innovations squared, v' S^-1 v; shapes and NaN as in `nees`."""
-    return nees(innovation, covariance)
-
-
 def squared_normalised_errors(error: ArrayLike, sigma: ArrayLike) -> FloatArray:
     """Return sums of squared errors over variances, errors and standard deviations (..., d): `DIAGONAL_NAME`.
 
@@ -103,23 +95,15 @@ def bounds(degrees: ArrayLike, probability: float = PROBABILITY) -> tuple[FloatA
     return np.asarray(chi2.ppf(tail, freedom)), np.asarray(chi2.ppf(1.0 - tail, freedom))
 
 
-def average_bounds(degrees: float, samples: float, probability: float = PROBABILITY) -> tuple[float, float]:
-    """Return the two-sided bounds of the mean of independent values (ANEES, average NIS) with equal degrees of freedom.
+def bounds_per_degree(degrees: float, samples: float, probability: float) -> tuple[float, float]:
+    """Return the two-sided bounds of the mean of independent values (ANEES, average NIS) per degree of freedom.
 
     `samples` may be fractional, because correlated samples count as fewer independent ones. NaN for less than one.
     """
-    if not samples >= 1.0 or not degrees > 0.0:
+    if not samples >= 1.0:
         return float("nan"), float("nan")
     low, high = bounds(samples * degrees, probability)
-    return float(low) / samples, float(high) / samples
-
-
-def share_inside(values: ArrayLike, degrees: ArrayLike, probability: float = PROBABILITY) -> float:
-    """Return the share of known values inside the bounds of a single value; NaN where none is known."""
-    value = np.asarray(values, dtype=np.float64)
-    low, high = bounds(np.broadcast_to(np.asarray(degrees), value.shape), probability)
-    known = np.isfinite(value) & np.isfinite(low)
-    return float(np.mean((value >= low)[known] & (value <= high)[known])) if known.any() else float("nan")
+    return float(low) / (samples * degrees), float(high) / (samples * degrees)
 
 
 def independent_samples(values: ArrayLike) -> float:
@@ -144,80 +128,3 @@ def independent_samples(values: ArrayLike) -> float:
             break
         time += 2.0 * correlation
     return min(max(count / time, 1.0), float(count))
-
-
-@dataclass(frozen=True, slots=True)
-class ConsistencySummary:
-    """NEES or NIS of a series compared with its distribution.
-
-    Attributes
-    ----------
-    samples, unknown
-        Number of known and unknown values.
-    mean_per_degree
-        Sum of values over sum of degrees of freedom: 1 for a consistent estimator.
-    low_per_degree, high_per_degree
-        Bounds of that mean for the number of independent samples.
-    independent
-        Effective number of independent samples.
-    inside
-        Share of values inside the bounds of a single value.
-    probability
-        Probability of all bounds.
-    """
-
-    samples: int
-    unknown: int
-    mean_per_degree: float
-    low_per_degree: float
-    high_per_degree: float
-    independent: float
-    inside: float
-    probability: float
-
-    @property
-    def met(self) -> bool | None:
-        """Whether the mean is inside its bounds; None if unknown."""
-        if not np.isfinite(self.mean_per_degree) or not np.isfinite(self.low_per_degree):
-            return None
-        return self.low_per_degree <= self.mean_per_degree <= self.high_per_degree
-
-
-def summary(
-    values: ArrayLike,
-    degrees: ArrayLike,
-    independent: float | None = None,
-    probability: float = PROBABILITY,
-) -> ConsistencySummary:
-    """Return the consistency of a series (n,) of values in time order with given degrees of freedom.
-
-    Parameters
-    ----------
-    values
-        NEES or NIS, NaN where unknown.
-    degrees
-        Degrees of freedom, a number or (n,); a value with zero degrees counts as unknown.
-    independent
-        Number of independent samples, if known (runs of a Monte Carlo); None: estimated from the series.
-    """
-    value = np.asarray(values, dtype=np.float64).reshape(-1)
-    freedom = np.broadcast_to(np.asarray(degrees, dtype=np.float64), value.shape)
-    known = np.isfinite(value) & (freedom > 0.0)
-    count = int(np.count_nonzero(known))
-    if count == 0:
-        nan = float("nan")
-        return ConsistencySummary(0, len(value), nan, nan, nan, 0.0, nan, probability)
-    ratio = value[known] / freedom[known]
-    worth = independent_samples(ratio) if independent is None else float(independent)
-    typical = float(np.mean(freedom[known]))
-    low, high = average_bounds(typical, worth, probability)
-    return ConsistencySummary(
-        samples=count,
-        unknown=len(value) - count,
-        mean_per_degree=float(value[known].sum() / freedom[known].sum()),
-        low_per_degree=low / typical,
-        high_per_degree=high / typical,
-        independent=worth,
-        inside=share_inside(value, freedom, probability),
-        probability=probability,
-    )

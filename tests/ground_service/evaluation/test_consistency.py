@@ -8,14 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ground_service.evaluation.navigation.consistency import (
-    average_bounds,
     bounds,
+    bounds_per_degree,
     independent_samples,
     nees,
-    nis,
-    share_inside,
     squared_normalised_errors,
-    summary,
 )
 
 
@@ -24,7 +21,6 @@ def test_a_correlated_error_is_weighted_with_the_whole_matrix() -> None:
     # 4/4 + 1/3.
     covariance = [[4.0, 2.0], [2.0, 3.0]]
     assert nees([2.0, -1.0], covariance) == pytest.approx(3.0, rel=1e-12)
-    assert nis([2.0, -1.0], covariance) == pytest.approx(3.0, rel=1e-12)
     assert squared_normalised_errors([2.0, -1.0], np.sqrt([4.0, 3.0])) == pytest.approx(4.0 / 3.0, rel=1e-12)
 
 
@@ -69,43 +65,8 @@ def test_bounds_are_those_of_printed_tables() -> None:
     np.testing.assert_allclose(high, [5.024, 9.348, 14.449, 129.561], atol=6e-4)
     np.testing.assert_allclose(low, [0.001, 0.216, 1.237, 74.222], atol=6e-4)
     # Bar-Shalom, Li, Kirubarajan, example 5.4.2: 50 runs of 2 degrees, [1.5, 2.6] (74.22/50 and 129.56/50).
-    assert average_bounds(2, 50) == pytest.approx((1.4844, 2.5912), abs=1e-4)
-    assert np.isnan(bounds(0)[0]) and np.isnan(average_bounds(6, 0.5)).all()
-
-
-def test_the_share_inside_counts_known_values_only() -> None:
-    values = [0.2, 0.3, 5.0, 9.3, 9.4, np.nan]
-    assert share_inside(values, 3) == pytest.approx(3 / 5)
-    assert share_inside([1.0, 1.0], [3, 0]) == 1.0
-    assert np.isnan(share_inside([np.nan], 3))
-
-
-def test_a_summary_of_few_values_by_hand() -> None:
-    found = summary([2.0, 6.0, np.nan, 4.0], [2, 4, 4, 0], independent=2)
-    # Sums 8 and 6 over the two known values, mean 3 degrees: bounds of chi-square(6) over 6.
-    assert (found.samples, found.unknown) == (2, 2)
-    assert found.mean_per_degree == pytest.approx(8.0 / 6.0)
-    assert found.low_per_degree == pytest.approx(1.2373 / 6.0, abs=1e-4)
-    assert found.high_per_degree == pytest.approx(14.4494 / 6.0, abs=1e-4)
-    assert found.inside == 1.0 and found.met is True
-
-
-@pytest.mark.parametrize(("factor", "met"), [(1.0, True), (0.5, False), (2.0, False)])
-def test_consistent_samples_meet_their_bounds_and_others_do_not(factor: float, met: bool) -> None:
-    rng = np.random.default_rng(4)
-    root = np.tril(rng.standard_normal((3, 3))) + 2.0 * np.eye(3)
-    errors = rng.standard_normal((400, 3)) @ root.T
-    values = nees(errors, factor * root @ root.T)
-    assert summary(values, 3, independent=400).met is met
-    if met:
-        # 400 draws: the share is known to 0.011.
-        assert share_inside(values, 3) == pytest.approx(0.95, abs=0.035)
-
-
-def test_nothing_known_is_neither_met_nor_missed() -> None:
-    found = summary([np.nan, np.nan], 3)
-    assert (found.samples, found.unknown, found.met) == (0, 2, None)
-    assert np.isnan(found.inside)
+    assert bounds_per_degree(2, 50, 0.95) == pytest.approx((1.4844 / 2, 2.5912 / 2), abs=1e-4)
+    assert np.isnan(bounds(0)[0]) and np.isnan(bounds_per_degree(6, 0.5, 0.95)).all()
 
 
 def test_correlated_samples_are_worth_fewer() -> None:

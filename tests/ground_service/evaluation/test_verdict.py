@@ -68,7 +68,26 @@ CONSISTENT = series(
     anchor_reads_after_start=3,
     reset_trigger=("initialization", "time_gap", "none", "none", "manual_step", *["none"] * 5),
 )
-"""With 95 % chi-square lies in 0.0506 to 7.378 for two degrees of freedom, in 0.2158 to 9.348 for three (tables)."""
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "factor", "status", "draws", "bounds"),
+    [
+        (15, 3.1, "met", 1, "0.07 to 3.12"),  # one draw: 0.2158 / 3, 9.348 / 3 (tables of chi-square)
+        (15, 3.2, "not met", 1, "0.07 to 3.12"),
+        (3600, 2.2, "not met", 10, "0.56 to 1.57"),  # ten draws: 16.791 / 30, 46.979 / 30
+        (3600, 1.5, "met", 10, "0.56 to 1.57"),
+        (3600, 0.1, "met", 10, "0.56 to 1.57"),  # a cautious filter is a matter of many passes
+    ],
+)
+def test_nees_is_judged_by_the_bound_for_its_independent_draws(
+    gap_s: int, factor: float, status: str, draws: int, bounds: str
+) -> None:
+    times = np.arange(N, dtype=np.int64) * gap_s * 10**9
+    flown = replace(series("anchored", nees=np.full(N, 3.0 * factor)), utc_ns=times)
+    judged = row("consistency.nees", Limits("anchored", consistency_inside_percent=95.0), found(flown))
+    assert (judged.value, judged.status) == (pytest.approx(factor), status)
+    assert judged.note.endswith(f"{draws} independent draws, 95 % of them within {bounds}")
 
 
 @pytest.mark.parametrize(
@@ -76,8 +95,6 @@ CONSISTENT = series(
     [
         ("accuracy.median", "median_error_m", 50.0, 50.0, found()),
         ("accuracy.p95", "p95_error_m", 90.0, 90.0, found()),
-        ("consistency.nees", "consistency_inside_percent", 75.0, 75.0, found(CONSISTENT)),
-        ("consistency.nis", "consistency_inside_percent", 75.0, 75.0, found(CONSISTENT)),
         (
             "completeness.packets", "packets_percent", 80.0, 80.0,
             found(packets=PacketAccounting(80, lost=15, lost_at_edges=5)),
@@ -256,9 +273,13 @@ def test_the_table_of_a_pass_in_full() -> None:
             ("better_than.snapshot", "better than snapshot", "m", 50.0, 70.0, True, "met", "median 3-D error"),
             ("better_than.smoothed", "better than smoothed", "m", 50.0, 30.0, True, "not judged",
              "median 3-D error"),
-            ("consistency.nees", "NEES inside 95 % bounds", "%", 75.0, 90.0, False, "not met",
-             "position error against the covariance of estimate and reference"),
-            ("consistency.nis", "NIS inside 95 % bounds", "%", 75.0, 90.0, False, "not met", "image innovations"),
+            ("consistency.nees", "mean NEES per degree of freedom", "", pytest.approx(31.12 / 24),
+             pytest.approx(7.8147 / 3, abs=1e-4), True, "met",
+             "position error against the covariance of estimate and reference; 1 independent draws, "
+             "90 % of them within 0.12 to 2.60"),
+            ("consistency.nis", "mean NIS per degree of freedom", "", pytest.approx(22.9 / 16),
+             pytest.approx(1.891, abs=1e-3), True, "met",
+             "image innovations; 4.4 independent draws, 90 % of them within 0.36 to 1.89"),
             ("completeness.packets", "packets received of those expected", "%", 75.0, 75.0, False, "met",
              "1\u202f500 of 2\u202f000 packets"),
             ("completeness.frames", "frames reported of those expected", "%", 75.0, 90.0, False, "not met",

@@ -152,12 +152,3 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive: Archive) -> None
         one.join(20)
     assert found == [1, 1, 1, 1]
     assert not turns
-
-
-def test_long_answers_are_made_each_time(archive: Archive) -> None:
-    with archive.ground.database.reading() as connection:
-        for size, kept in ((module.LONGEST_OCTETS, True), (module.LONGEST_OCTETS + 1, False)):
-            octets = [bytes(size), b"new"]
-            cache = Cache(archive.ground, connection, archive.vehicle)
-            assert cache.answer(size, lambda octets=octets: octets[0]) == octets[0]
-            assert (cache.answer(size, lambda octets=octets: octets[1]) == octets[0]) is kept

@@ -12,7 +12,7 @@ from sqlalchemy import text
 
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.service import define_pass, list_events
@@ -27,7 +27,7 @@ from ground_service.timekeeping.recorrelation import (
     residuals,
 )
 from ground_service.timekeeping.service import TimePoint, correlate, correlate_again, correlations_on_record
-from ground_service.worker.follow_up import open_following
+from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
 from linna.cli import run
 from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
@@ -144,7 +144,8 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(
     found = []
     for number, seed in enumerate(range(4)):
         rng = random.Random(seed)
-        with open_following(tmp_path / f"home{number}") as ground:
+        with open_ground(tmp_path / f"home{number}") as ground:
+            follow_in_process(ground)
             steps: list[tuple[str, Any]] = [("file", octets) for octets in cut]
             steps += [("times", spacecraft.reports[k : k + 11]) for k in range(0, REPORTS, 10)]
             rng.shuffle(steps)
