@@ -332,11 +332,7 @@ def _navigation(
     times = _sample_times(inputs)
     track = reference_states(reference, inputs.orientation, times)
     path_m = _path(track)
-    series = [
-        _estimate_series(inputs, samples, track, path_m)
-        for samples in inputs.navigation
-        if len(samples.utc_ns)
-    ]
+    series = _estimates(inputs, track, path_m)
     series += _smoothed(inputs, track, path_m, provenance, remarks)
     uncovered = int(np.count_nonzero(~track.covered))
     if uncovered:
@@ -367,11 +363,11 @@ def _without_reference(inputs: PassInputs) -> tuple[NavigationSeries, ...]:
     """What the estimators reported, with no error of any of it."""
     track = reference_states(None, None, _sample_times(inputs))
     path_m = np.full(len(track.utc_ns), np.nan)
-    return tuple(
-        _estimate_series(inputs, samples, track, path_m)
-        for samples in inputs.navigation
-        if len(samples.utc_ns)
-    )
+    return tuple(_estimates(inputs, track, path_m))
+
+
+def _estimates(inputs: PassInputs, track: ReferenceStates, path_m: FloatArray) -> list[NavigationSeries]:
+    return [_estimate_series(inputs, one, track, path_m) for one in inputs.navigation if len(one.utc_ns)]
 
 
 def _with_extras(

@@ -13,6 +13,7 @@ import numpy as np
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.evaluation.inputs import reference_of
+from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of
 from ground_service.missions.frames import assumed_camera, camera_of, declared_frames
@@ -22,13 +23,10 @@ from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import pass_span
 from ground_service.store.stored_files import register_file
-from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue, format_catalogue
 from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris
-from lunar.frames import Orientation, spherical_from_mcmf
 from lunar.messages.ephemeris_files import load_ephemeris
-from lunar.timescales import tdb_s_from_utc_ns
 
 TRACK_STEP_S = 15.0
 MARGIN_M = 10_000.0
@@ -86,7 +84,9 @@ def _store_catalogue(ground: Ground, mission: Mission, reference: Ephemeris, rec
     camera = camera_of(mission.camera)
     half_diagonal = math.sqrt(2.0) * math.tan(camera.fov_rad / 2.0)
     reach = half_diagonal + math.tan(math.radians(abs(mission.camera.tilt_deg or 0.0)))
-    track = _track(reference, orientation, record.start_utc_ns, record.stop_utc_ns)
+    step_ns = round(TRACK_STEP_S * NANOSECONDS_PER_SECOND)
+    utc_ns = np.arange(record.start_utc_ns, record.stop_utc_ns + step_ns, step_ns, dtype=np.int64)
+    track = reference_states(reference, orientation, utc_ns)
     octets = format_catalogue(along_track(catalogue, track, reach)).encode("ascii")
     stored = ground.files.put_octets(octets)
     with ground.database.writing() as connection:
@@ -95,32 +95,20 @@ def _store_catalogue(ground: Ground, mission: Mission, reference: Ephemeris, rec
     return stored.sha256
 
 
-def along_track(catalogue: CraterCatalogue, track_mcmf_m: FloatArray, reach: float) -> CraterCatalogue:
-    """Return the craters that a camera can see from any position (n, 3) of a track, MCMF.
+def along_track(catalogue: CraterCatalogue, track: ReferenceStates, reach: float) -> CraterCatalogue:
+    """Return the craters that a camera can see from any covered position of a track.
 
     Parameters
     ----------
     reach
         Distance on the ground from the sub-satellite point to the edge of the view, over the altitude.
     """
-    latitude, longitude, altitude_m = spherical_from_mcmf(track_mcmf_m)
     near = [
         catalogue.near(
-            float(latitude[i]),
-            float(longitude[i]),
-            float(min(reach * altitude_m[i], REACH_LIMIT * MOON_RADIUS_M)) + MARGIN_M,
+            float(track.latitude_rad[i]),
+            float(track.longitude_rad[i]),
+            float(min(reach * track.altitude_m[i], REACH_LIMIT * MOON_RADIUS_M)) + MARGIN_M,
         )
-        for i in range(len(track_mcmf_m))
+        for i in np.flatnonzero(track.covered)
     ]
-    chosen = np.unique(np.concatenate(near)) if near else np.zeros(0, dtype=np.int64)
-    return catalogue.select(chosen)
-
-
-def _track(reference: Ephemeris, orientation: Orientation, start_utc_ns: int, stop_utc_ns: int) -> FloatArray:
-    """Return the covered positions (n, 3) of the reference during a pass, MCMF."""
-    step_ns = round(TRACK_STEP_S * NANOSECONDS_PER_SECOND)
-    utc_ns = np.arange(start_utc_ns, stop_utc_ns + step_ns, step_ns, dtype=np.int64)
-    utc_ns = utc_ns[reference.covers(utc_ns)]
-    position_m, _ = reference.at(utc_ns)
-    rotation = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns)))
-    return np.asarray(np.einsum("nij,nj->ni", rotation, position_m))
+    return catalogue.select(np.unique(np.concatenate(near)) if near else np.zeros(0, dtype=np.int64))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import uuid
 from collections.abc import Mapping
@@ -206,11 +205,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write a JSON document whole or not at all."""
-    _write_whole(path, json.dumps(plain(value), indent=2).encode())
 
 
 def _write_whole(path: Path, octets: bytes) -> None:

@@ -248,7 +248,7 @@ def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
             if share is not None and known.any():
                 degrees = float(values[1][known].mean())
                 low, bound = bounds_per_degree(degrees, values[2], share / 100.0)
-                note += f"; {values[2]:.3g} independent draws, {share:g} % of them within {low:.2f} to {bound:.2f}"
+                note += f"; {low:.2f} to {bound:.2f} with {share:g} % for {values[2]:.3g} independent draws"
         yield _row(
             f"consistency.{key}",
             f"mean {key.upper()} per degree of freedom",

@@ -17,7 +17,6 @@ from itertools import chain
 from typing import IO
 
 import numpy as np
-from sqlalchemy import Connection
 
 from ground_service.errors import EvaluationError, storage_error
 from ground_service.evaluation.core import PassInputs, evaluate_pass
@@ -34,8 +33,9 @@ from ground_service.ground import Ground
 from ground_service.passes import store
 from ground_service.passes.parameters import packets_by_name
 from ground_service.passes.service import get_pass
-from ground_service.passes.span import PassSpan, pass_span
+from ground_service.passes.span import pass_span
 from ground_service.store.files import INCOMING, unfinished_prefix
+from ground_service.timekeeping.store import load_correlations
 from lunar.frames import mcmf_from_spherical
 from tmtc.errors import MissingLibrary
 
@@ -111,7 +111,7 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
         return map_octets(inputs, kind, request.states)
     detail = get_pass(ground, request.pass_id)
     with ground.database.reading() as connection:
-        correlations = _span(connection, request.pass_id).correlations
+        correlations = load_correlations(connection, store.get_pass(connection, request.pass_id).vehicle_id)
     number = detail.spacecraft_id
     craft = messages.Craft(messages.craft_name(inputs, number), number, correlations)
     if kind in ORBITS:
@@ -125,7 +125,9 @@ def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[t
     """Yield name and content of each file of a format; EvaluationError without any."""
     if chosen.name == "parquet":
         with ground.database.reading() as connection:
-            packets = packets_by_name(connection, _span(connection, request.pass_id))
+            packets = packets_by_name(
+                connection, pass_span(connection, store.get_pass(connection, request.pass_id))
+            )
             yield from _some(
                 parquet_files(packets, {"pass": str(request.pass_id)}), request.pass_id, "packets"
             )
@@ -141,10 +143,6 @@ def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[t
             yield from csv_files(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
         else:
             yield from _some(_trajectories(inputs), request.pass_id, "navigation solutions with a reference")
-
-
-def _span(connection: Connection, pass_id: int) -> PassSpan:
-    return pass_span(connection, store.get_pass(connection, pass_id))
 
 
 def _some(files: Iterable[tuple[str, bytes]], pass_id: int, what: str) -> Iterator[tuple[str, bytes]]:

@@ -361,13 +361,12 @@ class Experiment(Section):
 
     Attributes
     ----------
-    orbit_error_m, orbit_age_s
-        Error and age of the orbit that estimators start from. Without an error, they start from the best known orbit,
-        and propagating it is no rival.
+    orbit_error_m
+        Error of the orbit that estimators start from, 1 sigma per axis. Without it, they start from the best known
+        orbit, and propagating it is no rival.
     """
 
     orbit_error_m: Positive | None = None
-    orbit_age_s: NotNegative | None = None
 
 
 class Uploads(Section):

@@ -127,18 +127,14 @@ def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassR
 
 def _span(connection: Connection, cache: Cache, record: PassRecord) -> PassSpan:
     """Return the interval of a pass, which reports of observations near it and other windows can change."""
-    near = vehicle_span(
-        connection, record.vehicle_id, record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
-    )
-    windows = store.approved_windows(
-        connection, record.vehicle_id, record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
-    )
+    times = record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
+    near = vehicle_span(connection, record.vehicle_id, *times)
     return cache.answer(
         ("span", record.id),
         lambda: pass_span(connection, record),
         start_ticks=near.start_ticks,
         stop_ticks=near.stop_ticks,
-        state=tuple(windows),
+        state=tuple(store.approved_windows(connection, record.vehicle_id, *times)),
     )
 
 
@@ -162,9 +158,7 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
         spans = {
             one.id: _span(connection, cache, one)
             for one in store.passes_of_vehicle(connection, vehicle, reported=False)
-            if any(
-                one.start_utc_ns - REACH_NS <= event.utc_ns <= one.stop_utc_ns + REACH_NS for event in found
-            )
+            if any(one.start_utc_ns <= at.utc_ns + REACH_NS <= one.stop_utc_ns + 2 * REACH_NS for at in found)
         }
 
     def pass_at(utc_ns: int) -> int | None:

@@ -11,11 +11,11 @@ from sqlalchemy import Connection
 from ground_service.ingest.redecode import readable_version
 from ground_service.passes import store
 from ground_service.passes.model import PassRecord
+from ground_service.store import telemetry
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.arrays import IntArray
 from tmtc.codes import EVENTS
-from tmtc.cuc import TICKS_PER_SECOND
 
 _EVENT_CODES = {name: code for code, name in EVENTS}
 STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
@@ -112,8 +112,12 @@ def belongs_to(one: Observation, mine: Planned, others: Sequence[Planned], margi
 
 def observation_events(connection: Connection, span: PassSpan) -> list[tuple[int, int, int]]:
     """Return on-board time, event and planned end of the reports of start and end of observations in an interval."""
-    where = span.vehicle, span.dictionary_version, span.start_ticks, span.stop_ticks
-    return store.event_values(connection, *where, (STARTED, STOPPED))
+    where = span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version
+    found = telemetry.samples(connection, "events", *where, ("ticks", "event_id", "value_1"))
+    rows = zip(found["ticks"], found["event_id"], found["value_1"], strict=True)
+    return [
+        (ticks, event, int(planned or 0)) for ticks, event, planned in rows if event in (STARTED, STOPPED)
+    ]
 
 
 def vehicle_span(
@@ -132,24 +136,18 @@ def vehicle_span(
 
 def pass_span(connection: Connection, record: PassRecord) -> PassSpan:
     """Return the interval of a pass."""
-    window_id, cadence_s = record.manifest.get("window_id"), record.manifest.get("cadence_s")
-    times = record.start_utc_ns, record.stop_utc_ns
-    return observed_span(connection, record.vehicle_id, *times, window_id=window_id, cadence_s=cadence_s)
+    window_id = record.manifest.get("window_id")
+    return observed_span(connection, record.vehicle_id, record.start_utc_ns, record.stop_utc_ns, window_id)
 
 
 def observed_span(
-    connection: Connection,
-    vehicle: int,
-    start_utc_ns: int,
-    stop_utc_ns: int,
-    *,
-    window_id: int | None,
-    cadence_s: float | None,
+    connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int, window_id: int | None
 ) -> PassSpan:
     """Return the interval of the observations of a window, or of a pass without one, with the housekeeping around them.
 
-    Its limits are the event reports of start and end. Where one is missing, the limit is the planned end that the other
-    states, or the planned time. Housekeeping around it is left out where frames or events of another observation are.
+    Its limits are the event reports of start and end. A missing start is the planned one; a missing end is the one that
+    the start states, or the planned one, and a minute later. Housekeeping around is left out where frames or events
+    of other observations are.
     """
     correlations = load_correlations(connection, vehicle)
 
@@ -183,7 +181,7 @@ def observed_span(
     if begin is None:
         begin = max([start, *(ticks + 1 for ticks in foreign if ticks < mine.stop)])
     if end is None:
-        end = (own[-1].planned or mine.stop) + round((cadence_s or 0.0) * TICKS_PER_SECOND)
+        end = (own[-1].planned or mine.stop) + stop - mine.stop
         end = min([end, *(ticks - 1 for ticks in foreign if ticks > begin)])
 
     def is_free(first: int, last: int) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
@@ -189,26 +189,7 @@ def approved_windows(
         windows.c.start_utc_ns <= stop_utc_ns,
         windows.c.stop_utc_ns >= start_utc_ns,
     )
-    return [(int(key), int(start), int(stop)) for key, start, stop in connection.execute(query)]
-
-
-def event_values(
-    connection: Connection,
-    vehicle: int,
-    version: int,
-    start_ticks: int,
-    stop_ticks: int,
-    events: Sequence[int],
-) -> list[tuple[int, int, int]]:
-    """Return on-board time, number and first value (0: none) of the reports of some events in an interval."""
-    table = repository.SAMPLES["events"]
-    query = select(table.c.ticks, table.c.event_id, table.c.value_1).where(
-        table.c.vehicle_id == vehicle,
-        table.c.dictionary_version == version,
-        table.c.ticks.between(start_ticks, stop_ticks),
-        table.c.event_id.in_(events),
-    )
-    return [(int(ticks), int(event), int(value or 0)) for ticks, event, value in connection.execute(query)]
+    return [(key, start, stop) for key, start, stop in connection.execute(query)]
 
 
 def received_frames(

@@ -89,14 +89,7 @@ def _advance(connection: Connection, window: WindowRecord) -> str | None:
 
 def span_of(connection: Connection, window: WindowRecord) -> PassSpan:
     """Return the interval of on-board time of a window."""
-    return observed_span(
-        connection,
-        window.vehicle_id,
-        window.start.utc_ns,
-        window.stop.utc_ns,
-        window_id=window.id,
-        cadence_s=window.cadence_s,
-    )
+    return observed_span(connection, window.vehicle_id, window.start.utc_ns, window.stop.utc_ns, window.id)
 
 
 def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:

@@ -27,6 +27,7 @@ from ground_service.missions import store as missions
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Mission
 from ground_service.missions.places import stations_of
+from ground_service.passes.store import get_pass
 from ground_service.planning import model, store
 from ground_service.planning.core import (
     Candidate,
@@ -105,7 +106,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
         catalogue_sha256 = None
         if given.catalogue_pass_id is not None:
-            catalogue_sha256 = store.catalogue_of_pass(connection, given.catalogue_pass_id)
+            catalogue_sha256 = get_pass(connection, given.catalogue_pass_id).catalogue_sha256
             if catalogue_sha256 is None:
                 raise InvalidInput("search", "catalogue_pass_id", "a pass with a crater catalogue", "none")
     start = reference.start.utc_ns if start is None else start

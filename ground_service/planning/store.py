@@ -216,12 +216,6 @@ def add_pass(connection: Connection, window: WindowRecord, mission_id: int | Non
     )
 
 
-def catalogue_of_pass(connection: Connection, pass_id: int) -> str | None:
-    """Return the SHA-256 of the crater catalogue of a pass; None without any."""
-    sha256: str | None = repository.get(connection, repository.PASSES, pass_id, "pass")["catalogue_sha256"]
-    return sha256
-
-
 def has_report(connection: Connection, pass_id: int) -> bool:
     """Return whether a pass has a report."""
     return repository.find(connection, repository.REPORTS, pass_id=pass_id) is not None

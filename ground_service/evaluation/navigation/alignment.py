@@ -111,8 +111,3 @@ def ground_path_m(reference: ReferenceStates, radius_m: float) -> FloatArray:
     chord = np.linalg.norm(np.diff(direction, axis=0), axis=-1)
     arc = 2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))
     return radius_m * np.concatenate(([0.0] if len(direction) else [], np.cumsum(arc)))
-
-
-def horizontal_m(error_rtn_m: FloatArray) -> FloatArray:
-    """Horizontal part (...) of errors (..., 3): the transverse and normal components together."""
-    return np.asarray(np.hypot(error_rtn_m[..., 1], error_rtn_m[..., 2]))

@@ -13,7 +13,6 @@ from ground_service.evaluation.navigation.alignment import (
     error_of_places_rtn_m,
     error_of_positions_rtn_m,
     ground_path_m,
-    horizontal_m,
     places_of_positions,
     reference_states,
 )
@@ -151,7 +150,3 @@ def test_a_quarter_of_the_way_round_is_a_quarter_of_the_circumference() -> None:
         np.zeros(3), np.zeros(3), np.zeros(3),
     )  # fmt: skip
     np.testing.assert_allclose(ground_path_m(track, 2.0), [0.0, math.pi, 3.0 * math.pi])
-
-
-def test_the_horizontal_part_leaves_the_height_out() -> None:
-    assert horizontal_m(np.array([[100.0, 3.0, -4.0], [0.0, 0.0, 2.0]])).tolist() == [5.0, 2.0]

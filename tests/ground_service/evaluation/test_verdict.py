@@ -87,7 +87,7 @@ def test_nees_is_judged_by_the_bound_for_its_independent_draws(
     flown = replace(series("anchored", nees=np.full(N, 3.0 * factor)), utc_ns=times)
     judged = row("consistency.nees", Limits("anchored", consistency_inside_percent=95.0), found(flown))
     assert (judged.value, judged.status) == (pytest.approx(factor), status)
-    assert judged.note.endswith(f"{draws} independent draws, 95 % of them within {bounds}")
+    assert judged.note.endswith(f"; {bounds} with 95 % for {draws} independent draws")
 
 
 @pytest.mark.parametrize(
@@ -275,11 +275,11 @@ def test_the_table_of_a_pass_in_full() -> None:
              "median 3-D error"),
             ("consistency.nees", "mean NEES per degree of freedom", "", pytest.approx(31.12 / 24),
              pytest.approx(7.8147 / 3, abs=1e-4), True, "met",
-             "position error against the covariance of estimate and reference; 1 independent draws, "
-             "90 % of them within 0.12 to 2.60"),
+             "position error against the covariance of estimate and reference; "
+             "0.12 to 2.60 with 90 % for 1 independent draws"),
             ("consistency.nis", "mean NIS per degree of freedom", "", pytest.approx(22.9 / 16),
              pytest.approx(1.891, abs=1e-3), True, "met",
-             "image innovations; 4.4 independent draws, 90 % of them within 0.36 to 1.89"),
+             "image innovations; 0.36 to 1.89 with 90 % for 4.4 independent draws"),
             ("completeness.packets", "packets received of those expected", "%", 75.0, 75.0, False, "met",
              "1\u202f500 of 2\u202f000 packets"),
             ("completeness.frames", "frames reported of those expected", "%", 75.0, 90.0, False, "not met",
