@@ -243,10 +243,9 @@ def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     ):
         share, mean, bound = limits.consistency_inside_percent, None, None
         if values is not None:
-            mean = per_degree(*values[:2])[1]
-            known = np.isfinite(values[0]) & (values[1] > 0)
-            if share is not None and known.any():
-                degrees = float(values[1][known].mean())
+            count, mean, _ = per_degree(*values[:2])
+            if share is not None and count:
+                degrees = float(values[1][values[1] > 0].mean())
                 low, bound = bounds_per_degree(degrees, values[2], share / 100.0)
                 note += f"; {low:.2f} to {bound:.2f} with {share:g} % for {values[2]:.3g} independent draws"
         yield _row(

@@ -122,20 +122,17 @@ def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassR
     """Return a pass, its interval of on-board time, and the cached answers on its vehicle."""
     record = store.get_pass(connection, pass_id)
     cache = Cache(ground, connection, record.vehicle_id)
-    return record, _span(connection, cache, record), cache
-
-
-def _span(connection: Connection, cache: Cache, record: PassRecord) -> PassSpan:
-    """Return the interval of a pass, which reports of observations near it and other windows can change."""
+    # Reports of observations near it, and other windows, can change its interval.
     times = record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
     near = vehicle_span(connection, record.vehicle_id, *times)
-    return cache.answer(
+    span = cache.answer(
         ("span", record.id),
         lambda: pass_span(connection, record),
         start_ticks=near.start_ticks,
         stop_ticks=near.stop_ticks,
         state=tuple(store.approved_windows(connection, record.vehicle_id, *times)),
     )
+    return record, span, cache
 
 
 def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Event]:
@@ -154,9 +151,8 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
         found, total = sample_store.event_page(
             connection, span, asked, severities=asked.severity, name=asked.name
         )
-        cache = Cache(ground, connection, vehicle)
         spans = {
-            one.id: _span(connection, cache, one)
+            one.id: pass_span(connection, one)
             for one in store.passes_of_vehicle(connection, vehicle, reported=False)
             if any(one.start_utc_ns <= at.utc_ns + REACH_NS <= one.stop_utc_ns + 2 * REACH_NS for at in found)
         }

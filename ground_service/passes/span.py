@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from sqlalchemy import Connection
@@ -149,49 +149,39 @@ def observed_span(
     the start states, or the planned one, and a minute later. Housekeeping around is left out where frames or events
     of other observations are.
     """
-    correlations = load_correlations(connection, vehicle)
+    times = start_utc_ns - REACH_NS, stop_utc_ns + REACH_NS
+    near = vehicle_span(connection, vehicle, *times)
 
     def ticks_of(utc_ns: int) -> int:
-        return ticks_of_utc_ns(utc_ns, correlations)
+        return ticks_of_utc_ns(utc_ns, near.correlations)
 
-    version = readable_version(connection, vehicle)
     mine = Planned(ticks_of(start_utc_ns), ticks_of(stop_utc_ns), window_id)
     start, stop = ticks_of(start_utc_ns - HOUSEKEEPING_NS), ticks_of(stop_utc_ns + HOUSEKEEPING_NS)
-    first, last = ticks_of(start_utc_ns - REACH_NS), ticks_of(stop_utc_ns + REACH_NS)
     others = [
-        Planned(ticks_of(start), ticks_of(stop), key)
-        for key, start, stop in store.approved_windows(
-            connection, vehicle, start_utc_ns - REACH_NS, stop_utc_ns + REACH_NS
-        )
+        Planned(ticks_of(first), ticks_of(last), key)
+        for key, first, last in store.approved_windows(connection, vehicle, *times)
         if key != window_id
     ]
-    found = observations(
-        observation_events(connection, PassSpan(vehicle, first, last, correlations, version))
-    )
+    found = observations(observation_events(connection, near))
     own = [one for one in found if belongs_to(one, mine, others, stop - mine.stop)]
     foreign = [
         ticks for one in found if one not in own for ticks in (one.start, one.stop) if ticks is not None
     ]
-    if not own:
-        middle = (mine.start + mine.stop) // 2
-        start = max([start, *(ticks + 1 for ticks in foreign if ticks < middle)])
-        stop = min([stop, *(ticks - 1 for ticks in foreign if ticks >= middle)])
-        return PassSpan(vehicle, start, stop, correlations, version)
-    begin, end = own[0].start, own[-1].stop
+    begin, end = (own[0].start, own[-1].stop) if own else (None, None)
     if begin is None:
-        begin = max([start, *(ticks + 1 for ticks in foreign if ticks < mine.stop)])
+        begin = max([start, *(ticks + 1 for ticks in foreign if ticks < (mine.start + mine.stop) // 2)])
     if end is None:
-        end = (own[-1].planned or mine.stop) + stop - mine.stop
+        end = ((own and own[-1].planned) or mine.stop) + stop - mine.stop
         end = min([end, *(ticks - 1 for ticks in foreign if ticks > begin)])
 
     def is_free(first: int, last: int) -> bool:
         """Return whether no event and no frame lies between two times, both included."""
         return not any(first <= ticks <= last for ticks in foreign) and not store.received_frames(
-            connection, vehicle, version, first, last
+            connection, vehicle, near.dictionary_version, first, last
         )
 
     if start < begin and not is_free(start, begin - 1):
         start = begin
     if stop > end and not is_free(end + 1, stop):
         stop = end
-    return PassSpan(vehicle, min(start, begin), max(stop, end), correlations, version)
+    return replace(near, start_ticks=min(start, begin), stop_ticks=max(stop, end))

@@ -41,7 +41,7 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments
-from ground_service.passes.span import REACH_NS, pass_span, vehicle_span
+from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.standing import needs_plan
@@ -349,17 +349,18 @@ def follow_in_process(ground: Ground, start: Start | None = None) -> FollowUp:
 
 def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:
     """Return the passes of a vehicle that have a report and that contain on-board times of an interval."""
-    found = []
-    for record in passes_of_vehicle(connection, vehicle, reported=True):
-        near = vehicle_span(
-            connection, vehicle, record.start_utc_ns - REACH_NS, record.stop_utc_ns + REACH_NS
+
+    def overlaps(span: PassSpan) -> bool:
+        return span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks
+
+    return [
+        one.id
+        for one in passes_of_vehicle(connection, vehicle, reported=True)
+        if overlaps(
+            vehicle_span(connection, vehicle, one.start_utc_ns - REACH_NS, one.stop_utc_ns + REACH_NS)
         )
-        if near.start_ticks > last_ticks or near.stop_ticks < first_ticks:
-            continue
-        span = pass_span(connection, record)
-        if span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks:
-            found.append(record.id)
-    return found
+        and overlaps(pass_span(connection, one))
+    ]
 
 
 def _job_id(kind: str, key: int, event: int) -> str:

@@ -74,7 +74,6 @@ CONSISTENT = series(
     ("gap_s", "factor", "status", "draws", "bounds"),
     [
         (15, 3.1, "met", 1, "0.07 to 3.12"),  # one draw: 0.2158 / 3, 9.348 / 3 (tables of chi-square)
-        (15, 3.2, "not met", 1, "0.07 to 3.12"),
         (3600, 2.2, "not met", 10, "0.56 to 1.57"),  # ten draws: 16.791 / 30, 46.979 / 30
         (3600, 0.1, "met", 10, "0.56 to 1.57"),  # a cautious filter is a matter of many passes
     ],

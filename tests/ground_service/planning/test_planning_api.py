@@ -322,7 +322,6 @@ def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestC
         images = next(row for row in account["by_apid"] if row["name"] == "detections")
         counts.append((images["packets"], images["lost_at_edges"]))
     assert counts == [(6, 0), (6, 0), (6, 0), (2, 4)]
-    assert len({one["pass_id"] for one in found}) == 4
 
 
 def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last() -> None:
@@ -331,7 +330,6 @@ def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last() 
     assert not belongs_to(begun, first, [later], 60) and belongs_to(begun, later, [first], 60)
     again = Observation(0, 100, 100)
     assert not belongs_to(again, first, [same], 60) and belongs_to(again, same, [first], 60)
-    assert belongs_to(Observation(None, 104), first, [later], 60)
     assert not belongs_to(Observation(None, 40), later, [], 60)  # the end of the one before
     whole = Planned(-50, 150)
     assert belongs_to(begun, whole, [], 60) and not belongs_to(Observation(120, 300, 300), whole, [], 60)
