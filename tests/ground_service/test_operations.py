@@ -24,13 +24,13 @@ VERBS = {
     "accept", "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export",
     "find", "get", "import", "keep", "list", "refuse", "reject", "release", "render", "repeat", "request",
     "revoke", "run",
-    "search", "send", "shelve", "start", "take", "uplink", "upload",
+    "search", "send", "shelve", "start", "take", "uplink", "upload", "withdraw",
 }  # fmt: skip
 SUMMARY_VERBS = {
     "Accept", "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable",
     "End", "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register",
     "Reject", "Release", "Render", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress",
-    "Take",
+    "Take", "Withdraw",
 }  # fmt: skip
 TAGS = {
     "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "landmarks", "links", "missions",
