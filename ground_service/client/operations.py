@@ -333,7 +333,7 @@ class Operations(Connection):
 
     @operation("POST /jobs/{job_id}/repeat")
     def repeat_job(self, job_id: str) -> jobs.Job:
-        """Do a failed job again, which changes nothing that is done already."""
+        """Queue a failed job again, which changes nothing that is done already."""
 
     # missions
 

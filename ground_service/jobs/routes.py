@@ -24,7 +24,7 @@ def get_job(ground: GroundOf, _: Viewer, job_id: Key) -> Job:
 
 @jobs.post("/jobs/{job_id}/repeat", responses=problems(404, 409))
 def repeat_job(ground: GroundOf, caller: Operator, dispatcher: DispatcherOf, job_id: Key) -> Job:
-    """Do a failed job again, which changes nothing that is done already."""
+    """Queue a failed job again, which changes nothing that is done already."""
     with ground.database.writing() as connection:
         store.repeat_job(connection, job_id)
         audit(connection, caller.name, "repeat job", job_id, {})
