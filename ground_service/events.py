@@ -71,7 +71,6 @@ class EphemerisAdded(Event):
     id: int
     start_utc_ns: int
     stop_utc_ns: int
-    withdrawn: bool = False
 
 
 class CommandsSent(Event):

@@ -26,7 +26,10 @@ EVENT_SEVERITIES = {"event_medium": WARNING, "event_high": ALARM}
 WATCHED_PACKETS = (*EVENT_SEVERITIES, *(one.name for one in STRUCTURES.values()))
 WATCHED_APIDS = tuple(sorted({DICTIONARY.packet(name).apid for name in WATCHED_PACKETS}))
 
-Source = Literal["event", "parameter"]
+Source = Literal["event", "parameter", "operations"]
+OPERATIONS: Source = "operations"
+"""Source of alarms for what stops operations (`worker.watch`)."""
+
 State = Literal["raised", "acknowledged", "cleared"]
 
 

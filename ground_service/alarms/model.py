@@ -16,12 +16,12 @@ SHELVED_DAYS_LIMIT = 30
 
 
 class Alarm(Entity):
-    """A condition that an operator must know of: an event report, or a parameter outside its limits."""
+    """A condition that an operator must know of: an event report, a broken limit, or what stops operations."""
 
     id: int
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])
-    source: Literal["event", "parameter"]
+    source: Literal["event", "parameter", "operations"]
     name: str = Field(description="Event or parameter", examples=["camera_fault"])
     severity: Severity = Field(description="Worst severity found")
     state: AlarmState

@@ -7,7 +7,9 @@ from the newest housekeeping packet.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import asdict
+from typing import cast
 
 import numpy as np
 from sqlalchemy import Connection
@@ -17,14 +19,14 @@ from ground_service.alarms import core, store
 from ground_service.alarms.core import Condition
 from ground_service.alarms.model import SHELVED_DAYS_LIMIT, Alarm, AlarmDetail, AlarmFilter
 from ground_service.alarms.store import AlarmRow
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import AlarmChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.store import parameters, telemetry
-from ground_service.store.vehicles import lock_vehicle
-from ground_service.timekeeping.core import utc_ns_of_ticks
+from ground_service.store.vehicles import FLOWN, lock_vehicle, vehicle_id
+from ground_service.timekeeping.core import ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.timescales import format_utc
 from tmtc.dictionary import STRUCTURES
@@ -61,7 +63,9 @@ def examine_packets(ground: Ground, vehicle: int) -> int:
             )
             if not packets.ids:
                 return examined
-            _update(connection, vehicle, core.conditions_in(b"".join(packets.octets)))
+            newest = (telemetry.newest_packet(connection, vehicle, one.apid) for one in STRUCTURES.values())
+            broken = core.broken_limits(b"".join(octets for octets in newest if octets is not None))
+            _update(connection, vehicle, core.conditions_in(b"".join(packets.octets)), broken)
             store.advance(connection, vehicle, packets.ids[-1])
         examined += len(packets.ids)
 
@@ -139,18 +143,43 @@ def shelve_alarm(
         return get_alarm(connection, alarm_id)
 
 
-def _update(connection: Connection, vehicle: int, found: tuple[Condition, ...]) -> None:
-    """Apply the conditions of new packets to the alarms of a vehicle, which the caller has locked."""
+def note_operations(ground: Ground, spacecraft_id: int, names: Set[str]) -> None:
+    """Raise the alarms of conditions that stop the operation of a spacecraft, and end those of others."""
+    with ground.database.writing() as connection:
+        vehicle = vehicle_id(connection, spacecraft_id, FLOWN)
+        lock_vehicle(connection, vehicle)
+        rows = store.open_alarms(connection, vehicle)
+        known = {row.name for row in rows if row.source == core.OPERATIONS and row.active}
+        if known != names:
+            ticks = ticks_of_utc_ns(mission_now_ns(), load_correlations(connection, vehicle))
+            new = sorted(names - known)
+            found = tuple(Condition(core.OPERATIONS, one, core.ALARM, ticks, ticks, 1) for one in new)
+            _update(connection, vehicle, found, names, is_operations=True)
+
+
+def _update(
+    connection: Connection,
+    vehicle: int,
+    found: tuple[Condition, ...],
+    broken: Set[str],
+    *,
+    is_operations: bool = False,
+) -> None:
+    """Apply new conditions to the alarms of a vehicle, which the caller has locked; those in `broken` continue."""
     now = utc_now_ns()
-    newest = (telemetry.newest_packet(connection, vehicle, one.apid) for one in STRUCTURES.values())
-    broken = core.broken_limits(b"".join(octets for octets in newest if octets is not None))
-    known = {(row.source, row.name): row for row in store.open_alarms(connection, vehicle)}
+    known = {
+        (row.source, row.name): row
+        for row in store.open_alarms(connection, vehicle)
+        if (row.source == core.OPERATIONS) == is_operations
+    }
     worse: set[tuple[str, str]] = set()
     for condition in found:
         key: tuple[str, str] = (condition.source, condition.name)
-        row = known.get(key) or _cleared_later(connection, vehicle, condition)
+        row = known.get(key)
+        if row is None and not is_operations:
+            row = _cleared_later(connection, vehicle, condition)
         if row is None:
-            active = condition.source == "parameter" and condition.name in broken
+            active = condition.source != "event" and condition.name in broken
             alarm_id = store.add(connection, vehicle, condition, active=active, now_utc_ns=now)
             store.note_change(connection, alarm_id, now, TELEMETRY, "raised")
             _publish(connection, store.get(connection, alarm_id), "raised")
@@ -159,7 +188,7 @@ def _update(connection: Connection, vehicle: int, found: tuple[Condition, ...]) 
         if condition.severity > row.severity:
             worse.add(key)
     for cause, row in known.items():
-        active = row.source == "parameter" and row.name in broken
+        active = row.source != "event" and row.name in broken
         if active != row.active:
             store.set_active(connection, row.id, active)
         state = core.state_after(row.state, active=active, worse=cause in worse)
@@ -195,8 +224,15 @@ def _publish(connection: Connection, row: AlarmRow, state: str) -> None:
 
 
 def _condition(row: AlarmRow) -> Condition:
-    source: core.Source = "event" if row.source == "event" else "parameter"
-    return Condition(source, row.name, row.severity, row.first_ticks, row.last_ticks, row.count, row.value)
+    return Condition(
+        cast(core.Source, row.source),
+        row.name,
+        row.severity,
+        row.first_ticks,
+        row.last_ticks,
+        row.count,
+        row.value,
+    )
 
 
 def get_alarm(connection: Connection, alarm_id: int) -> AlarmDetail:

@@ -77,13 +77,12 @@ def withdraw_ephemeris(ground: Ground, ephemeris_id: int, *, actor: str) -> None
     """
     with ground.database.writing() as connection:
         found = store.withdraw_ephemeris(connection, ephemeris_id)
-        detail = found.model_dump(mode="json", include={"sha256", "object_name", "precedence"})
-        audit(connection, actor, "withdraw ephemeris", found.name, {"id": ephemeris_id, **detail})
+        audit(
+            connection, actor, "withdraw ephemeris", found.name, {"id": ephemeris_id, "sha256": found.sha256}
+        )
         publish(
             connection,
-            EphemerisAdded(
-                id=found.id, start_utc_ns=found.start.utc_ns, stop_utc_ns=found.stop.utc_ns, withdrawn=True
-            ),
+            EphemerisAdded(id=found.id, start_utc_ns=found.start.utc_ns, stop_utc_ns=found.stop.utc_ns),
         )
 
 

@@ -42,18 +42,18 @@ class LinkStatus(Entity):
 class LinkContact(Entity):
     """A predicted, open, ended or missed contact of a link; times are mission time."""
 
-    id: int | None = Field(description="null: predicted")
+    id: int | None = Field(default=None, description="null: predicted")
     link: str
     station: str
     spacecraft_id: int
     state: ContactState
-    reason: str | None
+    reason: str | None = None
     start: UtcTime
     stop: UtcTime | None
     predicted_start: UtcTime | None
     predicted_stop: UtcTime | None
-    octets: int
-    telecommands: int
+    octets: int = 0
+    telecommands: int = 0
 
 
 class Contacts(Entity):

@@ -10,7 +10,7 @@ given to the link of that station.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from sqlalchemy import Connection
 
@@ -532,26 +532,18 @@ def _link(connection: Connection, declared: DeclaredLink) -> LinkStatus:
     owned = row is not None and row.owner is not None and row.lease_utc_ns >= utc_now_ns()
     state, reason = _state(row, owned)
     fault = core.clock_fault(None if row is None else row.clock_offset_ns)
-    heard = None if row is None else row.heard_utc_ns
     offset = None if row is None else row.clock_offset_ns
-    return LinkStatus(
-        name=link.name,
-        kind=link.kind,
-        station=link.station,
+    return LinkStatus.of(
+        {"octets": 0, "heard_utc_ns": None, "changed_utc_ns": 0}
+        | ({} if row is None else asdict(row))
+        | link.model_dump(),
         spacecraft_id=declared.spacecraft_id,
-        instance=link.instance,
-        downlink=link.downlink,
-        uplink=link.uplink,
-        send=link.send,
         state=state,
         reason="; ".join(one for one in (reason, fault) if one) or None,
         owner=row.owner if row is not None and owned else None,
-        octets=0 if row is None else row.octets,
-        heard=None if heard is None else UtcTime(heard),
         clock_offset_s=None if offset is None else offset / NS,
         unsent=_unsent(connection, declared),
         unconfirmed=len(pending),
-        changed=UtcTime(0 if row is None else row.changed_utc_ns),
     )
 
 
@@ -568,40 +560,20 @@ def _unsent(connection: Connection, declared: DeclaredLink) -> int:
 
 
 def _contact(row: ContactRow, spacecraft_id: int) -> LinkContact:
-    def time(utc_ns: int | None) -> UtcTime | None:
-        return None if utc_ns is None else UtcTime(utc_ns)
-
-    return LinkContact(
-        id=row.id,
-        link=row.link,
-        station=row.station,
-        spacecraft_id=spacecraft_id,
-        state=row.state,
-        reason=row.reason,
-        start=UtcTime(row.start_utc_ns),
-        stop=time(row.stop_utc_ns),
-        predicted_start=time(row.predicted_start_utc_ns),
-        predicted_stop=time(row.predicted_stop_utc_ns),
-        octets=row.octets,
-        telecommands=row.telecommands,
-    )
+    return LinkContact.of(asdict(row), spacecraft_id=spacecraft_id)
 
 
 def _predicted(declared: DeclaredLink, contact: PredictedContact) -> LinkContact:
     start, stop = UtcTime(contact.start_utc_ns), UtcTime(contact.stop_utc_ns)
     return LinkContact(
-        id=None,
         link=declared.link.name,
         station=declared.station,
         spacecraft_id=declared.spacecraft_id,
         state="predicted",
-        reason=None,
         start=start,
         stop=stop,
         predicted_start=start,
         predicted_stop=stop,
-        octets=0,
-        telecommands=0,
     )
 
 

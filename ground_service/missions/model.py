@@ -670,7 +670,7 @@ def parse_mission(text: str, source: str = "mission.toml") -> Mission:
     InvalidInput
         The text is not TOML, or has an unknown key or an invalid value; the message states the first fault.
     """
-    result = _read(text, source)
+    result = read_document(text, source)
     if isinstance(result, Mission):
         return result
     raise result[0]
@@ -678,11 +678,12 @@ def parse_mission(text: str, source: str = "mission.toml") -> Mission:
 
 def mission_faults(text: str, source: str = "mission.toml") -> list[str]:
     """Return one line for each fault of a mission description; empty if it is valid."""
-    result = _read(text, source)
+    result = read_document(text, source)
     return [] if isinstance(result, Mission) else [str(fault) for fault in result]
 
 
-def _read(text: str, source: str) -> Mission | list[InvalidInput]:
+def read_document(text: str, source: str) -> Mission | list[InvalidInput]:
+    """Return the mission description in `text`, or all its faults."""
     try:
         return Mission.model_validate(read_table(text, source, "TOML"))
     except InvalidInput as error:

@@ -23,8 +23,8 @@ from ground_service.missions.model import (
     Mission,
     MissionDetail,
     format_mission,
-    mission_faults,
     parse_mission,
+    read_document,
 )
 
 
@@ -61,11 +61,9 @@ def check_mission_file(path: Path) -> tuple[Mission | None, list[str]]:
         text = read_mission_file(path).decode("utf-8")
     except UnicodeDecodeError:
         raise InvalidInput(str(path), "", "UTF-8 text", "other octets") from None
-    faults = mission_faults(text, str(path))
-    if not faults:
-        mission = parse_mission(text, str(path))
-        faults = [str(fault) for fault in definition_faults(mission, str(path))]
-    return (None, faults) if faults else (mission, [])
+    read = read_document(text, str(path))
+    faults = definition_faults(read, str(path)) if isinstance(read, Mission) else read
+    return None if faults or not isinstance(read, Mission) else read, [str(fault) for fault in faults]
 
 
 def add_mission(

@@ -177,8 +177,7 @@ def in_force(connection: Connection, vehicle: int) -> int | None:
 
 def mission_in_force(connection: Connection, ccsds_id: int | None) -> Mission | None:
     """Return the description in force of a spacecraft; None without any."""
-    key = None if ccsds_id is None else newest_of_spacecraft(connection, ccsds_id)
-    return None if key is None else get_mission(connection, key)
+    return None if ccsds_id is None else missions_in_force(connection, ccsds_id).get(ccsds_id)
 
 
 def mission_of_vehicle(connection: Connection, vehicle: int) -> Mission | None:
@@ -198,13 +197,8 @@ def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
 
     Descriptions imported with archives do not change the approval rules.
     """
-    found = connection.execute(
-        select(MISSIONS.c.id)
-        .where(MISSIONS.c.ccsds_id == ccsds_id, MISSIONS.c.entered_by != ARCHIVE_ACTOR)
-        .order_by(MISSIONS.c.created_utc_ns.desc(), MISSIONS.c.id.desc())
-        .limit(1)
-    ).scalar()
-    return Approval() if found is None else get_mission(connection, int(found)).approval
+    mission = mission_in_force(connection, ccsds_id)
+    return Approval() if mission is None else mission.approval
 
 
 def get_catalogue(connection: Connection, sha256: str) -> HeldCatalogue:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, groupby, pairwise
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from ground_service.evaluation.detection.recall import expected_craters
 from ground_service.links.core import PredictedContact, predict_contacts
 from ground_service.missions.stations import STATIONS
+from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
@@ -89,15 +90,6 @@ class Resources:
     estimators: int = 3
     detections_per_frame: float = 25.0
     stations: tuple[GroundStation, ...] = STATIONS
-
-
-@dataclass(frozen=True, slots=True)
-class Commitment:
-    """A window that is planned already: its span and the data it will make."""
-
-    start_utc_ns: int
-    stop_utc_ns: int
-    octets: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +166,7 @@ class Planner:
         cadence_s: float,
         *,
         step_s: float = 30.0,
-        commitments: Sequence[Commitment] = (),
+        commitments: Sequence[Option] = (),
     ) -> SearchResult:
         """Windows between two times, longer ones cut at the maximum duration, in order of time.
 
@@ -258,7 +250,7 @@ class Planner:
         *,
         since_utc_ns: int,
         until_utc_ns: int,
-        commitments: Sequence[Commitment] = (),
+        commitments: Sequence[Option] = (),
     ) -> Candidate:
         """What a given window would be like: the battery is full at `since`, contacts are counted up to `until`."""
         horizon = min(until_utc_ns, stop_utc_ns + round(CONTACT_HORIZON_S) * NS)
@@ -352,7 +344,7 @@ class Planner:
         cadence_s: float,
         contacts: Sequence[PredictedContact],
         battery: tuple[IntArray, FloatArray],
-        commitments: Sequence[Commitment],
+        commitments: Sequence[Option],
     ) -> Candidate:
         frames = frames_between(start, stop, cadence_s)
         epochs = np.linspace(start, stop, min(max(frames, 2), 200)).astype(np.int64)
@@ -362,7 +354,7 @@ class Planner:
         octets = data_octets(frames, per_frame, self.resources.estimators)
         extra_w = self.resources.observing_w
         charge = np.interp(epochs, *battery) - extra_w * (epochs - start) / NS / 3600.0
-        mine = Commitment(start, stop, octets)
+        mine = Option(start, stop, octets)
         peak, by = storage_peak([*commitments, mine], contacts, self.resources.downlink_bit_s, mine)
         return Candidate(
             start_utc_ns=start,
@@ -421,10 +413,10 @@ def data_octets(frames: int, detections_per_frame: float, estimators: int) -> in
 
 
 def storage_peak(
-    commitments: Sequence[Commitment],
+    commitments: Sequence[Option],
     contacts: Sequence[PredictedContact],
     downlink_bit_s: float,
-    mine: Commitment,
+    mine: Option,
 ) -> tuple[int, int | None]:
     """Most octets ever stored on board, and when those of `mine` are down (None: not within the contacts).
 
@@ -433,7 +425,7 @@ def storage_peak(
     visible = _union(contacts)
     queue = sorted(commitments, key=lambda one: (one.stop_utc_ns, one.start_utc_ns))
     rate = downlink_bit_s / 8.0 / NS
-    finished: list[tuple[int | None, Commitment]] = []
+    finished: list[tuple[int | None, Option]] = []
     free_at = 0
     for one in queue:
         left = float(one.octets)
@@ -524,8 +516,7 @@ def explain_exclusion(excess: Sequence[Excess], needed: int, step_s: float) -> s
             if math.isfinite(nearest)
             else f"without {one.name}"
         )
-    runs = groupby(_hold(excess, n).tolist())
-    longest = max((len(list(run)) for holds, run in runs if holds), default=0)
+    longest = max(map(len, _hold(excess, n).tobytes().split(b"\0")))
     if longest > 1:
         helps.append(f"a minimum duration of {(longest - 1) * step_s:g} s")
     return reason + (f"; possible: {' or '.join(helps)}" if helps else "; no single relaxation gives one")

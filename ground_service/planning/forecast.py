@@ -13,13 +13,12 @@ from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
 from ground_service.missions.model import Mission
-from ground_service.missions.places import outages_of
 from ground_service.planning import service, store
 from ground_service.planning.core import Planner
 from ground_service.planning.filling import NS, Option, ResourceGrid, curves, violation
 from ground_service.planning.model import CraterDensity, PlanForecast, Span, Window, WindowConflict
 from ground_service.planning.window_states import COMMITTED
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.timescales import format_utc
@@ -59,7 +58,7 @@ def get_forecast(
         expected = f"a time after the start, at most {LIMIT_S // 86_400} days"
         raise InvalidInput("forecast", "stop", expected, f"{span_s:.0f} s after it")
     with ground.database.reading() as connection:
-        mission = missions.mission_in_force(connection, spacecraft_id) or Mission(name="not stated")
+        mission = service.mission_of(connection, spacecraft_id)
         windows = store.windows_between(
             connection, spacecraft_id, instance, start_utc_ns - HISTORY_NS, stop_utc_ns
         )
@@ -84,7 +83,7 @@ def get_forecast(
         data=[],
         step_s=step_s,
         **{name: [] for name in _COLUMNS},
-        battery_floor=_floor(mission),
+        battery_floor=service.battery_floor(mission),
         storage_octets=service.resources_of(mission).storage_octets,
         conflicts=_overlaps(windows, {}),
     )
@@ -124,7 +123,7 @@ def _forecast(
     before = min((begin - reference.start.utc_ns) // step_ns, HISTORY_NS // step_ns)
     first = begin - before * step_ns
     middles = first + np.arange(before + count, dtype=np.int64) * step_ns + step_ns // 2
-    grid = _grid(planner, mission, first, before + count, empty.step_s, middles)
+    grid = service.resource_grid(planner, mission, first, before + count, empty.step_s)
     options = {
         one.id: Option(one.start.utc_ns, one.stop.utc_ns, one.data_octets)
         for one in windows
@@ -159,39 +158,12 @@ def _rounded(values: FloatArray, digits: int) -> list[float]:
     return rounded
 
 
-def _floor(mission: Mission) -> float:
-    return max(mission.resources.minimum_battery or 0.0, service.BATTERY_FLOOR)
-
-
-def _grid(
-    planner: Planner, mission: Mission, start: int, count: int, step_s: float, middles: IntArray
-) -> ResourceGrid:
-    resources = planner.resources
-    gain_w = planner.sunlit(middles) * resources.generation_w - resources.idle_w
-    hours = mission.resources.observe_hours_per_day
-    return ResourceGrid(
-        start_utc_ns=start,
-        step_s=step_s,
-        gain_wh=gain_w * step_s / 3600.0,
-        downlink_octets=planner.downlink_octets(start, count, step_s, outages_of(mission.link)),
-        battery_wh=resources.battery_wh,
-        floor_wh=_floor(mission) * resources.battery_wh,
-        observing_w=resources.observing_w,
-        storage_octets=resources.storage_octets,
-        observe_s_per_day=None if hours is None else hours * 3600.0,
-    )
-
-
-def _ordered(windows: Sequence[Window]) -> list[Window]:
-    """Return committed windows before drafts, each in order of time."""
-    return sorted(windows, key=lambda one: (one.state == "draft", one.start.utc_ns, one.id))
-
-
 def _violations(grid: ResourceGrid, windows: Sequence[Window], options: dict[int, Option]) -> dict[int, str]:
     """Return the limit that each window breaks with those before it; windows that break one do not count further."""
     taken: list[Option] = []
     reasons: dict[int, str] = {}
-    for window in _ordered(windows):
+    # Committed windows come before drafts.
+    for window in sorted(windows, key=lambda one: (one.state == "draft", one.start.utc_ns, one.id)):
         option = options.get(window.id)
         if option is None or any(_overlap(option, one) for one in taken):
             continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
@@ -116,45 +116,50 @@ class Span(Entity):
         return cls(min=math.degrees(limits_rad[0]), max=math.degrees(limits_rad[1]))
 
 
-class Candidate(Entity):
+class WindowPrediction(Entity):
+    """Prediction of a window; the conditions are unknown if no reference ephemeris covers it."""
+
+    # Rows of earlier versions also state resources.
+    model_config = ConfigDict(extra="ignore")
+
+    frames: int | None = None
+    start: UtcTime | None = None
+    stop: UtcTime | None = None
+    altitude_km: Span | None = None
+    sun_elevation_deg: Span | None = None
+    latitude_deg: Span | None = None
+    sunlit_share: float | None = None
+    craters_per_frame: Span | None = None
+    mare_share: float | None = None
+    data_octets: int | None = None
+    energy_wh: float | None = None
+    battery_minimum: float | None = Field(
+        default=None, description="Minimum charge of the battery, share of its capacity"
+    )
+    storage_peak_octets: int | None = None
+    downlinked_by: UtcTime | None = Field(
+        default=None, description="When its data are downlinked; null: not within the contacts"
+    )
+
+
+class Candidate(WindowPrediction):
     """A window that fulfils the constraints, with its predicted conditions."""
 
     start: UtcTime
     stop: UtcTime
-    frames: int
     altitude_km: Span
     sun_elevation_deg: Span
-    latitude_deg: Span
-    sunlit_share: float
-    craters_per_frame: Span | None
-    mare_share: float | None
-    data_octets: int
-    energy_wh: float
-    battery_minimum: float = Field(description="Minimum charge of the battery, share of its capacity")
-    storage_peak_octets: int
-    downlinked_by: UtcTime | None = Field(
-        description="When its data are downlinked; null: not within the contacts"
-    )
 
     @classmethod
     def from_core(cls, found: core.Candidate) -> Candidate:
         """Return the entity of a candidate of the planner."""
         craters = found.craters_per_frame
-        return cls(
-            start=UtcTime(found.start_utc_ns),
-            stop=UtcTime(found.stop_utc_ns),
-            frames=found.frames,
+        return cls.of(
+            asdict(found),
             altitude_km=Span(min=found.altitude_m[0] / 1e3, max=found.altitude_m[1] / 1e3),
             sun_elevation_deg=Span.degrees(found.sun_elevation_rad),
             latitude_deg=Span.degrees(found.latitude_rad),
-            sunlit_share=found.sunlit_share,
             craters_per_frame=None if craters is None else Span(min=craters[0], max=craters[1]),
-            mare_share=found.mare_share,
-            data_octets=found.data_octets,
-            energy_wh=found.energy_wh,
-            battery_minimum=found.battery_minimum,
-            storage_peak_octets=found.storage_peak_octets,
-            downlinked_by=None if found.downlinked_by_utc_ns is None else UtcTime(found.downlinked_by_utc_ns),
         )
 
 
@@ -271,28 +276,6 @@ class WindowChange(Given):
             for name, value in given.items()
             if value is not None or name == "predecessor_id"
         }
-
-
-class WindowPrediction(Entity):
-    """Prediction of a window; the conditions are unknown if no reference ephemeris covers it."""
-
-    # Rows of earlier versions also state resources.
-    model_config = ConfigDict(extra="ignore")
-
-    frames: int | None = None
-    start: UtcTime | None = None
-    stop: UtcTime | None = None
-    altitude_km: Span | None = None
-    sun_elevation_deg: Span | None = None
-    latitude_deg: Span | None = None
-    sunlit_share: float | None = None
-    craters_per_frame: Span | None = None
-    mare_share: float | None = None
-    data_octets: int | None = None
-    energy_wh: float | None = None
-    battery_minimum: float | None = None
-    storage_peak_octets: int | None = None
-    downlinked_by: UtcTime | None = None
 
 
 @dataclass(frozen=True, slots=True)

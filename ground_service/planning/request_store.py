@@ -164,12 +164,6 @@ def unfinished_windows(connection: Connection, until_utc_ns: int) -> list[Window
     )
 
 
-def has_unfinished(connection: Connection) -> bool:
-    """Return whether there are approved windows without an uplink."""
-    query = select(_WINDOWS.c.id).where(_WINDOWS.c.state == "approved").limit(1)
-    return connection.execute(query).first() is not None
-
-
 def _request(connection: Connection, row: repository.Row) -> StandingRequest:
     vehicle = get_vehicle(connection, row["vehicle_id"])
     counts = (
@@ -189,17 +183,14 @@ def _request(connection: Connection, row: repository.Row) -> StandingRequest:
     )
 
 
+_RECORDED = ("id", "vehicle_id", "name", "state", "anchor_utc_ns", "plans", "version")
+
+
 def _record(connection: Connection, row: repository.Row) -> RequestRecord:
     vehicle = get_vehicle(connection, row["vehicle_id"])
     return RequestRecord(
-        id=row["id"],
-        vehicle_id=row["vehicle_id"],
+        **{name: row[name] for name in _RECORDED},
         spacecraft_id=vehicle.ccsds_id,
         instance=vehicle.instance,
-        name=row["name"],
-        state=row["state"],
         terms=RequestTerms.model_validate_json(json.dumps(row["terms"])),
-        anchor_utc_ns=row["anchor_utc_ns"],
-        plans=row["plans"],
-        version=row["version"],
     )

@@ -26,12 +26,11 @@ from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Mission
-from ground_service.missions.places import stations_of
+from ground_service.missions.places import outages_of, stations_of
 from ground_service.passes.store import get_pass
 from ground_service.planning import model, store
 from ground_service.planning.core import (
     Candidate,
-    Commitment,
     Constraints,
     Planner,
     Resources,
@@ -39,6 +38,7 @@ from ground_service.planning.core import (
     frames_between,
     storage_peak,
 )
+from ground_service.planning.filling import Option, ResourceGrid
 from ground_service.planning.model import (
     AssessedWindow,
     Contact,
@@ -101,7 +101,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
         reference = ephemeris_for(connection, given.ephemeris_id, start, stop, given.spacecraft_id)
-        mission = missions.mission_in_force(connection, given.spacecraft_id)
+        mission = mission_of(connection, given.spacecraft_id)
         constraints = observable(given.constraints(), mission)
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
         catalogue_sha256 = None
@@ -139,10 +139,8 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     )
 
 
-def observable(constraints: Constraints, mission: Mission | None) -> Constraints:
+def observable(constraints: Constraints, mission: Mission) -> Constraints:
     """Return constraints with the limits of images that a mission description states: latitude, and daylight."""
-    if mission is None:
-        return constraints
     limit, daylight = mission.observation.latitude_limit_deg, mission.observation.needs_daylight
     if limit is not None:
         constraints = replace(constraints, limit_rad=math.radians(limit))
@@ -298,7 +296,8 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
             return ids
         if window.state != "approved":
             raise StateConflict("window", window_id, "approved", window.state)
-        conflicts = _span_conflicts(connection, window.vehicle_id, window_id, window.entry())
+        mission = mission_of(connection, window.spacecraft_id)
+        conflicts = _span_conflicts(connection, window.vehicle_id, window_id, window.entry(), mission)
         if conflicts:
             raise PlanConflicts(f"window {window_id}", conflicts)
         correlations = load_correlations(connection, window.vehicle_id)
@@ -373,10 +372,10 @@ def _preparation(
         8 * window.id,
     )
     if state is not None:
-        x, y, z = state.position_icrf_m.tolist()
-        u, v, w = state.velocity_icrf_m_s.tolist()
         uploaded = model.UploadedState(
-            utc=UtcTime(state.utc_ns), position_icrf_m=(x, y, z), velocity_icrf_m_s=(u, v, w)
+            utc=UtcTime(state.utc_ns),
+            position_icrf_m=tuple(state.position_icrf_m.tolist()),
+            velocity_icrf_m_s=tuple(state.velocity_icrf_m_s.tolist()),
         )
         store.note_uploads(connection, window.id, model.WindowUploads(start_state=uploaded))
     return activities
@@ -392,14 +391,14 @@ def _assessed(
     PlanConflicts
         It conflicts with committed windows or resources.
     """
-    conflicts = _span_conflicts(connection, vehicle, window_id, entry)
-    mission = missions.mission_in_force(connection, entry.spacecraft_id)
+    mission = mission_of(connection, entry.spacecraft_id)
+    conflicts = _span_conflicts(connection, vehicle, window_id, entry, mission)
     commitments = store.commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
-    prediction = _prediction(ground, connection, entry, commitments)
+    prediction = _prediction(ground, connection, entry, mission, commitments)
     frames = frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
     resources = resources_of(mission)
     octets = data_octets(frames, resources.detections_per_frame, resources.estimators)
-    limit = None if mission is None else mission.observation.latitude_limit_deg
+    limit = mission.observation.latitude_limit_deg
     if prediction is not None:
         peak = prediction.storage_peak_octets
         furthest = math.degrees(max(map(abs, prediction.latitude_rad)))
@@ -421,9 +420,9 @@ def _assessed(
                 )
             )
     else:
-        if (conflict := _coverage_conflict(connection, entry)) is not None:
+        if (conflict := _coverage_conflict(connection, entry, mission)) is not None:
             conflicts.append(conflict)
-        mine = Commitment(entry.start_utc_ns, entry.stop_utc_ns, octets)
+        mine = Option(entry.start_utc_ns, entry.stop_utc_ns, octets)
         peak, _ = storage_peak([*commitments, mine], (), resources.downlink_bit_s, mine)
     if peak > resources.storage_octets:
         conflicts.append(
@@ -444,28 +443,30 @@ def _assessed(
 def planner_of(
     ground: Ground,
     reference: Ephemeris,
-    mission: Mission | None,
+    mission: Mission,
     catalogue: CraterCatalogue | None = None,
     mare: Any = None,
 ) -> Planner:
     """Return a planner with camera and orientation of the mission; defaults replace what it does not state."""
-    stated = Mission(name="not stated") if mission is None else mission
-    orientation = declared_frames(stated.frames, ground.data).orientation or ground.orientation
+    orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
     return Planner(
         open_ephemeris(ground, reference),
         orientation,
         resources_of(mission),
-        camera_of(stated.camera),
+        camera_of(mission.camera),
         catalogue,
         mare,
-        gap_ns(stated.uploads),
+        gap_ns(mission.uploads),
     )
 
 
-def resources_of(mission: Mission | None) -> Resources:
+def mission_of(connection: Connection, spacecraft_id: int | None) -> Mission:
+    """Return the description in force of a spacecraft; without any, one that states nothing."""
+    return missions.mission_in_force(connection, spacecraft_id) or Mission(name="not stated")
+
+
+def resources_of(mission: Mission) -> Resources:
     """Return the resources that a mission description states, with defaults for the others."""
-    if mission is None:
-        return Resources()
     stated, default = mission.resources, asdict(Resources())
     rates = [
         one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None
@@ -475,21 +476,44 @@ def resources_of(mission: Mission | None) -> Resources:
         "downlink_bit_s": min(rates, default=None)
         if stated.downlink_kbit_s is None
         else stated.downlink_kbit_s * 1e3,
-        "battery_wh": stated.battery_wh,
-        "generation_w": stated.generation_w,
-        "idle_w": stated.idle_w,
-        "observing_w": stated.observing_w,
+        "stations": stations_of(mission.link) or Resources().stations,
     }
-    values = default | {name: value for name, value in given.items() if value is not None}
-    values["stations"] = stations_of(mission.link) or Resources().stations
-    return Resources(**values)
+    given = stated.model_dump(include=set(default)) | given
+    return Resources(**default | {name: value for name, value in given.items() if value is not None})
+
+
+def battery_floor(mission: Mission) -> float:
+    """Return the smallest charge, share of the capacity, of a mission description or of the planner."""
+    return max(mission.resources.minimum_battery or 0.0, BATTERY_FLOOR)
+
+
+def resource_grid(planner: Planner, mission: Mission, start: int, count: int, step_s: float) -> ResourceGrid:
+    """Return the resources in `count` steps from a time on, as far as the ephemeris reaches."""
+    resources, hours = planner.resources, mission.resources.observe_hours_per_day
+    middles = start + (np.arange(count, dtype=np.int64) * 2 + 1) * round(step_s * NS / 2)
+    sunlit = planner.sunlit(np.minimum(middles, planner.ephemeris.stop_utc_ns))
+    return ResourceGrid(
+        start_utc_ns=start,
+        step_s=step_s,
+        gain_wh=(sunlit * resources.generation_w - resources.idle_w) * step_s / 3600.0,
+        downlink_octets=planner.downlink_octets(start, count, step_s, outages_of(mission.link)),
+        battery_wh=resources.battery_wh,
+        floor_wh=battery_floor(mission) * resources.battery_wh,
+        observing_w=resources.observing_w,
+        storage_octets=resources.storage_octets,
+        observe_s_per_day=None if hours is None else hours * 3600.0,
+        gap_ns=planner.gap_ns,
+    )
 
 
 def _prediction(
-    ground: Ground, connection: Connection, entry: WindowEntry, commitments: Sequence[Commitment]
+    ground: Ground,
+    connection: Connection,
+    entry: WindowEntry,
+    mission: Mission,
+    commitments: Sequence[Option],
 ) -> Candidate | None:
     """What the window would be like, where a reference ephemeris covers it."""
-    mission = missions.mission_in_force(connection, entry.spacecraft_id)
     candidates = (
         [ephemerides.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
@@ -515,13 +539,12 @@ def _prediction(
     return None
 
 
-def _coverage_conflict(connection: Connection, entry: WindowEntry) -> PlanConflict | None:
+def _coverage_conflict(connection: Connection, entry: WindowEntry, mission: Mission) -> PlanConflict | None:
     """Return the conflict of a window that no ephemeris covers.
 
     A window needs one if it names it, or if tables for it are made from it (`[uploads]` of the mission description).
     """
-    mission = missions.mission_in_force(connection, entry.spacecraft_id)
-    if entry.ephemeris_id is None and (mission is None or mission.uploads is None):
+    if entry.ephemeris_id is None and mission.uploads is None:
         return None
     known = ephemerides.list_ephemerides(connection, Paging(limit=1)).items
     if not known:
@@ -538,10 +561,9 @@ def _coverage_conflict(connection: Connection, entry: WindowEntry) -> PlanConfli
 
 
 def _span_conflicts(
-    connection: Connection, vehicle: int, window_id: int, entry: WindowEntry
+    connection: Connection, vehicle: int, window_id: int, entry: WindowEntry, mission: Mission
 ) -> list[PlanConflict]:
-    mission = missions.mission_in_force(connection, entry.spacecraft_id)
-    gap = 0 if mission is None else gap_ns(mission.uploads)
+    gap = gap_ns(mission.uploads)
     spans = store.neighbours(connection, vehicle, entry, gap)
     predecessor = next((span for span in spans if span.id == entry.predecessor_id), None)
     if entry.predecessor_id is not None and predecessor is None:

@@ -11,10 +11,9 @@ import functools
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.access.service import audit
@@ -27,12 +26,10 @@ from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.links import service as links
-from ground_service.missions import store as missions
 from ground_service.missions.model import Mission
-from ground_service.missions.places import outages_of
 from ground_service.planning import request_store as store
 from ground_service.planning import service as planning
-from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between
+from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
 from ground_service.planning.filling import NS, Option, ResourceGrid, choose
 from ground_service.planning.model import WindowEntry, WindowRecord
 from ground_service.planning.preparation import gap_ns
@@ -154,7 +151,7 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None) -> dict[str, int]:
 def needs_plan(ground: Ground) -> bool:
     """Return whether `plan_tick` may have something to do: there are active requests or approved windows."""
     with ground.database.reading() as connection:
-        return bool(store.active_requests(connection)) or store.has_unfinished(connection)
+        return bool(store.active_requests(connection) or store.unfinished_windows(connection, 2**62))
 
 
 def _fail_late(ground: Ground, now: int) -> int:
@@ -184,7 +181,8 @@ def _advance(ground: Ground, now: int) -> tuple[int, int]:
             if one.request_id is not None and one.start.utc_ns > now
         ]
         automatic = {
-            one.spacecraft_id: _is_automatic(missions.mission_in_force(connection, one.spacecraft_id))
+            one.spacecraft_id: planning.mission_of(connection, one.spacecraft_id).approval.windows
+            == "automatic"
             for one in soon
         }
     approved = released = 0
@@ -210,11 +208,8 @@ def _advance(ground: Ground, now: int) -> tuple[int, int]:
 def _decided(ground: Ground, window: WindowRecord, decision: str, reason: str | None) -> int:
     try:
         planning.change_window(ground, window.id, actor=PLANNER, changes={}, decision=decision, reason=reason)
-    except PlanConflicts as error:
+    except GroundError as error:  # conflicts, or another process or a person was faster
         log.warning("window %d: %s", window.id, error)
-        return 0
-    except GroundError as error:  # another process or a person was faster
-        log.info("window %d: %s", window.id, error)
         return 0
     return 1
 
@@ -235,12 +230,11 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
     with ground.database.reading() as connection:
         request = store.get_request_record(connection, request_id)
         end = now + round(request.terms.horizon_days * DAY_NS)
-        mission = missions.mission_in_force(connection, request.spacecraft_id)
         last = store.get_plan(connection, request_id)
         windows = store.windows_around(connection, request.vehicle_id, _first_needed(request, now))
         situation = _Situation(
             request,
-            Mission(name="not stated") if mission is None else mission,
+            planning.mission_of(connection, request.spacecraft_id),
             tuple(ephemerides.covering_ephemerides(connection, now, end, request.spacecraft_id)),
             tuple(one for one in windows if one.request_id == request_id),
             tuple(one for one in windows if one.state in COMMITTED or one.state == "draft"),
@@ -330,7 +324,7 @@ def _candidates(
     return [], planner.exclusion(constraints, first, last)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Keyed:
     """A planner, equal to others of the same ephemeris and mission description."""
 
@@ -373,7 +367,7 @@ def _chosen(
             options.append(option)
     if not options:
         return [], rejected
-    grid = _grid(ground, situation, resources, now, end)
+    grid = _grid(ground, situation, now, end)
     committed = [
         Option(one.start.utc_ns, one.stop.utc_ns, one.data_octets)
         for one in situation.others
@@ -395,31 +389,19 @@ def _uplinks(ground: Ground, situation: _Situation, now: int, end: int) -> list[
     return sorted(starts) if known else None
 
 
-def _grid(ground: Ground, situation: _Situation, resources: Resources, now: int, end: int) -> ResourceGrid:
+def _grid(ground: Ground, situation: _Situation, now: int, end: int) -> ResourceGrid:
     """Return the resources from an orbit before now until a day after the horizon, as far as the ephemeris reaches."""
     reference = max(situation.references, key=lambda one: one.stop.utc_ns)
     start = max(now - HISTORY_NS, reference.start.utc_ns)
     stop = min(end + DAY_NS, reference.stop.utc_ns)
     planner = planning.planner_of(ground, reference, situation.mission)
-    n = max(int((stop - start) // round(STEP_S * NS)), 1)
-    epochs = start + (np.arange(n, dtype=np.int64) * 2 + 1) * round(STEP_S * NS / 2)
-    gain_w = planner.sunlit(np.minimum(epochs, stop)) * resources.generation_w - resources.idle_w
+    count = max(int((stop - start) // round(STEP_S * NS)), 1)
+    grid = planning.resource_grid(planner, situation.mission, start, count, STEP_S)
     terms, stated = situation.request.terms, situation.mission.resources
-    floor = max(terms.minimum_battery, stated.minimum_battery or 0.0)
-    hours = stated.observe_hours_per_day
-    outages = outages_of(situation.mission.link)
-    return ResourceGrid(
-        start_utc_ns=start,
-        step_s=STEP_S,
-        gain_wh=gain_w * STEP_S / 3600.0,
-        downlink_octets=planner.downlink_octets(start, n, STEP_S, outages),
-        battery_wh=resources.battery_wh,
-        floor_wh=floor * resources.battery_wh,
-        observing_w=resources.observing_w,
-        storage_octets=resources.storage_octets,
+    return replace(
+        grid,
+        floor_wh=max(terms.minimum_battery, stated.minimum_battery or 0.0) * grid.battery_wh,
         downlink_within_s=86_400.0 if terms.needs_contact else float("inf"),
-        observe_s_per_day=None if hours is None else hours * 3600.0,
-        gap_ns=planner.gap_ns,
     )
 
 
@@ -486,10 +468,6 @@ def _candidate(option: Option, window_id: int | None, reason: str | None) -> Pla
         window_id=window_id,
         reason=reason,
     )
-
-
-def _is_automatic(mission: Mission | None) -> bool:
-    return mission is not None and mission.approval.windows == "automatic"
 
 
 def _check_terms(terms: RequestTerms) -> None:

@@ -13,7 +13,7 @@ from ground_service.errors import NotFound
 from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version
 from ground_service.passes import store as passes
-from ground_service.planning.core import Commitment
+from ground_service.planning.filling import Option
 from ground_service.planning.model import (
     AssessedWindow,
     Window,
@@ -166,7 +166,7 @@ def neighbours(connection: Connection, vehicle: int, entry: WindowEntry, gap_ns:
 
 def commitments(
     connection: Connection, spacecraft_id: int | None, instance: str, *, without: int = 0
-) -> list[Commitment]:
+) -> list[Option]:
     """Return the windows of a spacecraft, except one, whose data are or will be on board."""
     query = (
         select(WINDOWS.c.start_utc_ns, WINDOWS.c.stop_utc_ns, WINDOWS.c.data_octets)
@@ -178,7 +178,7 @@ def commitments(
             WINDOWS.c.state.in_([state for state in COMMITTED if state != "downlinked"]),
         )
     )
-    return [Commitment(*row) for row in connection.execute(query)]
+    return [Option(*row) for row in connection.execute(query)]
 
 
 def windows_between(

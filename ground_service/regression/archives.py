@@ -248,12 +248,7 @@ def store_archive(
         record = ArchiveRecord(
             digest=archive.digest,
             name=archive.name,
-            manifest_sha256=stored[MANIFEST].sha256,
-            frames=archive.frames,
-            frames_stored=archive.frames_stored,
-            state=archive.state,
-            reason=archive.reason,
-            octets=sum(file.octets for file in stored.values()),
+            **_columns(archive, stored),
             pinned=pinned,
             kept_since=UtcTime(utc_now_ns()),
             pass_id=pass_id,
@@ -273,16 +268,14 @@ def restock_archive(ground: Ground, record: ArchiveRecord, archive: PassArchive)
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
         _restore(files, archive.folder, stored)
-        store.restock_archive(
-            connection,
-            record,
-            manifest_sha256=stored[MANIFEST].sha256,
-            frames=archive.frames,
-            frames_stored=archive.frames_stored,
-            state=archive.state,
-            reason=archive.reason,
-            octets=sum(file.octets for file in stored.values()),
-        )
+        store.restock_archive(connection, record, **_columns(archive, stored))
+
+
+def _columns(archive: PassArchive, stored: Mapping[str, StoredFile]) -> dict[str, Any]:
+    """Return the columns of the contents of an archive."""
+    octets = sum(file.octets for file in stored.values())
+    same = {name: getattr(archive, name) for name in ("frames", "frames_stored", "state", "reason")}
+    return {"manifest_sha256": stored[MANIFEST].sha256, "octets": octets, **same}
 
 
 def _stored(files: FileArchive, archive: PassArchive) -> dict[str, StoredFile]:

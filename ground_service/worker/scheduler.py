@@ -25,6 +25,7 @@ from ground_service.planning.standing import needs_plan
 from ground_service.store import leases
 from ground_service.worker.actions import repeat_due
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
+from ground_service.worker.watch import Watch
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,9 @@ TICK_S = 2.0
 
 NIGHT_NS = 1_800_000_000_000
 """The nightly job is entered at 00:30 UTC."""
+
+WATCH_S = 30.0
+"""Interval of the search for what stops operations."""
 
 CATCH_UP_S = 60.0
 """A process that was not running then enters it so long after its start."""
@@ -66,6 +70,7 @@ class Scheduler:
         self._ground, self._dispatcher, self._drain = ground, dispatcher, drain
         self._kept, self._plan_hourly = dict(kept), plan_hourly
         self._catch_up_s = time.monotonic() + CATCH_UP_S
+        self._watch, self._watch_s = Watch(ground), time.monotonic() + WATCH_S
         self._plan: str | None = None
         self._night: str | None = None
         self._since_utc_ns: int | None = None
@@ -111,6 +116,9 @@ class Scheduler:
         self._do("events of other processes", self._drain)
         self._do("failed actions", self._repeat_actions)
         self._do("overdue telecommands", self._note_timeouts)
+        if time.monotonic() >= self._watch_s:
+            self._watch_s = time.monotonic() + WATCH_S
+            self._do("watch", self._watch.tick)
         if self._plan_hourly:
             self._do("plan", self._enter_plan)
         self._do("nightly job", self._enter_night)

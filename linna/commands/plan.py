@@ -141,7 +141,8 @@ def _candidates(found: SearchResult) -> str:
         f"Sun {one.sun_elevation_deg.min:.0f} to {one.sun_elevation_deg.max:.0f} deg"
         for one in found.candidates
     ]
-    return "\n".join([*lines, f"{len(found.candidates)} candidates; data: {'; '.join(found.data)}"])
+    last = found.reason or f"{len(found.candidates)} candidates; data: {'; '.join(found.data)}"
+    return "\n".join([*lines, last])
 
 
 def _window(window: Window) -> str:

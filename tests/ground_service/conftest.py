@@ -111,6 +111,13 @@ def circular_states(utc_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return radius * (c * along + s * across), radius * rate * (c * across - s * along)
 
 
+def save_circle(path: Path, start_utc_ns: int = START, hours: float = 4.0) -> Path:
+    """Write an ephemeris of the circular orbit."""
+    utc_ns = start_utc_ns + np.arange(0, round(hours * 3600), 60, dtype=np.int64) * NS
+    save_oem(ephemeris_from_states(utc_ns, *circular_states(utc_ns)), path)
+    return path
+
+
 def _catalogue(
     latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator
 ) -> CraterCatalogue:

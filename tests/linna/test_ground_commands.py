@@ -18,10 +18,8 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from linna.cli import GROUPS, run
 from linna.parser import LinnaParser
-from lunar.ephemeris import ephemeris_from_states
-from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import START, circular_states
+from tests.ground_service.conftest import START, save_circle
 from tests.serving import served
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -31,13 +29,7 @@ NS = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two hours of a polar circle at 40 km."""
-    import numpy as np
-
-    path = tmp_path_factory.mktemp("oem") / "reference.oem"
-    utc_ns = START + np.arange(0, 7200, 60, dtype=np.int64) * NS
-    save_oem(ephemeris_from_states(utc_ns, *circular_states(utc_ns)), path)
-    return path
+    return save_circle(tmp_path_factory.mktemp("oem") / "reference.oem")
 
 
 @pytest.fixture

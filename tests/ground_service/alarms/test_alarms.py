@@ -19,11 +19,18 @@ from ground_service.alarms.service import (
     list_alarms,
     shelve_alarm,
 )
-from ground_service.clock import utc_now_ns
+from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import AlarmChanged, read_events
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
+from ground_service.planning.model import WindowEntry
+from ground_service.planning.progress import note_reason
+from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning.service import add_window, change_window
+from ground_service.planning.standing import add_request, plan_tick
+from ground_service.worker.watch import Watch
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -217,3 +224,38 @@ def test_conditions_are_joined_in_any_order(conditions: list[core.Condition], ra
 
     shuffled = random.sample(conditions, len(conditions))
     assert whole(conditions) == whole(shuffled)
+
+
+def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None:
+    text = (
+        'name = "stopped"\n[spacecraft]\nid = 76\n[uploads]\n[[links]]\nname = "lab"\nkind = "tcp"\n'
+        'uplink = "127.0.0.1:9"\n'
+    )
+    moment = START // SECOND * 10**9
+    set_mission_clock(lambda: moment)
+    try:
+        with open_ground(tmp_path) as ground:
+            add_mission(ground, text.encode())
+            add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
+            entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
+            window = add_window(ground, entry, actor="planner").id
+            change_window(ground, window, actor="planner", changes={}, decision="approved")
+            note_reason(ground, window, "cannot be released")
+            plan_tick(ground, moment)
+            watch = Watch(ground, holds_s=0.0)
+            watch.tick()
+            names = {"no_link", "window_not_released", "plan_empty"}
+            assert {one.name for one in alarms(ground, "raised")} == names
+            watch.tick()  # no time has passed since
+            assert {one.name for one in alarms(ground, "raised")} == {*names, "mission_time_stopped"}
+            assert {(one.source, one.severity, one.active) for one in alarms(ground)} == {
+                ("operations", "alarm", True)
+            }
+            moment += 10**9
+            watch.tick()
+            [ended] = [one for one in alarms(ground) if not one.active]
+            assert ended.name == "mission_time_stopped"
+            Watch(ground).tick()  # nothing has lasted for long
+            assert not any(one.active for one in alarms(ground))
+    finally:
+        set_mission_clock()

@@ -1,6 +1,7 @@
 """The detector's score, on a crater field whose detections are made by hand."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,6 +51,11 @@ def detections(
     )
 
 
+def scored(found: Any, expected: Any) -> Any:
+    """Return the scores of the detections of one frame."""
+    return score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
+
+
 def test_craters_project_where_the_picture_shows_them() -> None:
     """East is right, south is down; the crater below is at the centre and as wide as f D / h."""
     expected = expected_craters(field(), CAMERA, POSITION)
@@ -77,7 +83,7 @@ def test_a_perfect_detector_scores_one() -> None:
         expected.diameter_px.tolist(),
         [0, 1, 2, 3],
     )
-    score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
+    score = scored(found, expected)
     assert score.micro is not None
     assert (score.micro.expected, score.micro.detected_true, score.micro.false_alarms) == (3, 3, 0)
     assert score.micro.localisation_px == pytest.approx(0.5)
@@ -89,7 +95,7 @@ def test_one_detection_serves_one_crater_and_the_second_is_a_false_alarm() -> No
     expected = expected_craters(field(), CAMERA, POSITION)
     u, v, d = (float(a[1]) for a in (expected.u_px, expected.v_px, expected.diameter_px))
     found = detections([u, u + 2.0], [v, v], [d, d], [1, 1])
-    score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
+    score = scored(found, expected)
     middle = score.per_class[1]
     assert (middle.detected_true, middle.false_alarms, middle.precision, middle.recall) == (1, 1, 0.5, 1.0)
     assert middle.localisation_px == 0.0
@@ -119,7 +125,7 @@ def test_small_craters_count_neither_for_nor_against() -> None:
         [float(expected.diameter_px[3]), 15.0],
         [3, 3],
     )
-    score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
+    score = scored(found, expected)
     assert score.micro is not None
     assert (score.micro.expected, score.micro.false_alarms) == (3, 0)
 
@@ -128,7 +134,7 @@ def test_small_craters_count_neither_for_nor_against() -> None:
 def test_unfit_images_and_incomplete_regions_are_left_out(usable: bool, complete: bool) -> None:
     expected = expected_craters(field(complete), CAMERA, POSITION)
     found = detections([3.0], [3.0], [30.0], [1], usable)
-    score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
+    score = scored(found, expected)
     assert score.micro is not None
     assert (score.micro.expected, score.micro.false_alarms) == (0, 0)
     assert np.isnan(score.micro.recall)
@@ -138,7 +144,7 @@ def test_no_craters_and_no_frames_are_no_error() -> None:
     empty = field().select(np.zeros(0, dtype=np.int64))
     expected = expected_craters(empty, CAMERA, POSITION)
     found = detections([10.0], [10.0], [30.0], [1])
-    score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
+    score = scored(found, expected)
     assert score.micro is not None
     # Where the catalogue is complete nowhere, a detection is no false alarm: nobody knows the craters there.
     assert score.micro.false_alarms == 0 and np.isnan(score.micro.precision)

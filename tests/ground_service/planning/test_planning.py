@@ -11,7 +11,6 @@ import pytest
 
 from ground_service.links.core import PredictedContact
 from ground_service.planning.core import (
-    Commitment,
     Constraints,
     Planner,
     Resources,
@@ -19,6 +18,7 @@ from ground_service.planning.core import (
     frames_between,
     storage_peak,
 )
+from ground_service.planning.filling import Option
 from ground_service.planning.window_states import (
     PlannedSpan,
     WindowFacts,
@@ -181,7 +181,7 @@ def test_the_battery_falls_with_the_load() -> None:
 
 
 def test_data_leave_the_store_in_the_order_they_came() -> None:
-    first, second = Commitment(0, 100 * NS, 1000), Commitment(200 * NS, 300 * NS, 500)
+    first, second = Option(0, 100 * NS, 1000), Option(200 * NS, 300 * NS, 500)
     contacts = [
         PredictedContact("a", 400 * NS, 460 * NS),
         PredictedContact("b", 450 * NS, 500 * NS),

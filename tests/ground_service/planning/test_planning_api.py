@@ -265,27 +265,6 @@ def test_a_window_with_a_value_of_another_kind_is_refused(client: TestClient, fi
     assert client.get(f"{V1}/windows").json()["total"] == 0
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("NaN", "expected finite numbers, found NaN"),
-        ("Infinity", "expected finite numbers, found Infinity"),
-        ("-Infinity", "expected finite numbers, found -Infinity"),
-        ("1e400", "expected finite numbers, found 1e400"),
-        ("true", "set_parameter.value: expected a"),
-        ('"\\u0000"', "without NUL"),
-    ],
-)
-def test_a_command_with_a_number_that_is_none_is_refused_in_one_line(
-    client: TestClient, value: str, message: str
-) -> None:
-    body = f'{{"name": "set_parameter", "arguments": {{"parameter_id": 1, "value": {value}}}, "spacecraft_id": 76}}'
-    answer = client.post(f"{V1}/telecommands", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == 422
-    assert message in answer.json()["detail"]
-    assert answer.json()["detail"].isprintable()
-
-
 def test_of_two_decisions_the_second_is_told_the_state_that_won(client: TestClient) -> None:
     key = approved(client, 0, 300)
     assert client.patch(f"{V1}/windows/{key}", json={"state": "failed"}).status_code == 200

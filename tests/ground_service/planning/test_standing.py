@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ground_service.clock import set_mission_clock
@@ -27,9 +26,7 @@ from ground_service.planning.request_model import RequestTerms, StandingRequestC
 from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
 from ground_service.worker.follow_up import follow_in_process
-from lunar.ephemeris import ephemeris_from_states
-from lunar.messages.oem import save_oem
-from tests.ground_service.conftest import START, circular_states
+from tests.ground_service.conftest import START, save_circle
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 NS = 10**9
@@ -99,10 +96,8 @@ def ground(tmp_path: Path) -> Iterator[Ground]:
 
 @pytest.fixture(scope="module")
 def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    every = START - 3 * HOUR + np.arange(0, DAYS * 86_400, 60, dtype=np.int64) * NS
     path = tmp_path_factory.mktemp("oem") / "reference.oem"
-    save_oem(ephemeris_from_states(every, *circular_states(every)), path)
-    return path
+    return save_circle(path, START - 3 * HOUR, 24.0 * DAYS)
 
 
 def prepare(ground: Ground, oem: Path, extra: str = AUTOMATIC + LINKS) -> None:

@@ -28,10 +28,10 @@ WAIT_MS = 30_000
 AFTER = parse_utc("2029-08-07T06:15:00Z")
 
 
-def ask(url, **headers):
+def ask(url, body=None, **headers):
     """Status, body and headers of a GET."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, body, headers), timeout=60) as answer:
             return answer.status, answer.read(), answer.headers
     except urllib.error.HTTPError as error:
         with error:

@@ -3,8 +3,6 @@
 import asyncio
 import shutil
 import threading
-import urllib.error
-import urllib.request
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +18,7 @@ from ground_service.settings import Settings
 from ground_service.store import wakeups
 from ground_service.web import sockets
 from tests.ground_service.links.conftest import HEAD, Station
+from tests.ground_service.web.test_displays import ask as fetch
 from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -43,13 +42,7 @@ def server_url(migrated_postgres: Callable[[], str]) -> str:
 
 
 def ask(port: int, path: str, body: bytes | None = None) -> tuple[int, bytes, Any]:
-    request = urllib.request.Request(f"http://127.0.0.1:{port}/api/v1/{path}", data=body)
-    try:
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            return answer.status, answer.read(), answer.headers
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read(), error.headers
+    return fetch(f"http://127.0.0.1:{port}/api/v1/{path}", body)
 
 
 def housekeeping(second: int, **values: float) -> bytes:

@@ -18,14 +18,12 @@ import pytest
 
 from ground_service.settings import Settings
 from linna.cli import run
-from lunar.ephemeris import ephemeris_from_states
-from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft import new_board
-from tests.ground_service.conftest import START, circular_states
+from tests.ground_service.conftest import START, save_circle
 from tests.serving import served
 from tmtc.downlink import encode_cadus
 from tmtc.uplink import UplinkDecoder
@@ -94,13 +92,6 @@ def workers(settings: Settings, folder: Path, count: int) -> Iterator[None]:
             worker.wait(60)
 
 
-def reference_ephemeris(path: Path) -> Path:
-    """Four hours of a polar circle at 40 km."""
-    utc_ns = START + np.arange(0, 4 * 3600, 60, dtype=np.int64) * NS
-    save_oem(ephemeris_from_states(utc_ns, *circular_states(utc_ns)), path)
-    return path
-
-
 def operate(capsys: pytest.CaptureFixture[str], service: tuple[str, str], folder: Path) -> None:
     url, token = service
 
@@ -115,7 +106,7 @@ def operate(capsys: pytest.CaptureFixture[str], service: tuple[str, str], folder
         (ingested,) = linna("ingest", folder / "down.cadu")["ingested"]
         return ingested
 
-    linna("plan", "ephemeris", reference_ephemeris(folder / "reference.oem"))
+    linna("plan", "ephemeris", save_circle(folder / "reference.oem"))
     found = linna("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 600)["candidates"]
     chosen = found[1]
     key = linna(

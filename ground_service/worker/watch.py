@@ -1,0 +1,60 @@
+"""Alarms for what stops the operation of a spacecraft, found in the state of the service instead of in telemetry."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Set
+from dataclasses import dataclass, field
+
+from ground_service.alarms.service import note_operations
+from ground_service.clock import mission_now_ns
+from ground_service.ground import Ground
+from ground_service.links.service import list_links
+from ground_service.missions.store import missions_in_force
+from ground_service.planning import request_store
+from ground_service.planning.store import WINDOWS, records_where
+
+HOLDS_S = 300.0
+"""A condition is an alarm when it has held for so long."""
+
+
+@dataclass(slots=True)
+class Watch:
+    """Conditions (spacecraft, name), and since when each of them holds (monotonic clock, s)."""
+
+    ground: Ground
+    holds_s: float = HOLDS_S
+    _since: dict[tuple[int, str], float] = field(default_factory=dict)
+    _clock: int = 0
+
+    def tick(self) -> None:
+        """Look at all spacecraft; raise alarms, or end their conditions."""
+        now = time.monotonic()
+        with self.ground.database.reading() as connection:
+            spacecraft = set(missions_in_force(connection))
+        self._since = {one: self._since.get(one, now) for one in self._conditions(spacecraft)}
+        for number in spacecraft:
+            held = {
+                name
+                for (own, name), since in self._since.items()
+                if own == number and now - since >= self.holds_s
+            }
+            note_operations(self.ground, number, held)
+
+    def _conditions(self, spacecraft: Set[int]) -> Iterator[tuple[int, str]]:
+        now, before = mission_now_ns(), self._clock
+        self._clock = now
+        links = list_links(self.ground)
+        for number in spacecraft:
+            mine = [one for one in links if one.spacecraft_id == number]
+            if mine and now == before:
+                yield number, "mission_time_stopped"
+            if mine and not any(one.state in ("connected", "contact") for one in mine):
+                yield number, "no_link"
+        with self.ground.database.reading() as connection:
+            refused = records_where(connection, WINDOWS.c.state == "approved", WINDOWS.c.reason.is_not(None))
+            yield from ((one.spacecraft_id, "window_not_released") for one in refused)
+            for key in request_store.active_requests(connection):
+                plan = request_store.get_plan(connection, key)
+                if plan.planned is not None and not plan.candidates:
+                    yield request_store.get_request_record(connection, key).spacecraft_id, "plan_empty"
