@@ -392,6 +392,7 @@ MATRIX = [
     ("GET", "/contacts", "viewer"),
     ("GET", "/jobs", "viewer"),
     ("GET", f"/jobs/{'0' * 32}", "viewer"),
+    ("POST", f"/jobs/{'0' * 32}/repeat", "operator"),
     ("GET", f"/reports/{'0' * 32}", "viewer"),
     ("GET", f"/reports/{'0' * 32}/summary", "viewer"),
     ("GET", f"/reports/{'0' * 32}/overview", "viewer"),

@@ -63,7 +63,9 @@ def test_the_document_has_the_figures_tables_and_differences(
 
 
 def test_a_second_run_repeats_no_step(document: tuple[Path, dict[str, Any], list[str]]) -> None:
-    assert document[2] and all(line.endswith(": already done") for line in document[2])
+    announced, *steps = document[2]
+    assert announced.startswith("this takes") and steps
+    assert all(line.endswith(": already done") for line in steps)
 
 
 def test_without_torch_the_document_says_what_it_lacks(

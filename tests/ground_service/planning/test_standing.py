@@ -194,7 +194,7 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     assert standing.plan_tick(either, now.utc_ns)["added"] == 1
     second = max(either.read(list_windows, WindowFilter()).items, key=lambda one: one.id)
     assert (second.start, second.stop) == (first.start, first.stop)
-    monkeypatch.setattr(store, "received_frames", lambda *_: 5)
+    monkeypatch.setattr("ground_service.planning.progress.received_frames", lambda *_: 5)
     advance_windows(either, 1)
     found = [either.read(get_window, one.id) for one in (first, second)]
     assert [one.state for one in found] == ["failed", "executing"]

@@ -6,6 +6,7 @@ import json
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from ground_service.ground import open_ground
 from ground_service.regression.archives import pack_archive
 from ground_service.settings import Settings
 from linna.cli import run
+from tests.serving import wait_for
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -31,6 +33,10 @@ V1 = "/api/v1"
 def client(tmp_path: Path) -> Iterator[TestClient]:
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
         yield opened
+
+
+def is_done(client: TestClient, job_id: str) -> bool:
+    return bool(client.get(f"{V1}/jobs/{job_id}").json()["state"] == "done")
 
 
 def zipped(folder: Path, target: Path) -> bytes:
@@ -60,7 +66,8 @@ def test_a_build_is_registered_held_against_another_and_judged(
     for candidate, verdict in zip(digests, ("pass", "fail"), strict=True):
         job = client.post(f"{V1}/regressions", json={"candidate": candidate, "baseline": digests[0]})
         assert job.status_code == 202, job.text
-        assert (job.json()["kind"], job.json()["state"]) == ("regression", "done")
+        assert job.json()["kind"] == "regression"
+        wait_for(partial(is_done, client, job.json()["id"]), "the end of the regression")
         found = client.get(job.headers["location"]).json()
         assert found["verdict"] == verdict
         assert found["result"]["passes"][0]["archive"] == kept.json()["digest"]

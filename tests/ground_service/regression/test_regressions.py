@@ -467,7 +467,7 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     monkeypatch.setenv("LINNA_ARCHIVE_DAYS", "400")
     monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
     kept = Settings(home=tmp_path).kept
-    assert kept == {"retention_days": 90, "archive_days": 400, "archive_limit_mib": 2000}
+    assert kept == {"retention_days": 90, "archive_days": 400, "archive_limit_mib": 2000, "audit_heads": None}
     with pytest.MonkeyPatch.context() as patched:
         called = MagicMock(return_value=[])
         patched.setattr("ground_service.worker.upkeep.let_go", called)

@@ -49,12 +49,8 @@ class Server:
     def start(self) -> None:
         script = (self.scripts / "postgres.sh").read_text()
         options = re.findall(r"-c (\w+)=('[^']*'|\S+)", script)
-        assert [name for name, _ in options] == [
-            "wal_level",
-            "archive_mode",
-            "archive_timeout",
-            "archive_command",
-        ]
+        named = ["max_connections", "wal_level", "archive_mode", "archive_timeout", "archive_command"]
+        assert [name for name, _ in options] == named
         lines = [f"{name} = {value}" for name, value in options]
         own = [
             f"port = {self.port}",

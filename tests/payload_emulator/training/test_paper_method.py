@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -67,12 +69,15 @@ def test_a_crop_of_a_colour_frame_is_that_of_its_gray_where_channels_agree() -> 
     np.testing.assert_allclose(crops[0].image, crops[1].image, atol=1e-5)
 
 
-@pytest.fixture(scope="module")
-def coloured(tmp_path_factory) -> Dataset:
-    folder = tmp_path_factory.mktemp("colour") / "set"
-    source = Source("world", "train", "procedural", 1.0, (41,), altitude_km=(40.0, 45.0))
+def one_frame(folder: Path, split: Literal["train", "val"]) -> Dataset:
+    source = Source("world", split, "procedural", 1.0, (41,), altitude_km=(40.0, 45.0))
     list(build(Recipe("colour", 7, (source,), frames_per_shard=1, colour="rgb"), folder, 1, find_data(None)))
     return Dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def coloured(tmp_path_factory) -> Dataset:
+    return one_frame(tmp_path_factory.mktemp("colour") / "set", "train")
 
 
 def test_a_data_set_in_colour_keeps_the_channels(coloured: Dataset, tmp_path) -> None:
@@ -110,7 +115,7 @@ def classes_only(coloured: Dataset, tmp_path_factory) -> bytes:
         detail_blocks=0,
         preparation=Preparation.normalise_first,
     )
-    train([coloured], run, parameters)
+    train([coloured, one_frame(run.with_name("validation"), "val")], run, parameters)
     export(run / "checkpoint.pt", run / "m.onnx", [coloured], classes_only=True)
     return (run / "m.onnx").read_bytes()
 
