@@ -10,7 +10,7 @@ import sys
 from benchmarks._rows import measure, report
 
 NAMES = (
-    "tmtc", "xtce", "downlink", "downlink_memory", "ground", "orbit", "ephemeris", "render", "detector", "machine",
+    "tmtc", "xtce", "downlink", "downlink_memory", "ground", "orbit", "ephemeris", "render", "detector",
     "planning", "report_pages", "pages",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""

@@ -166,8 +166,8 @@ GROUPS = {
     ),
     "commanding": Group(
         (
-            "ground_service/commanding/service.py",
-            "ground_service/commanding/core.py",
+            "ground_service/contacts/commanding/service.py",
+            "ground_service/contacts/commanding/core.py",
             f"{_FLIGHT}/onboard/commanding.py",
         ),
         (

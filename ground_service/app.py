@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from starlette.routing import Route
 
 from ground_service.access.provider import provider_of
+from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
@@ -21,7 +22,6 @@ from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
-from ground_service.links.supervisor import LinkSupervisor
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis

@@ -175,6 +175,16 @@ def _check_first_spacecraft(folder: Path) -> None:
     assert "first" in (folder / "report.html").read_text()
 
 
+def test_the_walks_name_functions_that_exist() -> None:
+    steps = re.findall(r"`([\w/]+\.py): (\w+)`", (DOCS / "explanation" / "walks.md").read_text())
+    gone = [
+        (file, name)
+        for file, name in steps
+        if not re.search(rf"^(async )?(def|class) {name}\b", (ROOT / file).read_text(), re.MULTILINE)
+    ]
+    assert len(steps) > 20 and gone == []
+
+
 def test_reference_pages_name_every_setting() -> None:
     from ground_service.settings import Settings
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from ground_service.contacts.links import service as links
 from ground_service.errors import GroundError
-from ground_service.links import service as links
 from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario

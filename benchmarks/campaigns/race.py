@@ -41,7 +41,7 @@ from sqlalchemy import func, select
 from benchmarks.campaigns._deployment import ManyApis
 from ground_service.access.service import add_user
 from ground_service.clock import utc_now_ns
-from ground_service.commanding.service import enter_command, release_command
+from ground_service.contacts.commanding.service import enter_command, release_command
 from ground_service.ground import Ground, open_ground
 from ground_service.planning.service import WindowEntry, add_window, change_window, uplink_window
 from ground_service.regression.builds import load_build, register_build

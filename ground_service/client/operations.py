@@ -10,32 +10,33 @@ from ground_service.client.connection import Connection, Document, Listing, impo
 
 if TYPE_CHECKING:
     from ground_service.access import model as access
-    from ground_service.alarms import model as alarms
-    from ground_service.automation import model as automation
-    from ground_service.commanding import model as commanding
+    from ground_service.contacts.commanding import model as commanding
+    from ground_service.contacts.links import model as links
     from ground_service.displays import model as displays
-    from ground_service.ephemerides import model as ephemerides
     from ground_service.evaluation import model as evaluation
+    from ground_service.evaluation.landmarks import model as landmarks
+    from ground_service.evaluation.performance import model as performance
     from ground_service.exports import model as exports
     from ground_service.ingest import model as ingest
     from ground_service.jobs import model as jobs
-    from ground_service.landmarks import model as landmarks
-    from ground_service.links import model as links
     from ground_service.missions import model as missions
+    from ground_service.missions.ephemerides import model as ephemerides
+    from ground_service.missions.timekeeping import model as timekeeping
     from ground_service.passes import model as passes
-    from ground_service.performance import model as performance
+    from ground_service.passes.alarms import model as alarms
     from ground_service.planning import model as planning
     from ground_service.planning import request_model as request_model
     from ground_service.regression import model as regression
-    from ground_service.timekeeping import model as timekeeping
     from ground_service.worker import model as worker
+    from ground_service.worker.automation import model as automation
 else:
     import_lazily(
         globals(),
-        "access.model alarms.model automation.model commanding.model displays.model "
-        "ephemerides.model evaluation.model exports.model ingest.model jobs.model landmarks.model "
-        "links.model missions.model passes.model performance.model planning.model regression.model "
-        "planning.request_model timekeeping.model worker.model ",
+        "access.model passes.alarms.model worker.automation.model contacts.commanding.model "
+        "displays.model missions.ephemerides.model evaluation.model exports.model ingest.model "
+        "jobs.model evaluation.landmarks.model contacts.links.model missions.model passes.model "
+        "evaluation.performance.model planning.model regression.model planning.request_model "
+        "missions.timekeeping.model worker.model ",
     )
 
 
@@ -261,7 +262,7 @@ class Operations(Connection):
     ) -> performance.MonthlyReport:
         """Add the report of a month of one instance; the same content gives the same report."""
 
-    @operation("GET /monthly-reports", reads="performance.store.list_monthly_reports")
+    @operation("GET /monthly-reports", reads="evaluation.performance.store.list_monthly_reports")
     def list_monthly_reports(self, *, spacecraft_id: int | None = None) -> Listing[performance.MonthlyReport]:
         """List the monthly reports, newest month first."""
 
@@ -273,7 +274,7 @@ class Operations(Connection):
 
     # landmarks
 
-    @operation("GET /landmarks", reads="landmarks.store.list_landmarks")
+    @operation("GET /landmarks", reads="evaluation.landmarks.store.list_landmarks")
     def list_landmarks(
         self, *, spacecraft_id: int | None = None, state: landmarks.LandmarkState | None = None
     ) -> Listing[landmarks.Landmark]:
@@ -313,7 +314,7 @@ class Operations(Connection):
     ) -> ephemerides.Ephemeris:
         """Add a reference ephemeris: OEM (text or XML), STK .e or Horizons CSV as the body, also compressed."""
 
-    @operation("GET /ephemerides", reads="ephemerides.store.list_ephemerides")
+    @operation("GET /ephemerides", reads="missions.ephemerides.store.list_ephemerides")
     def list_ephemerides(self) -> Listing[ephemerides.Ephemeris]:
         """List the reference ephemerides, newest first."""
 
@@ -485,7 +486,7 @@ class Operations(Connection):
 
     # telecommands
 
-    @operation("GET /telecommands", reads="commanding.service.list_telecommands")
+    @operation("GET /telecommands", reads="contacts.commanding.service.list_telecommands")
     def list_telecommands(
         self, *, state: Literal["queued", "carried", "released", "rejected", "sent"] | None = None
     ) -> Listing[commanding.Telecommand]:
@@ -522,7 +523,7 @@ class Operations(Connection):
 
     # alarms
 
-    @operation("GET /alarms", reads="alarms.service.list_alarms")
+    @operation("GET /alarms", reads="passes.alarms.service.list_alarms")
     def list_alarms(
         self,
         *,
@@ -571,7 +572,7 @@ class Operations(Connection):
     def list_automation_rules(self) -> list[automation.RuleInForce]:
         """List the rules in force by spacecraft, and the default rules of spacecraft without a mission description."""
 
-    @operation("GET /automation/actions", reads="automation.store.list_automation_actions")
+    @operation("GET /automation/actions", reads="worker.automation.store.list_automation_actions")
     def list_automation_actions(
         self, *, state: automation.ActionState | None = None, pass_id: int | None = None
     ) -> Listing[automation.AutomationAction]:

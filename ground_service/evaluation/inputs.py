@@ -12,9 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
-from ground_service.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
-from ground_service.ephemerides.model import Ephemeris as EphemerisEntry
-from ground_service.ephemerides.store import covering_ephemerides, get_ephemeris
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.detection.fixes import IdentificationSamples
@@ -26,9 +23,14 @@ from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, F
 from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import read_catalogue
+from ground_service.missions.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
+from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
+from ground_service.missions.ephemerides.store import covering_ephemerides, get_ephemeris
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
+from ground_service.missions.timekeeping.model import Correlation
+from ground_service.missions.timekeeping.store import correlations_in_force
 from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
@@ -42,8 +44,6 @@ from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import Vehicle, get_vehicle
-from ground_service.timekeeping.model import Correlation
-from ground_service.timekeeping.store import correlations_in_force
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from lunar.frames import Orientation

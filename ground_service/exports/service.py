@@ -30,12 +30,12 @@ from ground_service.exports.packet_files import parquet_files
 from ground_service.exports.table_files import csv_files, netcdf_octets
 from ground_service.exports.tables import pass_tables
 from ground_service.ground import Ground
+from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import store
 from ground_service.passes.parameters import packets_by_name
 from ground_service.passes.service import get_pass
 from ground_service.passes.span import pass_span
 from ground_service.store.files import INCOMING, unfinished_prefix
-from ground_service.timekeeping.store import load_correlations
 from lunar.frames import mcmf_from_spherical
 from tmtc.errors import MissingLibrary
 

@@ -15,6 +15,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
 from ground_service.http.model import PageOf, Paging
 from ground_service.ingest.model import Ingest, IngestResult
+from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT
 from ground_service.store import repository
 from ground_service.store.bulk import insert_columns
 from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
@@ -39,9 +40,6 @@ _PLACE = (
     func.coalesce(_PIECES.c.stream, "").label("stream"),
     func.coalesce(_PIECES.c.position, 0).label("position"),
 )
-
-RECEPTIONS_LIMIT = 100_000
-"""Largest number of reception times of time reports of a vehicle."""
 
 log = logging.getLogger(__name__)
 

@@ -8,23 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.clock import utc_now_ns
-from ground_service.ephemerides.attitudes import attitude_file, load_attitudes
-from ground_service.ephemerides.store import add_ephemeris
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.events import ArchiveImported, publish_once
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.ephemerides.attitudes import attitude_file, load_attitudes
+from ground_service.missions.ephemerides.store import add_ephemeris
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
 from ground_service.missions.store import ARCHIVE_ACTOR
+from ground_service.missions.timekeeping.recorrelation import enter_receptions, read_receptions
 from ground_service.passes import store
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import SPACECRAFT_ID_MAX, vehicle_id
 from ground_service.text import require_line
-from ground_service.timekeeping.recorrelation import enter_receptions, read_receptions
 from ground_service.toml import read_json
 from lunar.catalogue import load_catalogue
 from lunar.errors import LunarError

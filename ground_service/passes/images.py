@@ -11,11 +11,11 @@ from sqlalchemy import Connection
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
+from ground_service.missions.timekeeping.core import utc_ns_of_ticks
 from ground_service.passes import sample_store, store
 from ground_service.passes.model import Image
 from ground_service.passes.span import PassSpan, pass_span, vehicle_span
 from ground_service.store.vehicles import find_vehicle
-from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray
 from lunar.timescales import TICKS_PER_SECOND
 from tmtc.dictionary import APID_LARGE_DATA, DICTIONARY

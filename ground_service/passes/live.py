@@ -11,11 +11,11 @@ from sqlalchemy import Connection
 from ground_service.clock import mission_now_ns
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
+from ground_service.missions.timekeeping.core import utc_ns_of_ticks
+from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes.model import LiveParameter, LiveValue, NewestPacket, SpacecraftInstance
 from ground_service.store import telemetry
 from ground_service.store.vehicles import FLOWN, Vehicle, all_vehicles, find_vehicle, get_vehicle
-from ground_service.timekeeping.core import utc_ns_of_ticks
-from ground_service.timekeeping.store import load_correlations
 from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.schema import DecodedPacket, Field
 

@@ -14,6 +14,7 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
+from ground_service.missions.timekeeping.core import utc_ns_of_ticks
 from ground_service.passes import sample_store, store
 from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
 from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, SampleSource
@@ -21,7 +22,6 @@ from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store import parameters as declared_values
 from ground_service.store import rollups
 from ground_service.store.vehicles import find_vehicle
-from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY, STRUCTURES

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, func, select
 
 from ground_service.http.model import Paging
+from ground_service.missions.timekeeping.core import utc_ns_of_ticks
 from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
 from ground_service.store import repository, telemetry
 from ground_service.store.codec import DETECTION_ITEM, unpack_detections
-from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import IntArray
 from reports.values import PassEvent
 from tmtc.cuc import onboard_ticks

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
+from ground_service.missions.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
 from ground_service.passes.core import (
     Aggregates,
     Buckets,
@@ -22,7 +23,6 @@ from ground_service.passes.span import PassSpan
 from ground_service.store import rollups, telemetry
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES
-from ground_service.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
 from lunar.arrays import FloatArray
 
 __all__ = ["PARAMETERS", "STATE_VALUES", "KindSamples", "Series", "SeriesReading", "series_document"]

@@ -18,6 +18,8 @@ from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import read_catalogue
+from ground_service.missions.timekeeping.core import ticks_of_utc_ns
+from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import sample_store, store
 from ground_service.passes.cache import Cache
 from ground_service.passes.model import (
@@ -53,8 +55,6 @@ from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
-from ground_service.timekeeping.core import ticks_of_utc_ns
-from ground_service.timekeeping.store import load_correlations
 from reports.values import PacketAccounting
 from tmtc.dictionary import DICTIONARY
 

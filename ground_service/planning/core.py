@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ground_service.contacts.links.core import PredictedContact, predict_contacts
 from ground_service.evaluation.detection.recall import expected_craters
-from ground_service.links.core import PredictedContact, predict_contacts
 from ground_service.missions.stations import STATIONS
 from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
+from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
 from ground_service.planning import service, store
 from ground_service.planning.core import Planner

@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
-from ground_service.commanding.store import views_of_window
+from ground_service.contacts.commanding.store import views_of_window
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.core import account_sequence

@@ -8,8 +8,8 @@ from fastapi import Header, Query, Response
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, Viewer, add_list
-from ground_service.commanding import service as commanding
-from ground_service.commanding.model import Telecommand
+from ground_service.contacts.commanding import service as commanding
+from ground_service.contacts.commanding.model import Telecommand
 from ground_service.http.common import (
     API_PREFIX,
     IF_MATCH_HEADER,

@@ -13,20 +13,22 @@ from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.commanding import service as commanding
-from ground_service.commanding import store as commands
-from ground_service.ephemerides import store as ephemerides
-from ground_service.ephemerides.model import Ephemeris
-from ground_service.ephemerides.service import open_ephemeris
+from ground_service.contacts.commanding import service as commanding
+from ground_service.contacts.commanding import store as commands
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
+from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.missions.ephemerides.model import Ephemeris
+from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Mission
 from ground_service.missions.places import outages_of, stations_of
+from ground_service.missions.timekeeping.core import ticks_of_utc_ns
+from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes.store import get_pass
 from ground_service.planning import model, store
 from ground_service.planning.core import (
@@ -54,8 +56,6 @@ from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
-from ground_service.timekeeping.core import ticks_of_utc_ns
-from ground_service.timekeeping.store import load_correlations
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder

@@ -18,14 +18,14 @@ from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.commanding import store as commands
-from ground_service.ephemerides import store as ephemerides
-from ground_service.ephemerides.model import Ephemeris
+from ground_service.contacts.commanding import store as commands
+from ground_service.contacts.links import service as links
 from ground_service.errors import PASSING, GroundError, InvalidInput, PlanConflicts, StateConflict
 from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
-from ground_service.links import service as links
+from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
 from ground_service.planning import request_store as store
 from ground_service.planning import service as planning

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, or_, select
 from sqlalchemy.sql import Select
 
-from ground_service.commanding.store import ids_of_windows
+from ground_service.contacts.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version

@@ -29,7 +29,7 @@ from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_confined
-from ground_service.sandbox.host import SandboxRefused, tail
+from ground_service.regression.sandbox.host import SandboxRefused, tail
 from ground_service.store.files import make_durable_folder, replace_durably
 from ground_service.store.stored_files import register_file
 from ground_service.text import require_line

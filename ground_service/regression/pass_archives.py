@@ -12,7 +12,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from ground_service.commanding.store import sent_for_pass
+from ground_service.contacts.commanding.store import sent_for_pass
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.evaluation.inputs import reference_of
 from ground_service.ground import Ground

@@ -12,10 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ephemerides.attitudes import ATTITUDE_FILES, attitude_file, load_attitudes, no_attitudes
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.inputs import orientation_of
+from ground_service.missions.ephemerides.attitudes import (
+    ATTITUDE_FILES,
+    attitude_file,
+    load_attitudes,
+    no_attitudes,
+)
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import archived_mission

@@ -31,9 +31,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from ground_service.sandbox import host
-from ground_service.sandbox.host import Run, SandboxRefused
-from ground_service.sandbox.runner_checks import build_remains, runner_faults
+from ground_service.regression.sandbox import host
+from ground_service.regression.sandbox.host import Run, SandboxRefused
+from ground_service.regression.sandbox.runner_checks import build_remains, runner_faults
 from kernels import cache_folder
 
 DOWNLINKS = ("downlink.cadu", "downlink.packets")

@@ -19,12 +19,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from ground_service.access.security import caller_of
 from ground_service.errors import NotAuthorised, NotFound
+from ground_service.evaluation.performance.store import get_monthly_report
 from ground_service.evaluation.store import get_report
 from ground_service.ground import Ground
 from ground_service.http.common import Key
 from ground_service.missions.model import Approval
 from ground_service.passes.series import STATE_VALUES
-from ground_service.performance.store import get_monthly_report
 from ground_service.regression.service import report_of
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY, STRUCTURES

@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping
 from itertools import groupby
 from typing import Any
 
-from ground_service.automation import store
-from ground_service.automation.model import OPEN_STATES, AutomationAction
 from ground_service.clock import utc_now_ns
 from ground_service.errors import (
     PASSING,
@@ -23,18 +21,20 @@ from ground_service.errors import (
     StateConflict,
     public_text,
 )
+from ground_service.evaluation.landmarks.service import update_landmarks
 from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.service import make_report, pass_summary, reevaluate
 from ground_service.evaluation.store import newest_report
 from ground_service.events import AutomationChanged, LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.service import add_job
-from ground_service.landmarks.service import update_landmarks
 from ground_service.missions.rules import DEFAULT_RULES, Rule
+from ground_service.missions.timekeeping.recorrelation import recorrelate
 from ground_service.planning.progress import close_window, note_reason
 from ground_service.regression.jobs import prepared, regression_job
 from ground_service.regression.pass_archives import keep_pass
-from ground_service.timekeeping.recorrelation import recorrelate
+from ground_service.worker.automation import store
+from ground_service.worker.automation.model import OPEN_STATES, AutomationAction
 from ground_service.worker.notifications import send
 from ground_service.worker.outgoing import NotDelivered
 from ground_service.worker.upkeep import broken_limits
@@ -260,7 +260,7 @@ def _compute_trends(ground: Ground, action: AutomationAction) -> dict[str, Any]:
 
 def _monthly_report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     """Make the report of the last complete month; late data in that month give a new one."""
-    from ground_service.performance.service import due_report_of_vehicle
+    from ground_service.evaluation.performance.service import due_report_of_vehicle
 
     if action.vehicle_id is None:
         raise EvaluationError("monthly_report: the event concerns no spacecraft")

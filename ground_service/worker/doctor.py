@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from pydantic import Field
 
 from ground_service.access.provider import provider_of
-from ground_service.automation.store import missions_in_force
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
@@ -17,6 +16,7 @@ from ground_service.settings import Settings
 from ground_service.store import leases
 from ground_service.store.database import schema_revisions
 from ground_service.store.stored_files import file_names
+from ground_service.worker.automation.store import missions_in_force
 from ground_service.worker.condition import broker_answers
 from ground_service.worker.outgoing import permitted_address
 from ground_service.worker.presence import (

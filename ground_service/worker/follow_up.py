@@ -18,8 +18,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
-from ground_service.alarms.service import examine_packets
-from ground_service.automation.service import OCCURRENCES, has_actions, record_actions
 from ground_service.errors import PASSING, public_text
 from ground_service.events import (
     AutomationChanged,
@@ -41,14 +39,16 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments
+from ground_service.missions.timekeeping.recorrelation import recorrelate
+from ground_service.missions.timekeeping.store import vehicles_with_receptions
+from ground_service.passes.alarms.service import examine_packets
 from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.standing import needs_plan
 from ground_service.store import events
 from ground_service.store.events import LoggedEvent
-from ground_service.timekeeping.recorrelation import recorrelate
-from ground_service.timekeeping.store import vehicles_with_receptions
+from ground_service.worker.automation.service import OCCURRENCES, has_actions, record_actions
 from ground_service.worker.jobs import run_job
 
 log = logging.getLogger(__name__)

@@ -24,13 +24,13 @@ from ground_service.ground import Ground
 from ground_service.ingest.packets import DIGEST_OCTETS
 from ground_service.ingest.parameters import decode_declared
 from ground_service.ingest.service import run_ingest
+from ground_service.missions.timekeeping.core import utc_ns_of_ticks
+from ground_service.missions.timekeeping.recorrelation import AUTOMATIC, recorrelate
+from ground_service.missions.timekeeping.store import correlations_in_force, load_correlations
 from ground_service.store import audit, events
 from ground_service.store.database import prepare_database
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import all_vehicles
-from ground_service.timekeeping.core import utc_ns_of_ticks
-from ground_service.timekeeping.recorrelation import AUTOMATIC, recorrelate
-from ground_service.timekeeping.store import correlations_in_force, load_correlations
 from ground_service.worker import integrity_store as store
 from ground_service.worker.follow_up import CONSUMER
 from tmtc.errors import TmtcError

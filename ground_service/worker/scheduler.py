@@ -14,12 +14,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.commanding.service import note_timeouts
+from ground_service.contacts.commanding.service import note_timeouts
+from ground_service.contacts.links.supervisor import process_name
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.jobs.store import repeat_ingests
-from ground_service.links.supervisor import process_name
 from ground_service.memory import give_back
 from ground_service.planning.standing import needs_plan
 from ground_service.store import leases

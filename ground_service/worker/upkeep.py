@@ -17,11 +17,11 @@ from ground_service.access.audit_log import audit_head, parse_head
 from ground_service.access.store import delete_answers, delete_ended_sessions
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
+from ground_service.evaluation.performance.service import make_due_reports
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
-from ground_service.performance.service import make_due_reports
 from ground_service.regression.archives import let_go, remove_unfinished
 from ground_service.store import audit, events
 from ground_service.store.files import UNPACKING, remove_leftovers

@@ -6,11 +6,11 @@ import time
 from collections.abc import Iterator, Set
 from dataclasses import dataclass, field
 
-from ground_service.alarms.service import note_operations
 from ground_service.clock import mission_now_ns
+from ground_service.contacts.links.service import list_links
 from ground_service.ground import Ground
-from ground_service.links.service import list_links
 from ground_service.missions.store import missions_in_force
+from ground_service.passes.alarms.service import note_operations
 from ground_service.planning import request_store
 from ground_service.planning.store import WINDOWS, records_where
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from linna.commands._table import Command, add_commands
 
 if TYPE_CHECKING:
-    from ground_service.alarms.model import Alarm, AlarmDetail
+    from ground_service.passes.alarms.model import Alarm, AlarmDetail
 
 
 def _line(alarm: Alarm) -> str:

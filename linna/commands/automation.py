@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from linna.commands._table import Command, Option, add_commands
 
 if TYPE_CHECKING:
-    from ground_service.automation.model import AutomationAction, RuleInForce
+    from ground_service.worker.automation.model import AutomationAction, RuleInForce
 
 
 def _rule(rule: RuleInForce) -> str:

@@ -15,7 +15,7 @@ from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.commanding.model import Telecommand, UplinkChannel, UplinkState
+    from ground_service.contacts.commanding.model import Telecommand, UplinkChannel, UplinkState
     from linna.parser import LinnaParser
 
 SHOWN = {"id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by", "remark"}

@@ -10,7 +10,7 @@ from linna.commands._table import Command, Option, add_commands
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.timekeeping.model import Correlation, TimeReport
+    from ground_service.missions.timekeeping.model import Correlation, TimeReport
 
 BLOCK = 10_000
 """Number of receptions in one request."""
@@ -26,7 +26,7 @@ def _list(
 def _receptions(
     service: Client, file: Path, *, spacecraft_id: int, instance: str = "flight"
 ) -> list[Correlation]:
-    from ground_service.timekeeping.recorrelation import read_receptions
+    from ground_service.missions.timekeeping.recorrelation import read_receptions
     from lunar.timescales import format_utc
 
     given = [

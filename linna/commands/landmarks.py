@@ -11,7 +11,7 @@ from linna.errors import UsageError
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.landmarks.model import Landmark, LandmarkDetail, LandmarkUpdate
+    from ground_service.evaluation.landmarks.model import Landmark, LandmarkDetail, LandmarkUpdate
 
 
 def _find(service: Client, pass_ids: list[int]) -> list[LandmarkUpdate]:
@@ -27,7 +27,11 @@ def _export(
     out: Path,
     spacecraft_id: int | None = None,
 ) -> dict[str, Any]:
-    from ground_service.landmarks.documents import extended_catalogue, extended_table, format_labels
+    from ground_service.evaluation.landmarks.documents import (
+        extended_catalogue,
+        extended_table,
+        format_labels,
+    )
     from lunar.catalogue import format_catalogue, load_catalogue
     from tmtc.tables import pack_catalogue_table, unpack_catalogue_table
 
@@ -49,7 +53,7 @@ def _export(
 def _upload(
     service: Client, table: Path, *, transaction: int = 1, instance: str = "flight", spacecraft_id: int
 ) -> dict[str, Any]:
-    from ground_service.landmarks.documents import upload_entries
+    from ground_service.evaluation.landmarks.documents import upload_entries
     from tmtc.tables import unpack_catalogue_table
 
     octets = _octets(table)

@@ -13,7 +13,7 @@ from linna.output import emit, finish, log
 from linna.parser import option
 
 if TYPE_CHECKING:
-    from ground_service.links.model import Contacts, LinkStatus
+    from ground_service.contacts.links.model import Contacts, LinkStatus
     from linna.parser import LinnaParser
     from tmtc.link_check import LinkProposal
 
@@ -138,8 +138,8 @@ def _configure_run(parser: LinnaParser) -> None:
 
 
 def operate(arguments: argparse.Namespace) -> int:
-    from ground_service.links.service import declared_links
-    from ground_service.links.supervisor import LinkSupervisor
+    from ground_service.contacts.links.service import declared_links
+    from ground_service.contacts.links.supervisor import LinkSupervisor
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
     from linna.errors import UsageError

@@ -10,7 +10,7 @@ from linna.commands._table import Command, Option, add_commands, as_json
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.performance.model import Performance
+    from ground_service.evaluation.performance.model import Performance
 
 METRICS = {"recall": ("%", 100.0, 1), "drift_percent": ("% of path", 1.0, 3), "median_error_m": ("m", 1.0, 0)}
 """Unit, scale and decimals of the metrics."""

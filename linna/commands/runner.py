@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from ground_service.logs import logging_config
     from ground_service.regression.runner import alive, runner_mode, serve_exchange
-    from ground_service.sandbox.host import SandboxRefused
+    from ground_service.regression.sandbox.host import SandboxRefused
     from ground_service.settings import load_settings
     from linna.errors import UsageError
 

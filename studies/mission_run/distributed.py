@@ -19,9 +19,9 @@ from pydantic import SecretStr
 from ground_service.access.service import add_user, renew_token
 from ground_service.client import Client
 from ground_service.clock import ClockFile, set_mission_clock
+from ground_service.contacts.links import service as links
 from ground_service.errors import Conflict, GroundError
 from ground_service.ground import Ground, open_ground
-from ground_service.links import service as links
 from ground_service.settings import Settings
 from ground_service.store import leases
 from ground_service.store.database import prepare_database

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.performance.model import PassPerformance
+from ground_service.evaluation.performance.model import PassPerformance
 from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.ground import MissionGround
 

@@ -18,13 +18,13 @@ from ground_service.client import Client
 from ground_service.client.local import local_client
 from ground_service.client.problems import Unavailable, Unreachable
 from ground_service.clock import ClockFile, set_mission_clock
+from ground_service.contacts.links import service as links
+from ground_service.contacts.links.runner import INCOMING
+from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import PASSING, GroundError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.live import spooled_octets
 from ground_service.jobs.store import unfinished_jobs as unfinished
-from ground_service.links import service as links
-from ground_service.links.runner import INCOMING
-from ground_service.links.supervisor import LinkSupervisor
 from ground_service.planning.model import Window
 from ground_service.store.events import position_of, read_events
 from ground_service.store.telemetry import packet_headers

@@ -126,8 +126,8 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
 ) -> None:
     from ground_service.evaluation.inputs import load_pass_inputs
     from ground_service.ground import open_ground
+    from ground_service.missions.timekeeping.recorrelation import in_force
     from ground_service.passes.archive_import import import_archive
-    from ground_service.timekeeping.recorrelation import in_force
     from ground_service.worker.follow_up import follow_in_process
 
     _, out = archive

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ground_service.sandbox import kernel
+from ground_service.regression.sandbox import kernel
 
 PROFILES = {
     "user": "the user that runs the campaign, unchanged",

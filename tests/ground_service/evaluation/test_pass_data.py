@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.ephemerides.attitudes import HEADER, load_attitudes
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.detection.viewing import Viewing
@@ -21,6 +20,7 @@ from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
+from ground_service.missions.ephemerides.attitudes import HEADER, load_attitudes
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission

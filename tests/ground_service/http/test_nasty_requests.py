@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ground_service.app import create_app
-from ground_service.commanding.service import enter_command
+from ground_service.contacts.commanding.service import enter_command
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window
 from ground_service.settings import Settings

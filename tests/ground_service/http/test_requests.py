@@ -15,10 +15,10 @@ from ground_service.app import create_app
 from ground_service.errors import DatabaseUnavailable, FileDamaged, StorageFull, StorageReadOnly
 from ground_service.ground import open_ground
 from ground_service.http.requests import parse_json
+from ground_service.missions.timekeeping.model import ReceptionIn, TimePointIn
 from ground_service.planning.model import WindowIn
 from ground_service.regression.routes import RegressionRequest
 from ground_service.settings import Settings
-from ground_service.timekeeping.model import ReceptionIn, TimePointIn
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.

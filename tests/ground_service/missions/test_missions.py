@@ -10,7 +10,7 @@ import pytest
 
 from ground_service.access.service import add_user
 from ground_service.app import create_app
-from ground_service.commanding.service import enter_command, release_command
+from ground_service.contacts.commanding.service import enter_command, release_command
 from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
 from ground_service.ground import open_ground
 from ground_service.http.model import Paging

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.commanding.service import enter_command
-from ground_service.ephemerides.service import add_ephemeris
+from ground_service.contacts.commanding.service import enter_command
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import make_report
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera
 from ground_service.missions.service import add_mission
+from ground_service.missions.timekeeping import recorrelation
+from ground_service.missions.timekeeping.recorrelation import ReceivedReport, enter_receptions, recorrelate
 from ground_service.passes.service import define_pass
 from ground_service.planning import service as planning
 from ground_service.store import repository
-from ground_service.timekeeping import recorrelation
-from ground_service.timekeeping.recorrelation import ReceivedReport, enter_receptions, recorrelate
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import SyntheticPass

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.ephemerides.service import add_ephemeris
 from ground_service.evaluation.service import make_report, pass_summary
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.passes.service import completeness, define_pass
 from lunar.ephemeris import ephemeris_from_states

@@ -7,10 +7,10 @@ import pytest
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
-from ground_service.ephemerides.service import add_ephemeris, withdraw_ephemeris
-from ground_service.ephemerides.store import covering_ephemerides
 from ground_service.errors import Conflict, InvalidInput, PlanConflicts
 from ground_service.ground import Ground
+from ground_service.missions.ephemerides.service import add_ephemeris, withdraw_ephemeris
+from ground_service.missions.ephemerides.store import covering_ephemerides
 from ground_service.missions.service import add_mission
 from ground_service.planning.service import WindowEntry, add_window
 from lunar.timescales import parse_utc

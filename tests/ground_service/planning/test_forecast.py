@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import add_catalogue
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
 from ground_service.planning.filling import NS, Option, ResourceGrid, curves

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.links.core import PredictedContact
+from ground_service.contacts.links.core import PredictedContact
 from ground_service.planning.core import (
     Constraints,
     Planner,

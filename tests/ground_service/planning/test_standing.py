@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from ground_service.clock import set_mission_clock
-from ground_service.commanding.model import TelecommandFilter
-from ground_service.commanding.service import get_command, list_telecommands
-from ground_service.ephemerides.service import add_ephemeris
+from ground_service.contacts.commanding.model import TelecommandFilter
+from ground_service.contacts.commanding.service import get_command, list_telecommands
 from ground_service.errors import InvalidInput, NotFound, PlanConflicts
 from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning

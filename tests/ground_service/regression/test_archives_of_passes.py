@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ground_service.automation.model import ActionFilter
-from ground_service.automation.store import list_automation_actions
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
@@ -41,6 +39,8 @@ from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import ArchiveRecord, Comparison, KeptReplay
 from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_pass, keep_pass
 from ground_service.regression.service import find_replay, run_regression
+from ground_service.worker.automation.model import ActionFilter
+from ground_service.worker.automation.store import list_automation_actions
 from linna.commands import regress
 from tests.ground_service.conftest import (
     SPACECRAFT,

@@ -13,8 +13,8 @@ from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.regression import builds
 from ground_service.regression.builds import load_build, register_build
+from ground_service.regression.sandbox.host import SandboxRefused
 from ground_service.regression.store import list_builds
-from ground_service.sandbox.host import SandboxRefused
 from linna.cli import run as run_command
 
 

@@ -17,7 +17,7 @@ from ground_service.app import create_app
 from ground_service.settings import Settings
 from ground_service.store import wakeups
 from ground_service.web import sockets
-from tests.ground_service.links.conftest import HEAD, Station
+from tests.ground_service.contacts.links.conftest import HEAD, Station
 from tests.ground_service.web.test_displays import ask as fetch
 from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from ground_service.ephemerides.service import add_ephemeris
 from ground_service.ground import open_ground
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning.model import WindowEntry
 from ground_service.planning.service import add_window

@@ -8,10 +8,10 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
+from ground_service.evaluation.landmarks.model import LandmarkFilter
+from ground_service.evaluation.landmarks.service import update_landmarks
+from ground_service.evaluation.landmarks.store import list_landmarks
 from ground_service.ground import open_ground
-from ground_service.landmarks.model import LandmarkFilter
-from ground_service.landmarks.service import update_landmarks
-from ground_service.landmarks.store import list_landmarks
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue
 from tests.ground_service.conftest import write_manifest

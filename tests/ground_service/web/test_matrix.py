@@ -21,10 +21,10 @@ from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 from ground_service.access.service import add_user
 from ground_service.client import Client
-from ground_service.ephemerides.service import add_ephemeris
+from ground_service.evaluation.landmarks.service import update_landmarks
 from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
-from ground_service.landmarks.service import update_landmarks
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
 from ground_service.regression.archives import keep_archive
@@ -33,7 +33,7 @@ from ground_service.web.pages import DISPLAYS, PAGES
 from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import SPACECRAFT, START
-from tests.ground_service.landmarks.test_learned_landmarks import rewrite
+from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
 from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, Service, wait_until
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft

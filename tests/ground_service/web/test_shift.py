@@ -21,8 +21,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from ground_service.access.service import add_user
-from ground_service.ephemerides.service import add_ephemeris
 from ground_service.ground import open_ground
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
 from ground_service.regression.archives import keep_archive

@@ -12,23 +12,20 @@ import numpy as np
 import pytest
 
 from ground_service import events
-from ground_service.automation.model import ActionFilter
-from ground_service.automation.service import decide, list_rules, record_actions, repeat
-from ground_service.automation.store import list_automation_actions
 from ground_service.client.local import local_client
 from ground_service.clock import utc_now_ns
-from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput, StateConflict, StorageFull
 from ground_service.evaluation import service as evaluation
+from ground_service.evaluation.landmarks.model import LandmarkFilter
+from ground_service.evaluation.landmarks.store import list_landmarks
 from ground_service.evaluation.store import newest_report
 from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, WindowChanged, publish
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
-from ground_service.landmarks.model import LandmarkFilter
-from ground_service.landmarks.store import list_landmarks
 from ground_service.missions.catalogues import add_catalogue, catalogue_of
+from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.model import parse_mission
 from ground_service.missions.service import add_mission
 from ground_service.missions.store import list_catalogues
@@ -41,6 +38,9 @@ from ground_service.regression.archives import kept_archives
 from ground_service.regression.pass_archives import LIVE
 from ground_service.worker import actions
 from ground_service.worker.actions import has_repetitions, repeat_due
+from ground_service.worker.automation.model import ActionFilter
+from ground_service.worker.automation.service import decide, list_rules, record_actions, repeat
+from ground_service.worker.automation.store import list_automation_actions
 from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from ground_service.worker.jobs import run_job

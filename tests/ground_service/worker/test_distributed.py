@@ -12,7 +12,12 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ground_service.commanding.service import enter_command, note_timeouts, release_command, take_uplink
+from ground_service.contacts.commanding.service import (
+    enter_command,
+    note_timeouts,
+    release_command,
+    take_uplink,
+)
 from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground

@@ -20,8 +20,6 @@ from typing import Any
 
 import pytest
 
-from ground_service.automation.model import ActionFilter
-from ground_service.automation.store import list_automation_actions
 from ground_service.errors import InvalidInput
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground, open_ground
@@ -32,6 +30,8 @@ from ground_service.missions.rules import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
 from ground_service.worker import outgoing
+from ground_service.worker.automation.model import ActionFilter
+from ground_service.worker.automation.store import list_automation_actions
 from ground_service.worker.dispatch import ThreadDispatcher
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.notifications import ATTEMPTS, signature

@@ -1,0 +1,1 @@
+"""Contacts with spacecraft: telecommands, and the links of the stations."""

@@ -1,0 +1,346 @@
+"""SQL of telecommands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import BigInteger, Connection, and_, cast, func, or_, select, update
+from sqlalchemy.sql import Select
+
+from ground_service.contacts.commanding.core import SentCommand, VerificationReport, fate_of
+from ground_service.contacts.commanding.model import (
+    CommandOctets,
+    CommandRecord,
+    CommandView,
+    TelecommandFilter,
+    UplinkChannel,
+)
+from ground_service.ingest.redecode import readable_version
+from ground_service.store import repository
+from ground_service.store.states import TELECOMMAND, change_if, move, move_all
+from ground_service.store.vehicles import get_vehicle
+from lunar.constants import NANOSECONDS_PER_SECOND
+
+TELECOMMANDS, VERIFICATIONS = TELECOMMAND.table, repository.SAMPLES["verifications"]
+
+SEARCHED_INGESTS = 200
+"""Number of newest ingests that are searched for channels: some contain no frames of a channel."""
+
+
+def add_command(
+    connection: Connection,
+    vehicle: int,
+    name: str,
+    arguments: Mapping[str, Any],
+    *,
+    state: str,
+    critical: bool,
+    timeout_s: int,
+    actor: str,
+    now_utc_ns: int,
+    window_id: int | None,
+    mission_id: int | None,
+    issued: CommandOctets | None,
+) -> int:
+    """Add a telecommand; return its id. `issued` is given if it is decided already."""
+    return int(
+        repository.add(
+            connection,
+            TELECOMMANDS,
+            vehicle_id=vehicle,
+            name=name,
+            arguments=dict(arguments),
+            state=state,
+            critical=int(critical),
+            timeout_s=timeout_s,
+            requested_by=actor,
+            created_utc_ns=now_utc_ns,
+            window_id=window_id,
+            mission_id=mission_id,
+            **({} if issued is None else _issued(issued, actor, now_utc_ns)),
+        )
+    )
+
+
+def release(
+    connection: Connection, command_id: int, issued: CommandOctets, *, actor: str, now_utc_ns: int
+) -> None:
+    """Move a queued telecommand to released.
+
+    Raises
+    ------
+    StateConflict
+        It is not queued.
+    """
+    values = _issued(issued, actor, now_utc_ns)
+    move(connection, TELECOMMAND, command_id, "released", expected=("queued",), **values)
+
+
+def reject(connection: Connection, command_id: int, *, actor: str, reason: str, now_utc_ns: int) -> None:
+    """Move a queued telecommand to rejected.
+
+    Raises
+    ------
+    StateConflict
+        It is not queued.
+    """
+    values: dict[str, Any] = {"decided_by": actor, "decided_utc_ns": now_utc_ns, "reason": reason}
+    move(connection, TELECOMMAND, command_id, "rejected", expected=("queued",), **values)
+
+
+def set_carrier(connection: Connection, command_id: int, carrier_id: int) -> None:
+    """Enter the telecommand that carries another one into the on-board schedule."""
+    repository.change(connection, TELECOMMANDS, command_id, carrier_id=carrier_id)
+
+
+def send_released(
+    connection: Connection, vehicle: int, now_utc_ns: int, mission_utc_ns: int
+) -> list[CommandRecord]:
+    """Move the released telecommands of a vehicle, and those that they carry, to sent.
+
+    Those whose time for transmission has passed at `mission_utc_ns` stay released.
+
+    Return the released ones in order of release. The caller holds the lock of the spacecraft. Verification
+    reports after the newest one so far count.
+    """
+    newest = connection.execute(
+        select(func.max(VERIFICATIONS.c.ticks)).where(*_readable_reports(connection, vehicle))
+    ).scalar()
+    sent = {"sent_utc_ns": now_utc_ns, "sent_after_ticks": -1 if newest is None else int(newest)}
+    mine = [TELECOMMANDS.c.vehicle_id == vehicle, *_sendable(mission_utc_ns)]
+    rows = move_all(connection, TELECOMMAND, mine, "sent", **sent)
+    rows.sort(key=lambda row: (row["decided_utc_ns"], row["id"]))
+    carried = TELECOMMANDS.c.carrier_id.in_([row["id"] for row in rows])
+    move_all(connection, TELECOMMAND, [carried], "sent", **sent)
+    return [CommandRecord.of(row) for row in rows]
+
+
+def count_released(connection: Connection, ccsds_id: int, instance: str, mission_utc_ns: int) -> int:
+    """Return the number of released telecommands of a spacecraft that may still be sent."""
+    vehicles = repository.VEHICLES
+    query = (
+        select(func.count())
+        .select_from(TELECOMMANDS)
+        .join(vehicles, vehicles.c.id == TELECOMMANDS.c.vehicle_id)
+        .where(vehicles.c.ccsds_id == ccsds_id, vehicles.c.instance == instance, *_sendable(mission_utc_ns))
+    )
+    return int(connection.execute(query).scalar_one())
+
+
+def limit_sending(connection: Connection, ids: Sequence[int], before_utc_ns: int) -> None:
+    """Enter the mission time from which telecommands are no longer sent."""
+    connection.execute(
+        update(TELECOMMANDS).where(TELECOMMANDS.c.id.in_(ids)).values(send_before_utc_ns=before_utc_ns)
+    )
+
+
+def note_timeout(connection: Connection, command_id: int, now_utc_ns: int) -> bool:
+    """Record the timeout of a telecommand; return whether it was not recorded before."""
+    unnoted = {"timeout_noted_utc_ns": None}
+    return change_if(connection, TELECOMMANDS, command_id, unnoted, timeout_noted_utc_ns=now_utc_ns)
+
+
+def get_record(connection: Connection, command_id: int) -> CommandRecord:
+    """Return the row of a telecommand."""
+    return CommandRecord.of(repository.get(connection, TELECOMMANDS, command_id, TELECOMMAND.kind))
+
+
+def get_view(connection: Connection, command_id: int, now_utc_ns: int) -> CommandView:
+    """Return a telecommand and its verification."""
+    return _view(connection, get_record(connection, command_id), now_utc_ns)
+
+
+def list_views(
+    connection: Connection, asked: TelecommandFilter, now_utc_ns: int
+) -> tuple[list[CommandView], int]:
+    """Return a page of the telecommands, newest first, and their number."""
+    rows, total = repository.newest(connection, TELECOMMANDS, asked)
+    return [_view(connection, CommandRecord.of(row), now_utc_ns) for row in rows], total
+
+
+def views_of_window(connection: Connection, window_id: int, now_utc_ns: int) -> list[CommandView]:
+    """Return the telecommands of a window that were not rejected."""
+    query = select(TELECOMMANDS).where(
+        TELECOMMANDS.c.window_id == window_id, TELECOMMANDS.c.state != "rejected"
+    )
+    return _views(connection, query, now_utc_ns)
+
+
+def views_of_unnoted_timeouts(
+    connection: Connection, since_utc_ns: int, until_utc_ns: int, now_utc_ns: int
+) -> list[CommandView]:
+    """Return the sent telecommands whose timeout ends in an interval and is not recorded."""
+    due = TELECOMMANDS.c.sent_utc_ns + cast(TELECOMMANDS.c.timeout_s, BigInteger) * NANOSECONDS_PER_SECOND
+    query = select(TELECOMMANDS).where(
+        TELECOMMANDS.c.state == "sent",
+        TELECOMMANDS.c.timeout_noted_utc_ns.is_(None),
+        due >= since_utc_ns,
+        due < until_utc_ns,
+    )
+    return _views(connection, query, now_utc_ns)
+
+
+def ids_of_windows(connection: Connection, windows: Sequence[int]) -> dict[int, list[int]]:
+    """Return the ids of the telecommands of each of these windows, ascending."""
+    query = select(TELECOMMANDS.c.window_id, TELECOMMANDS.c.id).where(TELECOMMANDS.c.window_id.in_(windows))
+    found: dict[int, list[int]] = {window: [] for window in windows}
+    for window, command in connection.execute(query.order_by(TELECOMMANDS.c.id)):
+        found[window].append(int(command))
+    return found
+
+
+def carriers_of_window(connection: Connection, window_id: int) -> list[int]:
+    """Return the ids of the telecommands that uplink a window, without rejected and carried ones."""
+    query = select(TELECOMMANDS.c.id).where(
+        TELECOMMANDS.c.window_id == window_id,
+        TELECOMMANDS.c.carrier_id.is_(None),
+        TELECOMMANDS.c.state != "rejected",
+    )
+    return [int(key) for key in connection.execute(query.order_by(TELECOMMANDS.c.id)).scalars()]
+
+
+def sent_for_pass(connection: Connection, pass_id: int) -> bytes:
+    """Return the telecommand packets that were sent for the window of a pass, in order of release.
+
+    Parameters that were changed by telecommand before are in force in the pass: those packets come first.
+    """
+    windows = repository.WINDOWS
+    window = connection.execute(
+        select(windows.c.id, windows.c.vehicle_id).where(windows.c.pass_id == pass_id)
+    )
+    found = window.first()
+    if found is None:
+        return b""
+    query = (
+        select(TELECOMMANDS.c.octets, TELECOMMANDS.c.window_id)
+        .where(
+            TELECOMMANDS.c.vehicle_id == found.vehicle_id,
+            or_(
+                TELECOMMANDS.c.window_id == found.id,
+                and_(TELECOMMANDS.c.window_id.is_(None), TELECOMMANDS.c.name == "set_parameter"),
+            ),
+            TELECOMMANDS.c.carrier_id.is_(None),
+            TELECOMMANDS.c.sent_utc_ns.is_not(None),
+            TELECOMMANDS.c.octets.is_not(None),
+        )
+        .order_by(TELECOMMANDS.c.decided_utc_ns, TELECOMMANDS.c.id)
+    )
+    rows = connection.execute(query).all()
+    last = max((number for number, row in enumerate(rows) if row.window_id is not None), default=-1)
+    return b"".join(row.octets for row in rows[: last + 1])
+
+
+def states_of_window(connection: Connection, window_id: int) -> set[str]:
+    """Return the stored states of the telecommands of a window."""
+    query = select(TELECOMMANDS.c.state).where(TELECOMMANDS.c.window_id == window_id)
+    return set(connection.execute(query).scalars())
+
+
+def withdraw_window(connection: Connection, window_id: int, *, actor: str, now_utc_ns: int) -> None:
+    """Reject the telecommands of a window that were not sent."""
+    move_all(
+        connection,
+        TELECOMMAND,
+        [TELECOMMANDS.c.window_id == window_id],
+        "rejected",
+        decided_by=actor,
+        decided_utc_ns=now_utc_ns,
+        reason="the window was withdrawn",
+    )
+
+
+def unlink_window(connection: Connection, window_id: int) -> None:
+    """Remove the reference to a window from its telecommands."""
+    connection.execute(
+        update(TELECOMMANDS).where(TELECOMMANDS.c.window_id == window_id).values(window_id=None)
+    )
+
+
+def newest_channels(connection: Connection, spacecraft_id: int, instance: str) -> list[UplinkChannel]:
+    """Return each telecommand channel of a spacecraft from the newest ingest that contains it, by number."""
+    ingests, vehicles = repository.INGESTS, repository.VEHICLES
+    # A file of several spacecraft is entered under one of them.
+    rows = connection.execute(
+        select(ingests.c.id, ingests.c.received_utc_ns, ingests.c.accounting)
+        .join(vehicles, vehicles.c.id == ingests.c.vehicle_id)
+        .where(vehicles.c.instance == instance, ingests.c.state == "done")
+        .order_by(ingests.c.id.desc())
+        .limit(SEARCHED_INGESTS)
+    )
+    newest: dict[int, UplinkChannel] = {}
+    for ingest_id, received_utc_ns, accounting in rows:
+        for seen in accounting.get("uplink", ()):
+            if seen["spacecraft_id"] == spacecraft_id:
+                channel = UplinkChannel.of(seen, ingest_id=ingest_id, received=received_utc_ns)
+                newest.setdefault(channel.virtual_channel, channel)
+    return [newest[number] for number in sorted(newest)]
+
+
+def _issued(issued: CommandOctets, actor: str, now_utc_ns: int) -> dict[str, Any]:
+    return {
+        "sequence_count": issued.sequence_count,
+        "request_id": issued.request_id,
+        "octets": issued.octets,
+        "decided_by": actor,
+        "decided_utc_ns": now_utc_ns,
+    }
+
+
+def _sendable(mission_utc_ns: int) -> tuple[Any, ...]:
+    before = TELECOMMANDS.c.send_before_utc_ns
+    return (TELECOMMANDS.c.state == "released", or_(before.is_(None), before > mission_utc_ns))
+
+
+def _readable_reports(connection: Connection, vehicle: int) -> tuple[Any, ...]:
+    return (
+        VERIFICATIONS.c.vehicle_id == vehicle,
+        VERIFICATIONS.c.dictionary_version == readable_version(connection, vehicle),
+    )
+
+
+def _views(connection: Connection, query: Select[Any], now_utc_ns: int) -> list[CommandView]:
+    records = [CommandRecord.of(row) for row in connection.execute(query).mappings().all()]
+    return [_view(connection, record, now_utc_ns) for record in records]
+
+
+def _view(connection: Connection, record: CommandRecord, now_utc_ns: int) -> CommandView:
+    vehicle = get_vehicle(connection, record.vehicle_id)
+    sent = _sent(connection, record)
+    if sent is None:
+        return CommandView(record, vehicle.ccsds_id, vehicle.instance, None)
+    reports = connection.execute(
+        select(
+            VERIFICATIONS.c.subtype,
+            VERIFICATIONS.c.request_id,
+            VERIFICATIONS.c.ticks,
+            VERIFICATIONS.c.step,
+            VERIFICATIONS.c.failure_code,
+        ).where(
+            *_readable_reports(connection, record.vehicle_id),
+            VERIFICATIONS.c.ticks > sent.sent_after_ticks,
+            VERIFICATIONS.c.request_id == sent.request_id,
+        )
+    )
+    fate = fate_of(sent, [VerificationReport(*report) for report in reports], now_utc_ns)
+    return CommandView(record, vehicle.ccsds_id, vehicle.instance, fate)
+
+
+def _sent(connection: Connection, record: CommandRecord) -> SentCommand | None:
+    """Return what verification needs about a sent telecommand; None if it was not sent."""
+    if record.request_id is None or record.sent_utc_ns is None or record.sent_after_ticks is None:
+        return None
+    repeated = connection.execute(
+        select(func.min(TELECOMMANDS.c.sent_after_ticks)).where(
+            TELECOMMANDS.c.vehicle_id == record.vehicle_id,
+            TELECOMMANDS.c.request_id == record.request_id,
+            TELECOMMANDS.c.id > record.id,
+        )
+    ).scalar()
+    return SentCommand(
+        request_id=record.request_id,
+        sent_utc_ns=record.sent_utc_ns,
+        sent_after_ticks=record.sent_after_ticks,
+        repeated_after_ticks=repeated,
+        timeout_ns=record.timeout_s * NANOSECONDS_PER_SECOND,
+    )

@@ -1,0 +1,271 @@
+"""Use cases of landmarks: those of a pass, decisions of persons, images of the sightings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from sqlalchemy import Connection
+
+from ground_service.access.service import audit
+from ground_service.clock import utc_now_ns
+from ground_service.errors import EvaluationError
+from ground_service.evaluation.core import PassInputs
+from ground_service.evaluation.detection.recall import expected_craters, match_detections
+from ground_service.evaluation.inputs import load_pass_inputs
+from ground_service.evaluation.landmarks import store
+from ground_service.evaluation.landmarks.core import (
+    Frames,
+    PassPlaces,
+    Place,
+    combined,
+    in_view,
+    is_persistent,
+    places_of_pass,
+    same_place,
+)
+from ground_service.evaluation.landmarks.model import (
+    Landmark,
+    LandmarkDetail,
+    LandmarkUpdate,
+    PassSightings,
+    Sighting,
+)
+from ground_service.evaluation.navigation.alignment import reference_states
+from ground_service.events import LandmarkChanged, publish
+from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.passes import store as passes
+from ground_service.passes.images import list_images
+from ground_service.passes.samples import DetectionSamples
+from ground_service.store.vehicles import get_vehicle
+
+DECIDED = ("accepted", "rejected")
+
+
+def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
+    """Bring the landmarks up to date with a pass; what the pass said before is replaced.
+
+    Raises
+    ------
+    EvaluationError
+        The pass lacks its reference, its crater catalogue or detections.
+    """
+    inputs = load_pass_inputs(ground, pass_id)
+    found, frames = _places(inputs)
+    with ground.database.writing() as connection:
+        record = passes.get_pass(connection, pass_id)
+        spacecraft = get_vehicle(connection, record.vehicle_id).ccsds_id
+        store.lock_landmarks(connection, spacecraft)
+        added = _entered(connection, spacecraft, pass_id, found, frames, inputs.detections)
+        proposed = store.count_proposed(connection, spacecraft)
+        publish(connection, LandmarkChanged(spacecraft_id=spacecraft, pass_id=pass_id, proposed=proposed))
+    east, north, _ = found.offset_m
+    return LandmarkUpdate(
+        pass_id=pass_id,
+        detections=len(inputs.detections.u_px),
+        unmatched=found.unmatched,
+        places=len(found.places),
+        controls=found.controls,
+        offset_east_m=east if math.isfinite(east) else None,
+        offset_north_m=north if math.isfinite(north) else None,
+        added=added,
+        proposed=proposed,
+    )
+
+
+def get_landmark(ground: Ground, landmark_id: int) -> LandmarkDetail:
+    """Return a landmark with its sightings and the addresses of their images."""
+    with ground.database.reading() as connection:
+        landmark = store.get_landmark(connection, landmark_id)
+    return landmark.model_copy(update={"evidence": [_with_images(ground, one) for one in landmark.evidence]})
+
+
+def decide_landmark(
+    ground: Ground, landmark_id: int, *, accept: bool, reason: str, actor: str
+) -> LandmarkDetail:
+    """Accept or reject a proposed landmark, or change the decision.
+
+    Raises
+    ------
+    NotFound
+        There is no such landmark.
+    StateConflict
+        It was not seen often enough, or is decided in this way already.
+    """
+    state = "accepted" if accept else "rejected"
+    with ground.database.writing() as connection:
+        now = utc_now_ns()
+        store.decide_landmark(connection, landmark_id, state, actor=actor, reason=reason, now_utc_ns=now)
+        verb = "accept" if accept else "reject"
+        audit(connection, actor, f"{verb} landmark", str(landmark_id), {"reason": reason})
+        decided = store.get_landmark(connection, landmark_id)
+        proposed = store.count_proposed(connection, decided.spacecraft_id)
+        publish(
+            connection,
+            LandmarkChanged(spacecraft_id=decided.spacecraft_id, pass_id=None, proposed=proposed),
+        )
+    return get_landmark(ground, landmark_id)
+
+
+def _places(inputs: PassInputs) -> tuple[PassPlaces, Frames]:
+    needed = {
+        "a reference ephemeris": inputs.reference,
+        "a lunar orientation": inputs.orientation,
+        "a crater catalogue": inputs.catalogue,
+        "detections": inputs.detections if len(inputs.detections) else None,
+    }
+    missing = [name for name, value in needed.items() if value is None]
+    if missing or inputs.catalogue is None:
+        raise EvaluationError(
+            f"landmarks of pass {inputs.pass_id}: expected {', '.join(missing)}, found none"
+        )
+    detections, viewing = inputs.detections, inputs.viewing
+    track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
+    rotation = viewing.camera_from_mcmf(detections.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    expected = expected_craters(inputs.catalogue, viewing.camera, track.position_mcmf_m, rotation)
+    matches = match_detections(detections, expected)
+    frames = Frames(viewing.camera, track.position_mcmf_m, rotation)
+    sigma = inputs.reference_sigma_rtn_m or (0.0, 0.0, 0.0)
+    error_m = math.hypot(sigma[1], sigma[2])
+    return places_of_pass(detections, expected, matches, inputs.catalogue, frames, error_m), frames
+
+
+def _entered(
+    connection: Connection,
+    spacecraft: int,
+    pass_id: int,
+    found: PassPlaces,
+    frames: Frames,
+    detections: DetectionSamples,
+) -> int:
+    """Replace what a pass says of the landmarks of its spacecraft; return the number of new ones."""
+    now = utc_now_ns()
+    left = list(found.places)
+    for landmark in store.landmarks_of_spacecraft(connection, spacecraft):
+        others = [one for one in landmark.evidence if one.pass_id != pass_id]
+        near = [place for place in left if same_place(place, place_of(landmark))]
+        evidence = list(others)
+        if near:
+            best = max(near, key=lambda one: (len(one.rows), one.score))
+            left.remove(best)
+            evidence.append(_evidence(pass_id, best, found.controls, frames, detections))
+        elif others and landmark.state not in DECIDED:
+            looks = int(np.count_nonzero(in_view(place_of(landmark), frames)))
+            if looks:
+                evidence.append(
+                    _evidence(pass_id, _unseen(place_of(landmark), looks), found.controls, frames, detections)
+                )
+        if not any(one.sightings for one in evidence) and landmark.state not in DECIDED:
+            store.delete_landmark(connection, landmark.id)
+        elif evidence != landmark.evidence:
+            _changed(connection, landmark, sorted(evidence, key=lambda one: one.pass_id), now)
+    for place in left:
+        evidence = [_evidence(pass_id, place, found.controls, frames, detections)]
+        store.add_landmark(connection, spacecraft, "seen", evidence, now, **_figures(evidence))
+    return len(left)
+
+
+def _changed(
+    connection: Connection, landmark: LandmarkDetail, evidence: Sequence[PassSightings], now: int
+) -> None:
+    seen = [one for one in evidence if one.sightings]
+    figures = _figures(evidence) if seen else {}
+    state: str = landmark.state
+    if state not in DECIDED:
+        sightings, looks = sum(len(one.sightings) for one in seen), sum(one.looks for one in evidence)
+        state = "proposed" if is_persistent(len(seen), sightings, looks) else "seen"
+    store.change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
+
+
+def place_of(one: Landmark | PassSightings) -> Place:
+    """Return place and uncertainty of a landmark for computation."""
+    return Place(
+        math.radians(one.latitude_deg),
+        math.radians(one.longitude_deg),
+        one.height_m,
+        (one.sigma_east_m, one.sigma_north_m, one.sigma_up_m),
+        one.diameter_m,
+        one.diameter_sigma_m,
+        one.score,
+        np.arange(len(one.sightings) if isinstance(one, PassSightings) else one.sightings),
+        one.looks,
+    )
+
+
+def _figures(evidence: Sequence[PassSightings]) -> dict[str, float]:
+    """Return the columns of a landmark from its sightings on one pass or more."""
+    seen = [one for one in evidence if one.sightings]
+    place = combined([place_of(one) for one in seen])
+    return {
+        **_columns(place),
+        "passes": len(seen),
+        "sightings": sum(len(one.sightings) for one in seen),
+        "looks": sum(one.looks for one in evidence),
+    }
+
+
+def _columns(place: Place) -> dict[str, float]:
+    return {
+        "latitude_deg": math.degrees(place.latitude_rad),
+        "longitude_deg": math.degrees(place.longitude_rad) % 360.0,
+        "height_m": place.height_m,
+        "sigma_east_m": place.sigma_m[0],
+        "sigma_north_m": place.sigma_m[1],
+        "sigma_up_m": place.sigma_m[2],
+        "diameter_m": place.diameter_m,
+        "diameter_sigma_m": place.diameter_sigma_m,
+        "score": place.score,
+    }
+
+
+def _unseen(place: Place, looks: int) -> Place:
+    nothing = np.zeros(0, dtype=np.int64)
+    return Place(
+        place.latitude_rad, place.longitude_rad, place.height_m, place.sigma_m, place.diameter_m,
+        place.diameter_sigma_m, 0.0, nothing, looks,
+    )  # fmt: skip
+
+
+def _evidence(
+    pass_id: int, place: Place, controls: int, frames: Frames, detections: DetectionSamples
+) -> PassSightings:
+    owner = np.searchsorted(detections.offsets, place.rows, side="right") - 1
+    sightings = [
+        Sighting(
+            frame_number=int(detections.frame_number[frame]),
+            time=UtcTime(int(detections.utc_ns[frame])),
+            u_px=float(detections.u_px[row]),
+            v_px=float(detections.v_px[row]),
+            diameter_px=float(detections.diameter_px[row]),
+            score=float(detections.score[row]),
+        )
+        for row, frame in zip(place.rows.tolist(), owner.tolist(), strict=True)
+    ]
+    figures = _columns(place)
+    return PassSightings(
+        pass_id=pass_id,
+        looks=place.looks,
+        controls=controls,
+        frame_width_px=frames.camera.width_px,
+        frame_height_px=frames.camera.height_px,
+        sightings=sightings,
+        **figures,
+    )
+
+
+def _with_images(ground: Ground, evidence: PassSightings) -> PassSightings:
+    """Return the sightings with the addresses of archived frames, otherwise of thumbnails."""
+    if not evidence.sightings:
+        return evidence
+    with ground.database.reading() as connection:
+        record = passes.get_pass(connection, evidence.pass_id)
+        vehicle = get_vehicle(connection, record.vehicle_id)
+    images = list_images(ground, vehicle.ccsds_id, vehicle.instance, record.start_utc_ns, record.stop_utc_ns)
+    address = {one.frame_number: one.address for one in images if one.source == "thumbnail"}
+    address |= {one.frame_number: one.address for one in images if one.source == "archive"}
+    sightings = [
+        one.model_copy(update={"image": address.get(one.frame_number)}) for one in evidence.sightings
+    ]
+    return evidence.model_copy(update={"sightings": sightings})

@@ -1,0 +1,363 @@
+"""Performance of a spacecraft over many passes, and monthly reports of it."""
+
+from __future__ import annotations
+
+import calendar
+import hashlib
+import logging
+import math
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from ground_service.clock import mission_now_ns, utc_now_ns
+from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping
+from ground_service.evaluation.model import PassFigures, StoredReport
+from ground_service.evaluation.performance import store
+from ground_service.evaluation.performance.core import (
+    ALTITUDE_EDGES_KM,
+    FALSE_ALARM_RATE,
+    METRICS,
+    SUN_EDGES_DEG,
+    change_points,
+    interval_name,
+    interval_names,
+    mean_level,
+    rolling_counts,
+    wilson,
+)
+from ground_service.evaluation.performance.documents import monthly_value
+from ground_service.evaluation.performance.model import (
+    ChangePoint,
+    GroupFigures,
+    MonthlyReport,
+    PassPerformance,
+    Performance,
+    RollingRequirement,
+    StoredMonthlyReport,
+)
+from ground_service.evaluation.report_overview import PREFERRED_ESTIMATORS
+from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.passes.model import PassRecord
+from ground_service.store.stored_files import register_file
+from ground_service.store.vehicles import FLOWN, get_vehicle
+from lunar.timescales import format_utc, parse_utc
+
+WINDOW_DAYS = 7.0
+DAY_NS = 86_400_000_000_000
+NOT_STATED = "not stated"
+_MONTH = re.compile(r"^(2[0-9]{3})-(0[1-9]|1[0-2])$")
+
+Reported = tuple[PassRecord, StoredReport, PassFigures]
+
+log = logging.getLogger(__name__)
+
+
+def performance(
+    ground: Ground,
+    spacecraft_id: int,
+    *,
+    instance: str | None = None,
+    start_utc_ns: int | None = None,
+    stop_utc_ns: int | None = None,
+    window_days: float = WINDOW_DAYS,
+) -> Performance:
+    """Return the performance of a spacecraft over its reported passes that begin in a span, by default all.
+
+    Parameters
+    ----------
+    instance
+        Instance of the spacecraft; None: the flown one if it has passes, otherwise all imported passes.
+    window_days
+        Length of the rolling window of the requirements.
+
+    Raises
+    ------
+    InvalidInput
+        There are too many passes in the span.
+    """
+    with ground.database.reading() as connection:
+        if instance is None and spacecraft_id in store.spacecraft_with_passes(connection, FLOWN):
+            instance = FLOWN
+        stored, total = store.reported_passes(connection, spacecraft_id, instance, start_utc_ns, stop_utc_ns)
+    found = [(record, report, PassFigures.model_validate(report.summary)) for record, report in stored]
+    passes = [_pass_performance(*one) for one in found]
+    return Performance(
+        spacecraft_id=spacecraft_id,
+        instance=instance,
+        window_days=window_days,
+        false_alarm_rate=FALSE_ALARM_RATE,
+        passes_in_span=total,
+        passes=passes,
+        groups=group_figures(passes),
+        changes=_changes(passes),
+        requirements=_requirements(found, round(window_days * DAY_NS)),
+    )
+
+
+def _pass_performance(record: PassRecord, report: StoredReport, figures: PassFigures) -> PassPerformance:
+    conditions = figures.conditions
+    names = [name for name in PREFERRED_ESTIMATORS if name in figures.navigation]
+    judged = None if conditions is None else conditions.estimator
+    estimator = judged if judged in names else names[0] if names else None
+    errors = None if estimator is None else figures.navigation[estimator]
+    return PassPerformance(
+        pass_id=record.id,
+        name=record.name,
+        start=UtcTime(record.start_utc_ns),
+        report_id=report.id,
+        estimator=estimator,
+        recall=figures.detector.recall,
+        drift_percent=None if errors is None else errors.drift_percent,
+        median_error_m=None if errors is None else errors.median_3d_m,
+        altitude_km=None if conditions is None else conditions.altitude_km,
+        sun_elevation_deg=None if conditions is None else conditions.sun_elevation_deg,
+        terrain=figures.evidence_level,
+        build="" if conditions is None else conditions.build,
+        frames=figures.frames,
+        packets=figures.packets,
+        packets_lost=figures.packets_lost,
+        verdict_level=figures.verdict_level,
+    )
+
+
+def group_figures(passes: Sequence[PassPerformance]) -> list[GroupFigures]:
+    """Return the mean of each metric by altitude, elevation of the Sun, terrain and build."""
+    factors: list[tuple[str, list[str], list[str]]] = []
+    for factor, name, edges, unit in (
+        ("altitude", "altitude_km", ALTITUDE_EDGES_KM, "km"),
+        ("sun elevation", "sun_elevation_deg", SUN_EDGES_DEG, "°"),
+    ):
+        groups = [interval_name(_number(getattr(one, name)), edges, unit) for one in passes]
+        factors.append((factor, groups, interval_names(edges, unit)))
+    for factor, name in (("terrain", "terrain"), ("build", "build")):
+        groups = [getattr(one, name) or NOT_STATED for one in passes]
+        factors.append((factor, groups, sorted(set(groups))))
+    found = []
+    for factor, groups, order in factors:
+        for group in order:
+            members = [one for one, its in zip(passes, groups, strict=True) if its == group]
+            for metric in METRICS if members else ():
+                level = mean_level([_number(getattr(one, metric)) for one in members])
+                found.append(
+                    GroupFigures(
+                        factor=factor,
+                        group=group,
+                        metric=metric,
+                        passes=level.passes,
+                        mean=_known(level.mean),
+                        low=_known(level.low),
+                        high=_known(level.high),
+                    )
+                )
+    return found
+
+
+def _changes(passes: Sequence[PassPerformance]) -> list[ChangePoint]:
+    found = []
+    for metric in METRICS:
+        for change in change_points([_number(getattr(one, metric)) for one in passes]):
+            first = passes[change.index]
+            found.append(
+                ChangePoint(
+                    metric=metric,
+                    pass_id=first.pass_id,
+                    time=first.start,
+                    before=change.before,
+                    after=change.after,
+                    passes_before=change.count_before,
+                    passes_after=change.count_after,
+                    p_value=change.p_value,
+                )
+            )
+    return sorted(found, key=lambda one: (one.time.utc_ns, one.metric))
+
+
+def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequirement]:
+    """Return the requirements of all reports over the window that ends at the newest pass.
+
+    Name, unit and limit are those of the newest report that has the requirement.
+    """
+    if not found:
+        return []
+    rows = [{one.key: one for one in figures.requirements} for _, _, figures in found]
+    times = [record.start_utc_ns for record, _, _ in found]
+    newest_of = {key: one for row in rows for key, one in row.items()}
+    order = dict.fromkeys(key for row in reversed(rows) for key in row)
+    requirements = []
+    for key in order:
+        newest = newest_of[key]
+        statuses = [row[key].status if key in row else "unknown" for row in rows]
+        counts = rolling_counts(times, statuses, window_ns)
+        shares = [
+            one.get("met", 0) / (one.get("met", 0) + one.get("not met", 0))
+            for one in counts
+            if one.get("met", 0) + one.get("not met", 0)
+        ]
+        last = counts[-1]
+        met, not_met = last.get("met", 0), last.get("not met", 0)
+        share = wilson(met, met + not_met)
+        requirements.append(
+            RollingRequirement(
+                key=key,
+                name=newest.name,
+                unit=newest.unit,
+                limit=newest.limit,
+                passes=sum(last.values()),
+                met=met,
+                not_met=not_met,
+                unknown=sum(last.values()) - met - not_met,
+                share_met=_known(share.share),
+                low=_known(share.low),
+                high=_known(share.high),
+                lowest_share=min(shares, default=None),
+            )
+        )
+    return requirements
+
+
+def make_monthly_report(
+    ground: Ground, spacecraft_id: int, month: str, *, instance: str = FLOWN
+) -> MonthlyReport:
+    """Make the report of a month (YYYY-MM, UTC) of a spacecraft in one instance, and return it.
+
+    The same content is stored once.
+
+    Raises
+    ------
+    InvalidInput
+        This is not a month, or it has no pass with a report.
+    """
+    found = _month(ground, spacecraft_id, instance, month)
+    if not found.passes:
+        raise InvalidInput(
+            f"monthly report of spacecraft {spacecraft_id} ({instance})",
+            month,
+            "passes with a report",
+            "none",
+        )
+    return _keep_monthly_report(ground, found, instance, month)
+
+
+def _month(ground: Ground, spacecraft_id: int, instance: str, month: str) -> Performance:
+    start_utc_ns, stop_utc_ns = month_span(month)
+    return performance(
+        ground,
+        spacecraft_id,
+        instance=instance,
+        start_utc_ns=start_utc_ns,
+        stop_utc_ns=stop_utc_ns,
+        window_days=(stop_utc_ns - start_utc_ns) / DAY_NS,
+    )
+
+
+def _keep_monthly_report(ground: Ground, found: Performance, instance: str, month: str) -> MonthlyReport:
+    from reports.render import render_pages, to_json
+
+    value = monthly_value(found, month)
+    data = to_json(value).encode()
+    said = f"{found.spacecraft_id} {instance} {month} ".encode()
+    identity = hashlib.blake2b(said + data, digest_size=16).hexdigest()
+    with ground.database.reading() as connection:
+        try:
+            return _entity(store.get_monthly_report(connection, identity))
+        except NotFound:
+            pass
+    page, printed = render_pages(value)
+    now = utc_now_ns()
+    stored = {
+        kind: ground.files.put_octets(octets)
+        for kind, octets in (("html", page.encode()), ("pdf", printed), ("json", data))
+    }
+    with ground.database.writing() as connection:
+        for kind, file in stored.items():
+            register_file(connection, file, "report", f"report of {month} ({kind})", now)
+        report = StoredMonthlyReport(
+            id=identity,
+            spacecraft_id=found.spacecraft_id,
+            instance=instance,
+            month=month,
+            passes=len(found.passes),
+            verdict=value.verdict,
+            created=UtcTime(now),
+            html_sha256=stored["html"].sha256,
+            pdf_sha256=stored["pdf"].sha256,
+            json_sha256=stored["json"].sha256,
+        )
+        store.add_monthly_report(connection, report)
+        return _entity(store.get_monthly_report(connection, identity))
+
+
+def make_due_report(ground: Ground, spacecraft_id: int, instance: str = FLOWN) -> MonthlyReport | None:
+    """Make the report of the last complete month (mission time); None if this month has no pass with a report.
+
+    Late data give a new report of this month.
+    """
+    month = last_month(mission_now_ns())
+    found = _month(ground, spacecraft_id, instance, month)
+    return _keep_monthly_report(ground, found, instance, month) if found.passes else None
+
+
+def make_due_reports(ground: Ground) -> tuple[list[dict[str, Any]], list[int]]:
+    """Make the reports of the last complete month of all flown spacecraft.
+
+    The first value has the reports. The second has the spacecraft whose report failed; the log states why.
+    """
+    with ground.database.reading() as connection:
+        spacecraft = store.spacecraft_with_passes(connection, FLOWN)
+    made: list[dict[str, Any]] = []
+    failed = []
+    for one in spacecraft:
+        try:
+            report = make_due_report(ground, one)
+        except (Stopping, DatabaseBusy):
+            raise
+        except Exception:  # one spacecraft does not keep the others from their reports
+            log.exception("monthly report of spacecraft %d: failed", one)
+            failed.append(one)
+        else:
+            if report is not None:
+                made.append({"spacecraft_id": one, "month": report.month, "report": report.id})
+    return made, failed
+
+
+def due_report_of_vehicle(ground: Ground, vehicle: int) -> MonthlyReport | None:
+    """Make the report of the last complete month of a vehicle; see `make_due_report`."""
+    with ground.database.reading() as connection:
+        found = get_vehicle(connection, vehicle)
+    return make_due_report(ground, found.ccsds_id, found.instance)
+
+
+def month_span(month: str) -> tuple[int, int]:
+    """Return start and stop of a month (YYYY-MM), UTC, ns.
+
+    Raises
+    ------
+    InvalidInput
+        This is not a month.
+    """
+    found = _MONTH.fullmatch(month)
+    if found is None:
+        raise InvalidInput("month", "", "a month such as 2029-08", month[:40])
+    days = calendar.monthrange(int(found[1]), int(found[2]))[1]
+    start = parse_utc(f"{month}-01T00:00:00Z")
+    return start, parse_utc(f"{month}-{days:02d}T00:00:00Z") + DAY_NS
+
+
+def last_month(utc_ns: int) -> str:
+    """Return the last complete month before a time."""
+    first = parse_utc(f"{format_utc(utc_ns)[:7]}-01T00:00:00Z")
+    return format_utc(first - DAY_NS)[:7]
+
+
+def _entity(report: StoredMonthlyReport) -> MonthlyReport:
+    return MonthlyReport.model_validate({name: getattr(report, name) for name in MonthlyReport.model_fields})
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,672 @@
+"""Telecommands: validation, release by two persons, uplink, and what the reports say became of them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sqlalchemy import select, update
+
+from ground_service.contacts.commanding import service as commanding
+from ground_service.contacts.commanding.core import SentCommand, VerificationReport, fate_of
+from ground_service.contacts.commanding.model import TelecommandFilter
+from ground_service.contacts.commanding.service import (
+    enter_command,
+    get_command,
+    list_telecommands,
+    note_timeouts,
+    reject_command,
+    release_command,
+    take_uplink,
+)
+from ground_service.errors import Conflict, InvalidInput, NotFound
+from ground_service.events import read_events
+from ground_service.ground import Ground
+from ground_service.http.model import Paging
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.model import Approval
+from ground_service.planning.model import WindowFilter
+from ground_service.planning.service import (
+    WindowEntry,
+    add_window,
+    change_window,
+    uplink_window,
+)
+from ground_service.planning.store import list_windows
+from ground_service.store import repository
+from lunar.timescales import parse_utc
+from tmtc.dictionary import DICTIONARY
+from tmtc.stream import cut_packets
+from tmtc.uplink import UplinkDecoder
+
+SPACECRAFT = 76
+START = {"function_id": "start_observation", "argument_1": 600.0, "argument_2": 15.0}
+
+
+def entered(ground: Ground, name: str = "perform_function", actor: str = "ann", **arguments: Any) -> int:
+    given = arguments or (START if name == "perform_function" else {})
+    return enter_command(ground, name, given, spacecraft_id=SPACECRAFT, actor=actor)
+
+
+def sent(ground: Ground, actor: str = "ann") -> int:
+    command = entered(ground, actor=actor)
+    release_command(ground, command, actor=actor)
+    take_uplink(ground, spacecraft_id=SPACECRAFT, actor=actor)
+    return command
+
+
+def downlink(ground: Ground, folder: Path, *reports: tuple[str, int, dict[str, Any]]) -> None:
+    path = folder / "reports.bin"
+    path.write_bytes(
+        b"".join(
+            DICTIONARY.pack(name, values, ticks=ticks, sequence_count=ticks % 16384)
+            for name, ticks, values in reports
+        )
+    )
+    ingest_file(ground, path, spacecraft_id=SPACECRAFT)
+
+
+def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground: Ground, tmp_path: Path) -> None:
+    command = entered(ground)
+    assert get_command(ground, command).state == "queued"
+    release_command(ground, command, actor="ann")
+    stream, ids = take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann")
+    assert ids == [command]
+    view = get_command(ground, command)
+    assert view.state == "sent"
+    request = {"request_id": view.record.request_id}
+    downlink(ground, tmp_path, ("verification_accepted", 1000, request))
+    assert get_command(ground, command).state == "accepted"
+    downlink(
+        ground, tmp_path, ("verification_completed", 3000, request), ("verification_started", 2000, request)
+    )
+    view = get_command(ground, command)
+    assert view.state == "completed"
+    assert view.fate is not None
+    assert [report.subtype for report in view.fate.reports] == [1, 3, 7]
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann") == (b"", [])
+    # the receiver at the other end gets the very packet
+    decoded = UplinkDecoder(SPACECRAFT).decode(stream)
+    assert list(decoded.packets) == [view.record.octets]
+
+
+def test_bare_packets_can_be_taken_instead_of_frames(ground: Ground) -> None:
+    for _ in range(3):
+        release_command(ground, entered(ground, "test_connection"), actor="ann")
+    stream, ids = take_uplink(ground, spacecraft_id=SPACECRAFT, framed=False, actor="ann")
+    cut = cut_packets(stream, packet_type=1)
+    assert len(cut) == len(ids) == 3
+    counts = [DICTIONARY.unpack_command(packet).sequence_count for packet in cut.packets(stream)]
+    assert counts == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("self_destruct", {}, "name: expected one of the 27 telecommands of the dictionary"),
+        (
+            "perform_function",
+            {"function_id": "dance", "argument_1": 0, "argument_2": 0},
+            "function_id: expected one of",
+        ),
+        ("perform_function", {"function_id": 1}, "argument_1: expected a value"),
+        ("set_housekeeping_interval", {"structure_id": 1, "interval_s": 0}, "interval_s: expected"),
+        ("set_parameter", {"parameter_id": "x", "value": []}, "expected"),
+        ("test_connection", {"extra": 1}, "no such field"),
+        *(
+            (
+                "set_parameter",
+                {"parameter_id": 1, "value": value},
+                "set_parameter.value: expected a finite number",
+            )
+            for value in (float("nan"), float("inf"), -float("inf"), 1e400, True, False)
+        ),
+        (
+            "set_parameter",
+            {"parameter_id": True, "value": 1.0},
+            "parameter_id: expected a finite number, found True",
+        ),
+        ("set_parameter", {"parameter_id": 1, "value": 10**400}, "value: expected a number"),
+        (
+            "set_housekeeping_interval",
+            {"structure_id": 1, "interval_s": True},
+            "interval_s: expected a finite number",
+        ),
+        ("delete_activity", {"request_id": -1}, "request_id: expected"),
+        ("delete_activity", {"request_id": 1e20}, "request_id: expected"),
+        (
+            "insert_activity",
+            {"release_ticks": 1, "items": [{"octet": 1}, {"octet": True}]},
+            "items.octet: expected a finite number",
+        ),
+        ("test_connection\x00", {}, "name: expected one of the 27 telecommands of the dictionary"),
+    ],
+)
+def test_what_the_dictionary_refuses_is_not_queued(
+    ground: Ground, name: str, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
+    assert ground.read(list_telecommands, TelecommandFilter()).total == 0
+
+
+@pytest.mark.parametrize("function", ["reboot", 7])
+def test_a_critical_command_needs_a_second_person(ground: Ground, function: Any) -> None:
+    command = entered(ground, function_id=function, argument_1=0.0, argument_2=0.0)
+    with pytest.raises(Conflict, match="critical; expected a person other than ann"):
+        release_command(ground, command, actor="ann")
+    release_command(ground, command, actor="bob")
+    assert get_command(ground, command).record.decided_by == "bob"
+
+
+def test_only_a_queued_command_can_be_decided_on(ground: Ground) -> None:
+    command = entered(ground)
+    reject_command(ground, command, actor="bob", reason="wrong cadence")
+    assert get_command(ground, command).record.reason == "wrong cadence"
+    for decide in (
+        lambda: release_command(ground, command, actor="bob"),
+        lambda: reject_command(ground, command, actor="bob", reason="again"),
+    ):
+        with pytest.raises(Conflict, match="expected state queued, found rejected"):
+            decide()
+    with pytest.raises(NotFound):
+        release_command(ground, 99, actor="bob")
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann") == (b"", [])
+
+
+def test_every_step_is_in_the_audit_log(ground: Ground) -> None:
+    command = sent(ground)
+    with ground.database.reading() as connection:
+        rows = connection.execute(
+            select(repository.AUDIT.c.action, repository.AUDIT.c.actor).where(
+                repository.AUDIT.c.target == str(command)
+            )
+        ).all()
+    assert [tuple(row) for row in rows] == [
+        ("enter telecommand", "ann"),
+        ("release telecommand", "ann"),
+        ("send telecommand", "ann"),
+    ]
+
+
+def test_a_failure_says_why(ground: Ground, tmp_path: Path) -> None:
+    command = sent(ground)
+    request = get_command(ground, command).record.request_id
+    downlink(
+        ground,
+        tmp_path,
+        ("verification_not_accepted", 500, {"request_id": request, "failure_code": "wrong_mode"}),
+    )
+    view = get_command(ground, command)
+    assert view.state == "failed"
+    assert view.fate is not None
+    assert view.fate.reports[0].failure_code == 5
+    assert view.telecommand.remark == "not accepted: wrong mode"
+
+
+REQUEST = 0x18A0C000
+COMMAND = SentCommand(REQUEST, sent_utc_ns=0, sent_after_ticks=100, repeated_after_ticks=None, timeout_ns=10)
+
+
+def report(subtype: int, ticks: int, request: int = REQUEST) -> VerificationReport:
+    return VerificationReport(subtype, request, ticks, None, None)
+
+
+def test_reports_of_an_earlier_or_later_command_with_the_same_count_do_not_count() -> None:
+    earlier, own, later = report(7, 100), report(1, 101), report(7, 201)
+    again = SentCommand(REQUEST, 0, 100, 200, 10)
+    assert fate_of(again, [earlier, own, later], 0).state == "accepted"
+    assert fate_of(COMMAND, [report(7, 150, REQUEST + 1)], 0).state == "sent"
+
+
+def test_a_command_whose_end_is_overdue_is_timed_out_until_late_reports_come() -> None:
+    assert not fate_of(COMMAND, [], 10).timed_out
+    assert fate_of(COMMAND, [report(1, 150)], 11).timed_out
+    late = fate_of(COMMAND, [report(1, 150), report(7, 900)], 11)
+    assert (late.state, late.timed_out) == ("completed", False)
+
+
+def test_a_time_out_is_put_on_record_once_and_stays_there(
+    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent, completed = sent(ground), sent(ground)
+    request = {"request_id": get_command(ground, completed).record.request_id}
+    downlink(ground, tmp_path, ("verification_completed", 3000, request))
+    due = get_command(ground, silent).record.sent_utc_ns + 600 * 10**9
+
+    def noted(now: int) -> list[int]:
+        monkeypatch.setattr("ground_service.contacts.commanding.service.utc_now_ns", lambda: now)
+        return note_timeouts(ground, 0, now)
+
+    assert noted(due - 1) == []
+    assert noted(due + 10**9) == [silent]
+    assert noted(due + 2 * 10**9) == []
+    late = {"request_id": get_command(ground, silent).record.request_id}
+    downlink(ground, tmp_path, ("verification_completed", 9000, late))
+    assert (get_command(ground, silent).state, noted(due + 3 * 10**9)) == ("completed", [])
+    with ground.database.reading() as connection:
+        record = repository.newest(connection, repository.AUDIT, Paging(), action="time out telecommand")[0]
+    assert [(row["actor"], row["target"], row["detail"]["state"]) for row in record] == [
+        ("service", str(silent), "sent")
+    ]
+    assert {"id": silent, "state": "timed out"} in [item.payload for item in read_events(ground.database, 0)]
+
+
+@given(st.lists(st.sampled_from([1, 3, 5, 7]), unique=True), st.randoms())
+def test_the_order_in_which_reports_arrive_does_not_matter(subtypes: list[int], random: Any) -> None:
+    reports = [report(subtype, 100 + subtype) for subtype in subtypes]
+    shuffled = list(reports)
+    random.shuffle(shuffled)
+    assert fate_of(COMMAND, shuffled, 0) == fate_of(COMMAND, reports, 0)
+
+
+@pytest.mark.parametrize("spacecraft_id", [-1, 1024, 10**20, True])
+def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground: Ground, spacecraft_id: int) -> None:
+    for work in (
+        lambda: enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft_id, actor="ann"),
+        lambda: take_uplink(ground, spacecraft_id=spacecraft_id, actor="ann"),
+    ):
+        with pytest.raises(InvalidInput, match="spacecraft, id: expected 0 to 1023"):
+            work()
+
+
+@pytest.mark.parametrize("reason", ["", "two\nlines", "\x1b[2Jgone", "nul\x00", "x" * 501])
+def test_a_reason_is_one_printable_line(ground: Ground, reason: str) -> None:
+    command = entered(ground)
+    with pytest.raises(InvalidInput, match="telecommand, reason: expected a line of 1 to 500 characters"):
+        reject_command(ground, command, actor="bob", reason=reason)
+    assert get_command(ground, command).state == "queued"
+
+
+def test_arguments_nested_without_end_are_refused(ground: Ground) -> None:
+    nested: Any = 1
+    for _ in range(3000):
+        nested = [nested]
+    with pytest.raises(InvalidInput, match="set_parameter"):
+        entered(ground, "set_parameter", parameter_id=1, value=nested)
+
+
+def test_an_instance_is_one_printable_line(ground: Ground) -> None:
+    with pytest.raises(InvalidInput, match="spacecraft, instance"):
+        enter_command(ground, "test_connection", {}, spacecraft_id=1, instance="a\nb", actor="ann")
+
+
+def carrying(name: str, **arguments: Any) -> dict[str, Any]:
+    octets = DICTIONARY.pack_command(name, arguments, sequence_count=0)
+    return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "critical"),
+    [
+        ("set_parameter", {"parameter_id": 1, "value": 2.0}, True),
+        ("disable_schedule", {}, True),
+        ("perform_function", {"function_id": "set_mode", "argument_1": 1, "argument_2": 0}, True),
+        ("perform_function", {"function_id": "synchronise_clock", "argument_1": 0, "argument_2": 0}, True),
+        ("uplink_first", {"transaction": 1, "part": 1, "table": "parameters", "items": [{"octet": 1}]}, True),
+        ("insert_activity", carrying("set_parameter", parameter_id=1, value=2.0), True),
+        ("insert_activity", carrying("perform_function", **START), False),
+        ("perform_function", START, False),
+        ("enable_schedule", {}, False),
+        ("test_connection", {}, False),
+    ],
+)
+def test_what_changes_the_state_of_the_payload_needs_a_second_person(
+    ground: Ground, name: str, arguments: dict[str, Any], critical: bool
+) -> None:
+    command = enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
+    assert bool(get_command(ground, command).record.critical) == critical
+    if critical:
+        with pytest.raises(
+            Conflict, match=r"critical; expected .* \((changes on-board state|destroys data): "
+        ):
+            release_command(ground, command, actor="ann")
+        release_command(ground, command, actor="bob")
+    else:
+        release_command(ground, command, actor="ann")
+    assert get_command(ground, command).state == "released"
+
+
+def raise_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = Approval(second_person_for=("perform_function/start_observation",))
+    monkeypatch.setattr(commanding, "approval_in_force", lambda *_: rules)
+
+
+def planned(ground: Ground, entered_by: str, approved_by: str) -> int:
+    start = parse_utc("2029-08-07T06:00:00Z")
+    entry = WindowEntry("window", start, start + 600 * 10**9, 15.0, SPACECRAFT)
+    window = int(add_window(ground, entry, actor=entered_by).id)
+    change_window(ground, window, actor=approved_by, changes={}, decision="approved")
+    return window
+
+
+def test_one_person_plans_approves_and_uplinks_a_routine_window(ground: Ground) -> None:
+    assert len(uplink_window(ground, planned(ground, "ann", "ann"), actor="ann")) == 3
+
+
+def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_telecommands(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raise_rule(monkeypatch)
+    with pytest.raises(Conflict, match="expected a window that a second person has approved"):
+        uplink_window(ground, planned(ground, "ann", "ann"), actor="bob")
+    assert ground.read(list_telecommands, TelecommandFilter()).total == 0
+    [window] = [row.id for row in ground.read(list_windows, WindowFilter()).items]
+    change_window(ground, window, actor="bob", changes={}, decision="draft")
+    change_window(ground, window, actor="bob", changes={}, decision="approved")
+    assert len(uplink_window(ground, window, actor="ann")) == 3
+
+
+def test_who_changes_a_window_has_entered_it(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    raise_rule(monkeypatch)
+    start = parse_utc("2029-08-07T06:00:00Z")
+    entry = WindowEntry("window", start, start + 600 * 10**9, 15.0, SPACECRAFT)
+    window = int(add_window(ground, entry, actor="ann").id)
+    change_window(ground, window, actor="bob", changes={"cadence_s": 20.0}, decision="approved")
+    with pytest.raises(Conflict, match="a second person"):
+        uplink_window(ground, window, actor="ann")
+
+
+NOW = parse_utc("2029-08-07T06:00:00Z")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """A clock that stands at `NOW` until it is set."""
+
+    def put(now: int) -> None:
+        monkeypatch.setattr("ground_service.contacts.commanding.service.utc_now_ns", lambda: now)
+
+    put(NOW)
+    return put
+
+
+def notes(ground: Ground, command: int) -> list[tuple[str, str, Any]]:
+    """Who did what to a command, and the details, in order."""
+    with ground.database.reading() as connection:
+        rows = repository.newest(connection, repository.AUDIT, Paging(), target=str(command))[0]
+    return [(row["actor"], row["action"], row["detail"]) for row in sorted(rows, key=lambda row: row["id"])]
+
+
+def told(ground: Ground) -> list[Any]:
+    return [item.payload for item in read_events(ground.database, 0) if item.kind == "telecommand"]
+
+
+def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    command = enter_command(
+        ground, "perform_function", START, spacecraft_id=SPACECRAFT, timeout_s=90, actor="ann"
+    )
+    view = get_command(ground, command)
+    assert (view.spacecraft_id, view.instance, view.fate) == (SPACECRAFT, "flight", None)
+    expected = {
+        "name": "perform_function", "arguments": START, "state": "queued", "critical": 0, "timeout_s": 90,
+        "requested_by": "ann", "created_utc_ns": NOW, "window_id": None, "carrier_id": None, "decided_by": None,
+        "sequence_count": None, "octets": None, "sent_utc_ns": None,
+    }  # fmt: skip
+    assert {name: getattr(view.record, name) for name in expected} == expected
+    clock(NOW + 1)
+    release_command(ground, command, actor="bob")
+    octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
+    expected |= {
+        "state": "released",
+        "decided_by": "bob",
+        "decided_utc_ns": NOW + 1,
+        "sequence_count": 0,
+        "octets": octets,
+        "request_id": int.from_bytes(octets[:4], "big"),
+    }
+    row = get_command(ground, command).record
+    assert {name: getattr(row, name) for name in expected} == expected
+    clock(NOW + 2)
+    take_uplink(ground, spacecraft_id=SPACECRAFT, actor="cleo")
+    row = get_command(ground, command).record
+    assert (row.state, row.sent_utc_ns, row.sent_after_ticks) == ("sent", NOW + 2, -1)
+    assert notes(ground, command) == [
+        ("ann", "enter telecommand", {"name": "perform_function", "arguments": START}),
+        ("bob", "release telecommand", {"sequence_count": 0}),
+        ("cleo", "send telecommand", {}),
+    ]
+    assert told(ground) == [{"id": command, "state": state} for state in ("queued", "released", "sent")]
+
+
+def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], None]) -> None:
+    command = entered(ground)
+    clock(NOW + 5)
+    reject_command(ground, command, actor="bob", reason="wrong cadence")
+    row = get_command(ground, command).record
+    assert (row.state, row.decided_by, row.decided_utc_ns, row.reason) == (
+        "rejected",
+        "bob",
+        NOW + 5,
+        "wrong cadence",
+    )
+    assert notes(ground, command)[1] == ("bob", "reject telecommand", {"reason": "wrong cadence"})
+    assert told(ground)[-1] == {"id": command, "state": "rejected"}
+
+
+@pytest.mark.parametrize(
+    ("timeout_s", "accepted"), [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)]
+)
+def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, accepted: bool) -> None:
+    def enter() -> int:
+        return enter_command(
+            ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann"
+        )
+
+    if accepted:
+        assert get_command(ground, enter()).record.timeout_s == timeout_s
+    else:
+        with pytest.raises(
+            InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"
+        ):
+            enter()
+
+
+def test_a_command_is_followed_for_ten_minutes_unless_told_otherwise(ground: Ground) -> None:
+    assert get_command(ground, entered(ground)).record.timeout_s == 600
+
+
+def test_an_unknown_name_is_answered_with_the_nearest_one(ground: Ground) -> None:
+    for name, near in (("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name)):
+        with pytest.raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
+            entered(ground, name)
+
+
+def test_commands_are_sent_in_the_order_of_their_release(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    first, second, third = (entered(ground, "test_connection") for _ in range(3))
+    for offset, command in ((1, second), (2, third), (2, first)):
+        clock(NOW + offset)
+        release_command(ground, command, actor="ann")
+    stream, ids = take_uplink(ground, spacecraft_id=SPACECRAFT, framed=False, actor="ann")
+    # Of two released in one instant the one entered first; the counts are those of the release.
+    assert ids == [second, first, third]
+    octets = [DICTIONARY.pack_command("test_connection", {}, sequence_count=count) for count in (0, 2, 1)]
+    assert stream == b"".join(octets)
+
+
+def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -> None:
+    mine = entered(ground, "test_connection")
+    twin = enter_command(
+        ground, "test_connection", {}, spacecraft_id=SPACECRAFT, instance="twin", actor="ann"
+    )
+    other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
+    waiting = entered(ground, "test_connection")
+    for command in (mine, twin, other):
+        release_command(ground, command, actor="ann")
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann")[1] == [mine]
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, instance="twin", actor="ann")[1] == [twin]
+    assert [get_command(ground, one).state for one in (other, waiting)] == ["released", "queued"]
+    # Each spacecraft counts by itself.
+    assert [get_command(ground, one).record.sequence_count for one in (mine, twin, other)] == [0, 0, 0]
+
+
+def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
+    ground: Ground, tmp_path: Path
+) -> None:
+    first = sent(ground)
+    request = get_command(ground, first).record.request_id
+    downlink(
+        ground,
+        tmp_path,
+        ("verification_accepted", 900, {"request_id": request}),
+        ("verification_completed", 1200, {"request_id": request}),
+    )
+    assert get_command(ground, sent(ground)).record.sent_after_ticks == 1200
+    other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
+    release_command(ground, other, actor="ann")
+    take_uplink(ground, spacecraft_id=77, actor="ann")
+    assert get_command(ground, other).record.sent_after_ticks == -1
+
+
+def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) -> None:
+    ids = [entered(ground, "test_connection") for _ in range(4)]
+    release_command(ground, ids[1], actor="ann")
+
+    def listed(**which: Any) -> tuple[list[int], int]:
+        page = ground.read(list_telecommands, TelecommandFilter(**which))
+        views, total = page.items, page.total
+        return [int(view.id) for view in views], total
+
+    assert listed() == (ids[::-1], 4)
+    assert listed(limit=2, offset=1) == ([ids[2], ids[1]], 4)
+    assert listed(state="queued") == ([ids[3], ids[2], ids[0]], 3)
+    assert listed(state="released") == ([ids[1]], 1)
+
+
+def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    command = sent(ground)
+    due = NOW + 600 * 10**9
+    clock(due + 1)
+    assert note_timeouts(ground, due + 1, due + 100) == []
+    assert note_timeouts(ground, 0, due) == []
+    assert note_timeouts(ground, due, due + 1) == [command]
+    assert get_command(ground, command).record.timeout_noted_utc_ns == due + 1
+    assert notes(ground, command)[-1] == (
+        "service",
+        "time out telecommand",
+        {"state": "sent", "timeout_s": 600},
+    )
+    assert note_timeouts(ground, 0, due + 100) == []
+
+
+def test_several_commands_time_out_at_once_and_those_that_ended_do_not(
+    ground: Ground, tmp_path: Path, clock: Callable[[int], None]
+) -> None:
+    commands = [sent(ground) for _ in range(3)]
+    ended = {"request_id": get_command(ground, commands[0]).record.request_id}
+    downlink(ground, tmp_path, ("verification_completed", 3000, ended))
+    entered(ground)
+    clock(NOW + 700 * 10**9)
+    assert note_timeouts(ground, 0, NOW + 700 * 10**9) == commands[1:]
+
+
+def vehicle_of(ground: Ground) -> int:
+    command = entered(ground, "test_connection")
+    return int(get_command(ground, command).record.vehicle_id)
+
+
+def test_an_activity_carries_the_octets_of_its_telecommand(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    vehicle = vehicle_of(ground)
+    with ground.database.writing() as connection:
+        outer = commanding.add_scheduled(
+            connection, vehicle, "perform_function", START, release_ticks=65_536, actor="ann", timeout_s=77,
+            window_id=5,
+        )  # fmt: skip
+    carrier, inner = get_command(ground, outer).record, get_command(ground, outer - 1).record
+    octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
+    expected = {
+        "name": "perform_function", "arguments": START, "state": "carried", "requested_by": "ann", "timeout_s": 77,
+        "window_id": 5, "carrier_id": outer, "sequence_count": 0, "octets": octets, "decided_by": "ann",
+        "decided_utc_ns": NOW, "request_id": int.from_bytes(octets[:4], "big"),
+    }  # fmt: skip
+    assert {name: getattr(inner, name) for name in expected} == expected
+    arguments = {"release_ticks": 65_536, "items": [{"octet": octet} for octet in octets]}
+    expected = {
+        "name": "insert_activity", "arguments": arguments, "state": "released", "requested_by": "ann",
+        "timeout_s": 77, "window_id": 5, "carrier_id": None, "sequence_count": 1, "decided_by": "ann",
+        "octets": DICTIONARY.pack_command("insert_activity", arguments, sequence_count=1),
+    }  # fmt: skip
+    assert {name: getattr(carrier, name) for name in expected} == expected
+    released = [get_command(ground, key).telecommand.release for key in (outer, outer - 1)]
+    assert released == ["1999-12-31T23:59:29.000000Z", None]  # 2000-01-01 TAI, and 1 s
+    clock(NOW + 9)
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="bob")[1] == [outer]
+    # What is inside is sent with its carrier.
+    inner = get_command(ground, outer - 1).record
+    assert (inner.state, inner.sent_utc_ns, inner.sent_after_ticks) == ("sent", NOW + 9, -1)
+
+
+REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("approval", "released"),
+    [
+        (None, False),
+        (commanding.Approval("ann", "ann"), False),
+        (commanding.Approval("ann", "bob"), True),
+    ],
+)
+def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
+    ground: Ground, approval: commanding.Approval | None, released: bool
+) -> None:
+    vehicle = vehicle_of(ground)
+
+    def add(name: str, arguments: dict[str, Any]) -> int:
+        with ground.database.writing() as connection:
+            return commanding.add_released(
+                connection,
+                vehicle,
+                name,
+                arguments,
+                actor="ann",
+                timeout_s=50,
+                window_id=3,
+                approval=approval,
+            )
+
+    def schedule() -> int:
+        with ground.database.writing() as connection:
+            return commanding.add_scheduled(
+                connection, vehicle, "perform_function", REBOOT, release_ticks=1, actor="ann", timeout_s=50,
+                approval=approval,
+            )  # fmt: skip
+
+    if released:
+        row = get_command(ground, add("perform_function", REBOOT)).record
+        assert (row.state, row.critical, row.timeout_s, row.window_id) == ("released", 1, 50, 3)
+        assert get_command(ground, schedule()).record.critical == 1
+    else:
+        for work in (lambda: add("perform_function", REBOOT), schedule):
+            with pytest.raises(Conflict, match=r"telecommand perform_function: .*critical"):
+                work()
+        assert ground.read(list_telecommands, TelecommandFilter()).total == 1
+    # A routine command needs nobody.
+    row = get_command(ground, add("test_connection", {})).record
+    assert (row.state, row.critical) == ("released", 0)
+
+
+def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
+    vehicle = vehicle_of(ground)
+    release_command(ground, 1, actor="ann")
+    with ground.database.writing() as connection:
+        connection.execute(
+            update(repository.COMMAND_COUNTERS)
+            .where(repository.COMMAND_COUNTERS.c.vehicle_id == vehicle)
+            .values(telecommands=16_384)
+        )
+    command = entered(ground, "test_connection")
+    release_command(ground, command, actor="ann")
+    row = get_command(ground, command).record
+    assert row.sequence_count == 0
+    assert row.octets == DICTIONARY.pack_command("test_connection", {}, sequence_count=0)

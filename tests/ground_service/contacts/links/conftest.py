@@ -1,0 +1,94 @@
+"""A ground station on two TCP ports that does what a test tells it."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+
+from ground_service.contacts.links import service
+from ground_service.contacts.links.runner import LinkRunner
+from ground_service.ground import Ground
+from ground_service.missions.service import add_mission
+
+PATIENCE_S = 20.0
+
+
+@dataclass
+class Station:
+    """Telemetry port and telecommand port; `telecommands` is what was received on all connections."""
+
+    down: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
+    up: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
+    telecommands: bytearray = field(default_factory=bytearray)
+    connections: list[socket.socket] = field(default_factory=list)
+    uplinks: list[socket.socket] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        threading.Thread(target=self._take_uplinks, daemon=True).start()
+
+    def accept(self, seconds: float = PATIENCE_S) -> socket.socket:
+        """Return the next telemetry connection of the service."""
+        self.down.settimeout(seconds)
+        connection, _ = self.down.accept()
+        self.connections.append(connection)
+        return connection
+
+    def _take_uplinks(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self.up.accept()
+                self.uplinks.append(connection)
+                threading.Thread(target=self._read, args=(connection,), daemon=True).start()
+
+    def _read(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while block := connection.recv(1 << 16):
+                self.telecommands += block
+
+    def link(self, extra: str = "") -> str:
+        """Return the section of the mission description."""
+        down, up = (one.getsockname()[1] for one in (self.down, self.up))
+        return (
+            f'[[links]]\nname = "lab"\nkind = "tcp"\ndownlink = "127.0.0.1:{down}"\n'
+            f'uplink = "127.0.0.1:{up}"\nsilence_s = 1.0\n{extra}\n'
+        )
+
+    def close(self) -> None:
+        """Close everything."""
+        for one in (self.down, self.up, *self.connections, *self.uplinks):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    made = Station()
+    yield made
+    made.close()
+
+
+HEAD = 'name = "selenita"\n[spacecraft]\nid = 76\n'
+
+
+def declare(ground: Ground, text: str) -> None:
+    """Add a mission description with links."""
+    add_mission(ground, (HEAD + text).encode(), actor="ann")
+
+
+@contextlib.contextmanager
+def operated(ground: Ground, owner: str = "here") -> Iterator[LinkRunner]:
+    """Operate the link "lab" in this process."""
+    declared = service.declared_links(ground)["lab"]
+    assert service.acquire(ground, declared, owner, 15_000_000_000)
+    runner = LinkRunner(ground, declared, owner)
+    runner.start()
+    try:
+        yield runner
+    finally:
+        runner.stop()

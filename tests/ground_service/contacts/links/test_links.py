@@ -1,0 +1,724 @@
+"""One link: reception without loss, contacts, and transmission of released telecommands, on both databases."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+from sqlalchemy import select
+
+from ground_service.clock import mission_now_ns, set_mission_clock, utc_now_ns
+from ground_service.contacts.commanding.service import enter_command, get_command, release_command
+from ground_service.contacts.links import service, store
+from ground_service.contacts.links.runner import LinkRunner
+from ground_service.contacts.links.store import TransmissionRow
+from ground_service.contacts.links.stream import ACKNOWLEDGEMENT, TRANSMISSION
+from ground_service.errors import Conflict, NotFound
+from ground_service.events import read_events
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.store import repository
+from ground_service.store.vehicles import all_vehicles
+from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.contacts.links.conftest import Station, declare, operated
+from tests.serving import wait_for
+from tmtc.uplink import UplinkDecoder
+
+CADU = 1279
+SPACECRAFT = 76
+
+
+def hash_of(ground: Ground) -> str:
+    with ground.database.reading() as connection:
+        known = [one.id for one in all_vehicles(connection) if one.instance == "flight"]
+        return archive_hash(connection, known[0]) if known else ""
+
+
+@pytest.fixture(scope="module")
+def stream(synthetic_pass: Any) -> bytes:
+    return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
+
+
+@pytest.fixture(scope="module")
+def expected(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> str:
+    with open_ground(tmp_path_factory.mktemp("whole")) as ground:
+        ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+        return hash_of(ground)
+
+
+def released(ground: Ground, count: int = 1) -> list[int]:
+    keys = [
+        enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, actor="ann")
+        for _ in range(count)
+    ]
+    for key in keys:
+        release_command(ground, key, actor="bob")
+    return keys
+
+
+def packets_of(octets: bytes) -> list[bytes]:
+    return list(UplinkDecoder(SPACECRAFT).decode(octets).packets)
+
+
+def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
+    return [bytes(get_command(ground, key).record.octets or b"") for key in keys]
+
+
+def received_of(ground: Ground) -> int:
+    return service.get_link(ground, "lab").octets
+
+
+def contact_events(ground: Ground) -> list[str]:
+    return [one.kind for one in read_events(ground.database, 0, 10_000) if one.kind.startswith("contact")]
+
+
+@pytest.mark.parametrize("cut", [1, 3, 4, CADU - 1, CADU, CADU + 1, 5 * CADU + 700, 9 * CADU + 2])
+def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
+    ground: Ground, station: Station, stream: bytes, expected: str, cut: int
+) -> None:
+    declare(ground, station.link())
+    with operated(ground) as runner:
+        first = station.accept()
+        first.sendall(stream[:cut])
+        first.close()
+        second = station.accept()
+        second.sendall(stream[cut:])
+        wait_for(lambda: runner.octets_received >= len(stream) - CADU, "the archive")
+        second.close()
+        wait_for(lambda: hash_of(ground) == expected, "the same archive")
+    assert service.get_link(ground, "lab").octets <= len(stream)
+
+
+def test_parts_of_frames_are_ingested_as_they_arrive(
+    ground: Ground, station: Station, stream: bytes, expected: str
+) -> None:
+    """What follows may never come; if it does, it has a position in the same recording."""
+    declare(ground, station.link().replace("silence_s = 1.0", "silence_s = 1000.0"))
+    with operated(ground):
+        connection = station.accept()
+        start = 0
+        for stop in (700, 5 * CADU, 6 * CADU - 9, 6 * CADU, len(stream)):
+            connection.sendall(stream[start:stop])
+            wait_for(lambda stop=stop: received_of(ground) == stop, f"{stop} octets in the archive")
+            start = stop
+    assert hash_of(ground) == expected
+    with ground.database.reading() as connection_:
+        pieces = connection_.execute(select(repository.PIECES).order_by(repository.PIECES.c.position)).all()
+    assert len({one.stream for one in pieces}) == 1
+    assert [one.position for one in pieces[1:]] == [one.position + one.octets for one in pieces[:-1]]
+
+
+def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(
+    ground: Ground, station: Station, stream: bytes, expected: str
+) -> None:
+    declare(ground, station.link())
+    with operated(ground):
+        connection = station.accept()
+        start = 0
+        for number, stop in enumerate((3 * CADU, 5 * CADU + 77, len(stream)), 1):
+            connection.sendall(stream[start:stop])
+            wait_for(lambda n=number: contact_events(ground).count("contact ended") == n, f"contact {number}")
+            start = stop
+    assert hash_of(ground) == expected
+    with ground.database.reading() as connection_:
+        pieces = connection_.execute(select(repository.PIECES).order_by(repository.PIECES.c.ingest_id)).all()
+    streams = list(dict.fromkeys(one.stream for one in pieces))
+    assert [sum(one.octets for one in pieces if one.stream == name) for name in streams] == [
+        3 * CADU,
+        len(stream) - 3 * CADU,
+    ]
+
+
+def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
+    either: Ground, station: Station, stream: bytes, expected: str
+) -> None:
+    declare(either, station.link())
+    folder = either.home / "incoming" / "link-lab"
+    folder.mkdir(parents=True)
+    (folder / "000000000003.segment").write_bytes(stream[: 4 * CADU + 9])
+    (folder / "current").write_bytes(stream[4 * CADU + 9 :])
+    with operated(either) as runner:
+        wait_for(lambda: runner.octets_received == len(stream), "all octets")
+    assert hash_of(either) == expected
+
+
+def test_octets_are_acknowledged_when_they_are_on_disk(
+    ground: Ground, station: Station, stream: bytes
+) -> None:
+    declare(ground, station.link("acknowledge = true"))
+    with operated(ground):
+        connection = station.accept()
+        connection.settimeout(10.0)
+        connection.sendall(stream)
+        count = 0
+        while count < len(stream):
+            octets = connection.recv(ACKNOWLEDGEMENT.size)
+            assert len(octets) == ACKNOWLEDGEMENT.size
+            assert ACKNOWLEDGEMENT.unpack(octets)[0] > count
+            (count,) = ACKNOWLEDGEMENT.unpack(octets)
+        assert count == len(stream)
+
+
+def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
+    either: Ground, station: Station, stream: bytes
+) -> None:
+    declare(either, station.link())
+    keys = released(either, 3)
+    with operated(either) as runner:
+        connection = station.accept()
+        wait_for(lambda: service.get_link(either, "lab").state == "connected", "the connection")
+        time.sleep(0.5)
+        assert not station.telecommands and runner.commands_unsent == 3
+        connection.sendall(stream)
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
+        )
+        wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
+        wait_for(lambda: contact_events(either)[-1] == "contact ended", "the end of the contact")
+        more = released(either)
+        time.sleep(0.5)
+        assert len(packets_of(bytes(station.telecommands))) == 3
+        connection.sendall(stream[: 2 * CADU])
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands))[3:] == octets_of(either, more), "the next contact"
+        )
+    assert contact_events(either).count("contact started") == 2
+    ended = [one for one in read_events(either.database, 0, 10_000) if one.kind == "contact ended"]
+    assert (ended[0].payload["octets"], ended[0].payload["telecommands"]) == (len(stream), 3)
+
+
+def test_manual_links_send_on_request_only(ground: Ground, station: Station, stream: bytes) -> None:
+    declare(ground, station.link('send = "manual"'))
+    with pytest.raises(Conflict, match="expected a process that operates it"):
+        service.request_send(ground, "lab", actor="ann")
+    keys = released(ground)
+    with operated(ground):
+        station.accept().sendall(stream[: 3 * CADU])
+        wait_for(lambda: service.get_link(ground, "lab").state == "contact", "the contact")
+        time.sleep(0.5)
+        assert not station.telecommands
+        assert service.request_send(ground, "lab", actor="ann").unsent == 1
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, keys), "the telecommand"
+        )
+        later = released(ground)
+        time.sleep(0.5)
+        assert len(packets_of(bytes(station.telecommands))) == 1
+        assert get_command(ground, later[0]).state == "released"
+    with pytest.raises(NotFound):
+        service.request_send(ground, "other", actor="ann")
+
+
+def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
+    either: Ground, station: Station, stream: bytes
+) -> None:
+    declare(either, station.link())
+    keys = released(either, 2)
+    declared = service.declared_links(either)["lab"]
+    assert service.acquire(either, declared, "dead", 1)
+    assert len(service.take_transmissions(either, declared, "dead")) == 1
+    time.sleep(0.01)  # the lease of 1 ns has ended
+    assert service.take_transmissions(either, declared, "nobody") == service.take_transmissions(
+        either, declared, "dead"
+    )
+    assert service.get_link(either, "lab").unconfirmed == 1
+    with operated(either, "living"):
+        station.accept().sendall(stream[: 3 * CADU])
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
+        )
+        time.sleep(0.5)
+        assert len(packets_of(bytes(station.telecommands))) == 2
+    assert service.get_link(either, "lab").unconfirmed == 0
+
+
+def test_a_process_without_the_lease_takes_no_telecommands(either: Ground, station: Station) -> None:
+    declare(either, station.link())
+    keys = released(either)
+    declared = service.declared_links(either)["lab"]
+    assert service.acquire(either, declared, "first", 15_000_000_000)
+    assert not service.acquire(either, declared, "second", 15_000_000_000)
+    assert service.take_transmissions(either, declared, "second") == []
+    assert get_command(either, keys[0]).state == "released"
+    service.release(either, "lab", "second")
+    assert not service.acquire(either, declared, "second", 15_000_000_000)
+    service.release(either, "lab", "first")
+    assert service.acquire(either, declared, "second", 15_000_000_000)
+
+
+def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
+    ground: Ground, station: Station, stream: bytes
+) -> None:
+    declare(ground, station.link())
+    keys = released(ground)
+    with operated(ground):
+        connection = station.accept()
+        for contact in range(service.REPEAT_ATTEMPTS + 1):
+            rows = [stream[k * CADU : (k + 1) * CADU] for k in range(4 * contact, 4 * contact + 4)]
+            connection.sendall(rows[0] + rows[1])
+            wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
+            wait_for(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
+            time.sleep(0.2)
+            connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
+            wait_for(
+                lambda n=contact: contact_events(ground).count("contact ended") > n, "the end of the contact"
+            )
+        sent = packets_of(bytes(station.telecommands))
+    assert sent == octets_of(ground, keys) * service.REPEAT_ATTEMPTS
+
+
+class Socket:
+    """A connection that returns what the test has put in, or nothing."""
+
+    connected = True
+    fault = None
+
+    def __init__(self) -> None:
+        self.blocks: list[bytes] = []
+
+    def connect(self) -> bool:
+        return True
+
+    def receive(self, _seconds: float) -> bytes | None:
+        return self.blocks.pop(0) if self.blocks else None
+
+    def close(self) -> None:
+        pass
+
+
+def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Station, stream: bytes) -> None:
+    """A process that was held up finds octets of the whole time: their contact goes on, and no frame is cut."""
+    declare(ground, station.link())
+    declared = service.declared_links(ground)["lab"]
+    assert service.acquire(ground, declared, "me", 3_600_000_000_000)
+    runner, line, now = LinkRunner(ground, declared, "me"), Socket(), [utc_now_ns()]
+    set_mission_clock(lambda: now[0])
+    ingesting = threading.Thread(target=runner._ingest_all, daemon=True)
+    try:
+        runner._open()
+        ingesting.start()
+        runner._down = line
+        line.blocks = [stream[: 2 * CADU + 100]]
+        runner._receive()
+        now[0] += 3600 * 10**9
+        line.blocks = [stream[2 * CADU + 100 : 4 * CADU]]
+        runner._receive()
+        runner._follow_contact()
+        assert contact_events(ground) == ["contact started"]
+        now[0] += 3600 * 10**9
+        runner._receive()  # finds nothing
+
+        def ended() -> bool:
+            runner._follow_contact()
+            return contact_events(ground) == ["contact started", "contact ended"]
+
+        wait_for(ended, "the end of the contact")
+    finally:
+        set_mission_clock(None)
+        runner._stopping.set()
+        runner._cut_all.set()
+        runner._work.set()
+        ingesting.join(60.0)
+        runner._spool.cut()
+        runner._spool.drain()
+        if runner._lock is not None:
+            runner._lock.close()
+
+
+def test_expired_telecommands_are_not_sent(ground: Ground, station: Station, stream: bytes) -> None:
+    declare(ground, station.link())
+    late, timely = released(ground, 2)
+    with ground.database.writing() as connection:
+        for key, before in ((late, mission_now_ns() - 1), (timely, mission_now_ns() + 10**12)):
+            repository.change(connection, repository.TELECOMMANDS, key, send_before_utc_ns=before)
+    with operated(ground) as runner:
+        station.accept().sendall(stream[: 3 * CADU])
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, [timely]), "the telecommand"
+        )
+        wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
+    assert get_command(ground, late).state == "released"
+
+
+def records(stream: bytes, utc_ns: int) -> bytes:
+    rows = [stream[at : at + CADU] for at in range(0, len(stream), CADU)]
+    return b"".join(struct.pack(">q", utc_ns) + row for row in rows)
+
+
+@pytest.mark.parametrize(("hours", "wrong"), [(0, False), (1, True), (-1, True)])
+def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(
+    ground: Ground, station: Station, stream: bytes, expected: str, hours: int, wrong: bool
+) -> None:
+    declare(
+        ground,
+        '[link]\nframe_length = 1115\ncoding = "rs"\nrandomiser = "legacy"\nframe_checksum = true\n'
+        '[link.stations.madrid]\nheader_octets = 8\ntime_code = "unix_ns"\ntime_offset = 0\n'
+        + station.link('station = "madrid"'),
+    )
+    with operated(ground):
+        station.accept().sendall(records(stream, utc_now_ns() + hours * 3600 * 10**9))
+        wait_for(lambda: hash_of(ground) == expected, "the same archive")
+        wait_for(lambda: service.get_link(ground, "lab").clock_offset_s is not None, "the offset")
+        link = service.get_link(ground, "lab")
+    assert link.clock_offset_s == pytest.approx(hours * 3600, abs=PATIENCE_OF_CLOCK_S)
+    assert (link.reason is not None and "the clock of the station differs" in link.reason) == wrong
+
+
+PATIENCE_OF_CLOCK_S = 20.0
+
+
+def test_states_say_why_a_link_waits(ground: Ground, station: Station) -> None:
+    declare(ground, station.link())
+    assert service.get_link(ground, "lab").reason == "no process operates it"
+    station.down.close()
+    with operated(ground):
+        wait_for(lambda: "refused" in (service.get_link(ground, "lab").reason or ""), "the reason")
+        assert service.get_link(ground, "lab").state == "waiting"
+
+
+def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(
+    ground: Ground, station: Station, stream: bytes
+) -> None:
+    declare(ground, station.link("reconnect = false"))
+    with operated(ground):
+        connection = station.accept()
+        connection.sendall(stream[: 3 * CADU])
+        connection.close()
+        wait_for(lambda: service.get_link(ground, "lab").state == "failed", "the state")
+        assert service.get_link(ground, "lab").reason == "closed by the station"
+
+
+def test_folders_are_watched_and_telecommands_written(
+    ground: Ground, tmp_path: Path, stream: bytes, expected: str
+) -> None:
+    incoming, outgoing = tmp_path / "in", tmp_path / "out"
+    declare(
+        ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n'
+    )
+    with operated(ground) as runner:
+        wait_for(lambda: "expected a folder" in (service.get_link(ground, "lab").reason or ""), "the reason")
+        incoming.mkdir()
+        outgoing.mkdir()
+        (incoming / "pass.cadu").write_bytes(stream)
+        keys = released(ground, 2)
+        wait_for(lambda: list(outgoing.glob("*.cltu")), "the file")
+        wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
+        assert hash_of(ground) == expected
+    assert [path.name for path in outgoing.iterdir()] == ["lab-00000001.cltu"]
+    assert packets_of((outgoing / "lab-00000001.cltu").read_bytes()) == octets_of(ground, keys)
+    assert contact_events(ground) == ["contact started", "contact ended"]
+
+
+def test_the_file_is_not_read_again_by_the_next_process(
+    ground: Ground, tmp_path: Path, stream: bytes
+) -> None:
+    declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{tmp_path}/in"\n')
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "pass.cadu").write_bytes(stream)
+    with operated(ground) as runner:
+        wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
+    with operated(ground, "another") as runner:
+        time.sleep(1.5)
+        assert runner.octets_received == 0
+
+
+@pytest.mark.parametrize(("share", "missed"), [(1.0, 0), (0.3, 1)])
+def test_a_contact_in_which_another_station_received_is_not_missed(
+    ground: Ground, station: Station, synthetic_pass: Any, share: float, missed: int
+) -> None:
+    from ground_service.missions.ephemerides.service import add_ephemeris
+    from tests.ground_service.conftest import START
+
+    both = station.link('station = "here"') + station.link('station = "here"').replace('"lab"', '"other"')
+    declare(ground, PLACES + both)
+    stored = ground.files.put_file(synthetic_pass.folder / "reference.oem")
+    add_ephemeris(ground, stored, name="reference", precedence=0, actor="ann")
+    lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
+    now = [START - 500 * 10**9]
+    set_mission_clock(lambda: now[0])
+    try:
+        (contact, _) = service.list_contacts(ground, now[0], START + 1000 * 10**9).contacts
+        assert contact.stop is not None
+        start, stop = contact.start.utc_ns, contact.stop.utc_ns
+        assert all(service.acquire(ground, one, "me", 15_000_000_000) for one in (lab, other))
+        now[0] = start
+        row = service.start_contact(ground, other, start)
+        assert row is not None
+        service.end_contact(ground, row.id, "other", start + round(share * (stop - start)))
+        now[0] = stop + service.MARGIN_NS + 2 * 10**9
+        assert service.note_missed(ground, lab, "me", now[0], "nothing was received") == missed
+    finally:
+        set_mission_clock(None)
+
+
+def test_missed_contacts_are_recorded_once_with_the_reason(
+    either: Ground, station: Station, synthetic_pass: Any
+) -> None:
+    from ground_service.missions.ephemerides.service import add_ephemeris
+    from tests.ground_service.conftest import START
+
+    declare(either, PLACES + station.link('station = "here"'))
+    stored = either.files.put_file(synthetic_pass.folder / "reference.oem")
+    add_ephemeris(either, stored, name="reference", precedence=0, actor="ann")
+    declared = service.declared_links(either)["lab"]
+    now = [START - 500 * 10**9]
+    set_mission_clock(lambda: now[0])
+    try:
+        found = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9)
+        assert found.unpredicted == {} and [one.state for one in found.contacts] == ["predicted"]
+        (contact,) = found.contacts
+        assert service.acquire(either, declared, "here", 15_000_000_000)
+        assert contact.stop is not None
+        assert (
+            service.note_missed(either, declared, "here", contact.start.utc_ns, "nothing was received") == 0
+        )
+        after = contact.stop.utc_ns + service.MARGIN_NS + 2 * 10**9
+        assert service.note_missed(either, declared, "other", after, "nothing was received") == 0
+        # looked at every half minute, as a link does, the whole contact counts
+        times = range(contact.start.utc_ns, after + 120 * 10**9, 30 * 10**9)
+        counts = [service.note_missed(either, declared, "here", t, "nothing was received") for t in times]
+        assert sum(counts) == 1 and counts[[t >= after for t in times].index(True)] == 1
+        (missed,) = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9).contacts
+        assert (missed.state, missed.reason) == ("missed", "nothing was received")
+        assert missed.predicted_start is not None and missed.predicted_stop is not None
+        assert missed.predicted_start.utc_ns <= contact.start.utc_ns
+        assert abs(missed.predicted_stop.utc_ns - contact.stop.utc_ns) <= 10**9
+        assert contact_events(either) == ["contact missed"]
+    finally:
+        set_mission_clock(None)
+
+
+PLACES = """[link.stations.here]
+latitude_deg = -20.0
+longitude_deg = 120.0
+minimum_elevation_deg = 0.0
+"""
+
+
+def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground: Ground, station: Station) -> None:
+    declare(ground, station.link())
+    now = mission_now_ns()
+    assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
+        "lab": "the mission description states no place of the station"
+    }
+    declare(ground, PLACES + station.link('station = "here"'))
+    assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
+        "lab": "no reference ephemeris covers the time"
+    }
+
+
+def test_the_lease_is_kept_while_the_link_is_operated(ground: Ground, station: Station) -> None:
+    declare(ground, station.link())
+    with operated(ground):
+        with ground.database.reading() as connection:
+            first = store.find_link(connection, "lab")
+        wait_for(
+            lambda: service.get_link(ground, "lab").owner == "here" and _lease(ground) > first.lease_utc_ns,
+            "a longer lease",
+        )
+    assert service.get_link(ground, "lab").owner is None
+
+
+def _lease(ground: Ground) -> int:
+    with ground.database.reading() as connection:
+        found = store.find_link(connection, "lab")
+    assert found is not None
+    return found.lease_utc_ns
+
+
+class Confirming(Station):
+    """A station that confirms transmissions: `answers` are given first (None: the connection is closed)."""
+
+    def __init__(self, *answers: int | None) -> None:
+        self.answers = list(answers)
+        self.transmissions: list[tuple[int, bytes]] = []
+        super().__init__()
+
+    def _read(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while head := connection.recv(TRANSMISSION.size, socket.MSG_WAITALL):
+                number, length = TRANSMISSION.unpack(head)
+                self.transmissions.append((number, connection.recv(length, socket.MSG_WAITALL)))
+                answer = self.answers.pop(0) if self.answers else number
+                if answer is None:
+                    connection.shutdown(socket.SHUT_RDWR)
+                    return
+                connection.sendall(ACKNOWLEDGEMENT.pack(answer))
+
+
+@pytest.mark.parametrize("answer", [0, 5, None])
+def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(
+    either: Ground, stream: bytes, answer: int | None
+) -> None:
+    station = Confirming(answer, answer)
+    try:
+        declare(either, station.link("confirm = true").replace("silence_s = 1.0", "silence_s = 60.0"))
+        keys = released(either, 2)
+        with operated(either) as runner:
+            station.accept().sendall(stream[: 2 * CADU])
+            wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
+        numbers, octets = zip(*station.transmissions, strict=True)
+        assert len(numbers) == 3 and len(set(numbers)) == 1 and numbers[0] > 0
+        assert packets_of(octets[-1]) == octets_of(either, keys)
+    finally:
+        station.close()
+
+
+def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
+    either: Ground, stream: bytes
+) -> None:
+    """At a handover the link of the first station does not know yet that its contact has ended."""
+    first, second = Confirming(*[0] * 1000), Confirming()
+    try:
+        declare(
+            either,
+            first.link("confirm = true")
+            + second.link("confirm = true")
+            .replace('"lab"', '"other"')
+            .replace("silence_s = 1.0", "silence_s = 60.0"),
+        )
+        declared = service.declared_links(either)["other"]
+        assert service.acquire(either, declared, "there", 15_000_000_000)
+        other = LinkRunner(either, declared, "there")
+        with operated(either) as runner:
+            other.start()
+            try:
+                first.accept().sendall(stream[: 2 * CADU])
+                wait_for(lambda: service.find_open_contact(either, "lab"), "the first contact")
+                keys = released(either, 2)
+                wait_for(lambda: first.transmissions, "the refused transmission")
+                # Also when its contact has ended, the station is asked.
+                wait_for(
+                    lambda: service.find_open_contact(either, "lab") is None, "the end of the first contact"
+                )
+                assert not second.transmissions and runner.commands_unsent == 2
+                second.accept().sendall(stream[2 * CADU : 4 * CADU])
+                wait_for(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
+            finally:
+                other.stop()
+        ((_, octets),) = second.transmissions
+        assert packets_of(octets) == octets_of(either, keys)
+        assert len({number for number, _ in first.transmissions + second.transmissions}) == 1
+        with either.database.reading() as connection:
+            query = select(repository.AUDIT.c.detail).where(
+                repository.AUDIT.c.action == "hand over transmission"
+            )
+            (detail,) = connection.execute(query).scalars()
+        assert detail == {"telecommands": keys, "from": "lab", "to": "other"}
+    finally:
+        first.close()
+        second.close()
+
+
+def held_elsewhere(ground: Ground, station: Station) -> tuple[TransmissionRow, list[int], list[int]]:
+    """Telecommands that the link "other" has taken and not sent, and later ones that any link may take."""
+    declare(
+        ground,
+        station.link("confirm = true").replace("silence_s = 1.0", "silence_s = 60.0")
+        + station.link("confirm = true").replace('"lab"', '"other"'),
+    )
+    other = service.declared_links(ground)["other"]
+    assert service.acquire(ground, other, "there", 15_000_000_000)
+    earlier = released(ground, 2)
+    (transmission,) = service.take_transmissions(ground, other, "there")
+    return transmission, earlier, released(ground, 2)
+
+
+def test_telecommands_do_not_overtake_those_that_another_link_has(either: Ground, stream: bytes) -> None:
+    """At a handover the payload would refuse the overtaken ones as out of sequence."""
+    station = Confirming()
+    try:
+        transmission, earlier, later = held_elsewhere(either, station)
+        with operated(either) as runner:
+            station.accept().sendall(stream[: 2 * CADU])
+            wait_for(lambda: runner.waits_for_others, "telecommands that wait")
+            assert not station.transmissions
+            other = service.declared_links(either)["other"]
+            assert service.hand_over(either, other, transmission) == "lab"
+            wait_for(lambda: runner.commands_unsent == 0, "both transmissions")
+            assert not runner.waits_for_others
+        assert [packets_of(octets) for _, octets in station.transmissions] == [
+            octets_of(either, earlier),
+            octets_of(either, later),
+        ]
+    finally:
+        station.close()
+
+
+def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
+    either: Ground, stream: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ground_service.contacts.links.runner.TURN_S", 0.0)
+    log = MagicMock()
+    monkeypatch.setattr("ground_service.contacts.links.runner.log", log)
+    station = Confirming()
+    try:
+        transmission, _, later = held_elsewhere(either, station)
+        with operated(either) as runner:
+            station.accept().sendall(stream[: 2 * CADU])
+            wait_for(lambda: runner.commands_unsent == 0, "the later telecommands")
+        assert [packets_of(octets) for _, octets in station.transmissions] == [octets_of(either, later)]
+        assert [one.id for one in service.pending_transmissions(either, "other")] == [transmission.id]
+        assert log.warning.call_args.args[1:] == ("lab", later, "other")
+    finally:
+        station.close()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ('format = "packets"', ""),
+        ('send = "manual"', ""),
+        ('instance = "twin"', ""),
+        ("", "released"),
+        ("", "ended"),
+    ],
+)
+def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
+    either: Ground, station: Station, change: tuple[str, str]
+) -> None:
+    section, event = change
+    declare(either, station.link() + station.link(section).replace('"lab"', '"other"'))
+    lab, other = (service.declared_links(either)[name] for name in ("lab", "other"))
+    released(either)
+    for one in (lab, other):
+        assert service.acquire(either, one, "here", 15_000_000_000)
+        assert service.start_contact(either, one, utc_now_ns()) is not None
+    (transmission,) = service.take_transmissions(either, lab, "here")
+    if event == "released":
+        service.release(either, "other", "here")
+    elif event == "ended":
+        contact = service.find_open_contact(either, "other")
+        assert contact is not None
+        service.end_contact(either, contact.id, "other", utc_now_ns())
+    assert service.hand_over(either, lab, transmission) is None
+    assert [one.id for one in service.pending_transmissions(either, "lab")] == [transmission.id]
+
+
+def test_the_next_owner_knows_when_a_contact_was_heard_last(
+    either: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mission time may stand still then: counted from the start of the process, the silence would never end."""
+    declare(either, station.link())
+    now = [utc_now_ns()]
+    set_mission_clock(lambda: now[0])
+    try:
+        with operated(either) as runner:
+            station.accept().sendall(stream)
+            wait_for(lambda: runner.octets_received == len(stream), "all octets")
+        assert service.find_open_contact(either, "lab") is not None
+        now[0] += 2_000_000_000
+        assert service.silent_contacts(either) == ["lab"]
+        with operated(either, "next"):
+            station.accept()
+            wait_for(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
+        assert service.silent_contacts(either) == []
+    finally:
+        set_mission_clock()

@@ -1,0 +1,318 @@
+"""Correlations follow the time reports and their receptions, whatever comes first, and once only."""
+
+import itertools
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import text
+
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.ephemerides.service import add_ephemeris
+from ground_service.missions.timekeeping import recorrelation
+from ground_service.missions.timekeeping.model import Correlation
+from ground_service.missions.timekeeping.recorrelation import (
+    ReceivedReport,
+    enter_receptions,
+    in_force,
+    read_receptions,
+    recorrelate,
+    residuals,
+)
+from ground_service.missions.timekeeping.service import (
+    TimePoint,
+    correlate,
+    correlate_again,
+    correlations_on_record,
+)
+from ground_service.passes.service import define_pass, list_events
+from ground_service.worker.follow_up import follow_in_process
+from ground_service.worker.integrity import verify
+from linna.cli import run
+from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
+from lunar.ephemeris import ephemeris_from_states
+from lunar.messages.oem import save_oem
+from lunar.third_bodies import earth_position_icrf_m
+from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+from tmtc.packets import PacketSequencer
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T06:00:00Z")
+SPACECRAFT = 76
+REPORTS = 30
+DRIFT = 3e-6  # the clock runs fast
+BOOT_AFTER = 15
+OFFSETS_S = (0.25, -1.5)  # of the clock, before and after the boot
+LIGHT_S = 1.25
+
+
+def clock(utc_ns: int, number: int) -> int:
+    off_s = OFFSETS_S[number >= BOOT_AFTER] + DRIFT * (utc_ns - START) / NS
+    return int(ticks_from_utc_ns(utc_ns)) + round(off_s * 65_536)
+
+
+class Spacecraft:
+    """A minute from one time report to the next, a boot in the middle, with housekeeping that tells of it."""
+
+    def __init__(self) -> None:
+        sequencer = PacketSequencer()
+        housekeeping: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
+        self.sent = [START + k * 60 * NS for k in range(REPORTS)]
+        self.packets: list[bytes] = []
+        self.reports: list[ReceivedReport] = []
+        for k, utc_ns in enumerate(self.sent):
+            ticks = clock(utc_ns, k)
+            boot = {**housekeeping, "boot_count": 7 + (k >= BOOT_AFTER)}
+            values: dict[str, dict[str, Any]] = {
+                "housekeeping": boot,
+                "time_report": {"reported_ticks": ticks, "rate_exponent": 4},
+                "event_info": {"event_id": 3, "frame_number": k, "value_1": 0.0, "value_2": 0.0},
+            }
+            for name, one in values.items():
+                apid = DICTIONARY.packet(name).apid
+                count = sequencer.next(apid)
+                # Housekeeping a little before, so that a run of the clock begins with it.
+                at = ticks - 6553 if name == "housekeeping" else ticks
+                self.packets.append(DICTIONARY.pack(name, one, ticks=at, sequence_count=count))
+                if name == "time_report":
+                    received = utc_ns + round(LIGHT_S * NS)
+                    self.reports.append(ReceivedReport(ticks, count, received))
+
+    def downlink(self, first: int = 0, last: int = REPORTS) -> bytes:
+        return encode_cadus(self.packets[3 * first : 3 * last], spacecraft_id=SPACECRAFT)
+
+
+@pytest.fixture(scope="module")
+def spacecraft() -> Spacecraft:
+    return Spacecraft()
+
+
+@pytest.fixture(autouse=True)
+def fixed_light_time(monkeypatch: Any) -> None:
+    monkeypatch.setattr(
+        recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS))
+    )
+
+
+def ingest(ground: Ground, folder: Path, octets: bytes, name: str = "d.cadu") -> int:
+    (folder / name).write_bytes(octets)
+    vehicle = ingest_file(ground, folder / name).vehicle_id
+    assert vehicle is not None
+    return vehicle
+
+
+def receive(ground: Ground, reports: list[ReceivedReport]) -> list[Correlation]:
+    return enter_receptions(ground, SPACECRAFT, "flight", reports, actor="ann")
+
+
+def content(rows: list[Correlation]) -> list[dict[str, Any]]:
+    return [row.model_dump(exclude={"id", "created"}) for row in rows]
+
+
+def test_every_boot_gets_its_line_and_every_derived_time_names_it(
+    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
+) -> None:
+    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    rows = receive(ground, spacecraft.reports)
+    assert [row.boot_count for row in rows] == [7, 8]
+    assert [row.points for row in rows] == [15, 15]
+    for row in rows:
+        assert row.drift_ppb == pytest.approx(-3000.0, abs=20.0)  # a tick (15 us) over 14 minutes is 18 ppb
+        assert row.residual_rms_ns < 15_259
+    key = define_pass(
+        ground,
+        name="p",
+        start_utc_ns=START - 60 * NS,
+        stop_utc_ns=START + REPORTS * 60 * NS,
+        spacecraft_id=SPACECRAFT,
+    )
+    found = list_events(ground, key, Paging(limit=1000)).items
+    np.testing.assert_allclose([event.time.utc_ns for event in found], spacecraft.sent, atol=20_000)
+    assert [event.correlation_id for event in found] == [rows[0].id] * 15 + [rows[1].id] * 15
+    left = residuals(ground, vehicle)
+    assert len(left) == REPORTS
+    assert max(abs(one.residual_ns) for one in left) < 20_000
+
+
+def test_the_order_of_telemetry_and_receptions_does_not_matter(
+    spacecraft: Spacecraft, tmp_path: Path
+) -> None:
+    cut = spacecraft.downlink(0, 12), spacecraft.downlink(12, 20), spacecraft.downlink(20)
+    found = []
+    for number, seed in enumerate(range(4)):
+        rng = random.Random(seed)
+        with open_ground(tmp_path / f"home{number}") as ground:
+            follow_in_process(ground)
+            steps: list[tuple[str, Any]] = [("file", octets) for octets in cut]
+            steps += [("times", spacecraft.reports[k : k + 11]) for k in range(0, REPORTS, 10)]
+            rng.shuffle(steps)
+            steps += rng.sample(steps, 2)
+            for k, (kind, what) in enumerate(steps):
+                if kind == "file":
+                    vehicle = ingest(ground, tmp_path, what, f"{number}-{k}.cadu")
+                else:
+                    receive(ground, what)
+            found.append(content(in_force(ground, vehicle)))
+            on_record = len(correlations_on_record(ground, vehicle))
+            assert not recorrelate(ground, vehicle)
+            assert len(correlations_on_record(ground, vehicle)) == on_record
+    assert all(one == found[0] for one in found)
+    assert len(found[0]) == 2
+
+
+def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> None:
+    from ground_service.missions.timekeeping.core import clock_runs, fit_correlation
+
+    sent = START + np.arange(20, dtype=np.int64) * 60 * NS
+    ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64)
+    none = np.zeros(20, dtype=np.int64)
+    wild = ticks.copy()
+    wild[8] += 5 * 65_536
+    (run_,) = clock_runs(wild, sent, none, none)
+    fit = fit_correlation(wild[run_], sent[run_], none)
+    assert (fit.points, fit.rejected, fit.drift_ppb) == (19, 1, 0.0)
+    runs = clock_runs(np.where(np.arange(20) < 8, ticks, ticks + 3 * 65_536), sent, none, none)
+    assert [len(one) for one in runs] == [8, 12]
+
+
+def test_a_drift_within_the_resolution_of_the_clock_is_none() -> None:
+    from ground_service.missions.timekeeping.core import fit_correlation
+
+    sent = START + np.arange(4, dtype=np.int64) * NS
+    ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64) + np.array([0, 0, 1, 1])
+    fit = fit_correlation(ticks, sent, np.zeros(4, dtype=np.int64))
+    assert fit.drift_ppb == 0.0
+
+
+def test_what_an_operator_entered_stays_until_asked_otherwise(
+    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
+) -> None:
+    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
+    assert [row.points for row in receive(ground, spacecraft.reports)] == [1]
+    assert len(correlate_again(ground, SPACECRAFT, "flight", actor="ann")) == 2
+
+
+def test_an_earlier_reception_of_the_same_report_counts(
+    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
+) -> None:
+    ingest(ground, tmp_path, spacecraft.downlink())
+    played_back = [
+        ReceivedReport(one.ticks, one.sequence_count, one.earth_utc_ns + 3600 * NS)
+        for one in spacecraft.reports
+    ]
+    for order in itertools.permutations([spacecraft.reports, played_back]):
+        for reports in order:
+            rows = receive(ground, reports)
+    assert [row.reference_utc_ns for row in rows] == pytest.approx(
+        [spacecraft.sent[7], spacecraft.sent[22]], abs=20_000
+    )
+
+
+def test_a_new_reference_ephemeris_gives_new_light_times(
+    ground: Ground, spacecraft: Spacecraft, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.undo()
+    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    receive(ground, spacecraft.reports)
+    times = START + np.arange(-10, REPORTS + 10, dtype=np.int64) * 60 * NS
+    earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(times))))
+    distance = np.linalg.norm(earth, axis=1, keepdims=True)
+    far_side = -earth / distance * 3.0 * MOON_RADIUS_M
+    before = [one.light_time_s for one in residuals(ground, vehicle)]
+    save_oem(ephemeris_from_states(times, far_side, np.zeros_like(far_side)), tmp_path / "far.oem")
+    add_ephemeris(ground, ground.files.put_file(tmp_path / "far.oem"), name="far")
+    after = [one.light_time_s for one in residuals(ground, vehicle)]
+    # From the Moon's centre to three radii behind it, as seen from the Earth.
+    np.testing.assert_allclose(np.array(after) - before, 3.0 * MOON_RADIUS_M / SPEED_OF_LIGHT_M_S, atol=1e-5)
+    assert len(in_force(ground, vehicle)) == 2
+    assert len(correlations_on_record(ground, vehicle)) == 4
+
+
+def test_an_operator_correlates_from_a_file(
+    spacecraft: Spacecraft, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home = ["--home", str(tmp_path / "home"), "--json"]
+    who = ["--spacecraft-id", str(SPACECRAFT)]
+    (tmp_path / "d.cadu").write_bytes(spacecraft.downlink())
+    lines = [f"{r.ticks},{r.sequence_count},{format_utc(r.earth_utc_ns)}," for r in spacecraft.reports]
+    table = tmp_path / "times.csv"
+    table.write_text("\n".join(["packet_ticks,sequence_count,received_utc,station", *lines]) + "\n")
+
+    def linna(*words: str) -> Any:
+        assert run([*words, *home]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    linna("ingest", str(tmp_path / "d.cadu"))
+    made = linna("correlate", "receptions", str(table), *who)["correlations"]
+    assert (
+        made
+        == linna("correlate", "list", *who)["correlations"]
+        == linna("correlate", "run", *who)["correlations"]
+    )
+    assert len(linna("correlate", "residuals", *who)["time_reports"]) == REPORTS
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "line 1: expected a column packet_ticks, found a,b"),
+        ("packet_ticks,sequence_count,received_utc\n1,2,then\n", "receptions.0"),
+        ("packet_ticks,sequence_count,received_utc\n1,99999,2029-08-07T06:00:00Z\n", "14 bits of count"),
+        ("packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\n", "Canberra"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InvalidInput, match=message):
+        read_receptions(tmp_path / "t.csv")
+
+
+def test_telemetry_without_receptions_leaves_the_clock_ideal(
+    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
+) -> None:
+    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    assert in_force(ground, vehicle) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "kinds"),
+    [
+        ("reference_utc_ns = reference_utc_ns + 900", set()),  # rounding
+        ("reference_utc_ns = reference_utc_ns + 1100", {"correlations"}),
+        ("drift_ppb = drift_ppb + 5", {"correlations"}),
+        ("superseded = 1", {"correlations"}),
+        ("method = 'entered'", set()),
+    ],
+)
+def test_verification_fits_the_correlations_again(
+    either: Ground, tmp_path: Path, spacecraft: Spacecraft, changes: str, kinds: set[str]
+) -> None:
+    ingest(either, tmp_path, spacecraft.downlink())
+    receive(either, spacecraft.reports)
+    intact = verify(either, rebuild=True)
+    assert (intact.damaged, intact.unchecked, intact.checked["correlations"]) == ([], {}, 2)
+    with either.database.writing() as connection:
+        connection.execute(text(f"UPDATE correlations SET {changes} WHERE boot_count = 8"))
+    found = verify(either, rebuild=True)
+    assert {one.kind for one in found.damaged} == kinds
+    assert bool(found.unchecked) == changes.startswith("method")
+
+
+def test_verification_does_not_expect_correlations_before_the_follow_up_work(
+    either: Ground, tmp_path: Path, spacecraft: Spacecraft, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receive(either, spacecraft.reports)
+    monkeypatch.setattr(either.database.listeners, "_functions", [])
+    ingest(either, tmp_path, spacecraft.downlink())
+    found = verify(either, rebuild=True)
+    assert found.damaged == []
+    assert found.unchecked == {"vehicles with follow-up work that is not done": 1}

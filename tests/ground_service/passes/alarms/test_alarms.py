@@ -1,0 +1,259 @@
+"""Alarms: raised once for each cause, kept until acknowledged, equal for any order of arrival."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
+from ground_service.clock import set_mission_clock, utc_now_ns
+from ground_service.errors import Conflict, InvalidInput, NotFound
+from ground_service.events import AlarmChanged, read_events
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
+from ground_service.passes.alarms import core
+from ground_service.passes.alarms.model import Alarm, AlarmFilter
+from ground_service.passes.alarms.service import (
+    acknowledge_alarm,
+    examine_packets,
+    get_alarm,
+    list_alarms,
+    shelve_alarm,
+)
+from ground_service.planning.model import WindowEntry
+from ground_service.planning.progress import note_reason
+from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning.service import add_window, change_window
+from ground_service.planning.standing import add_request, plan_tick
+from ground_service.worker.watch import Watch
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+
+SPACECRAFT = 76
+SECOND = 65_536
+START = 1_900_000_000 * SECOND
+
+
+def housekeeping(second: int, temperature_c: float) -> bytes:
+    """A housekeeping packet with one value outside its limits, if that of the temperature is."""
+    values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values |= {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c}
+    return DICTIONARY.pack(
+        "housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384
+    )
+
+
+def event(second: int, name: str = "event_high", event_id: int = 20) -> bytes:
+    values = {"event_id": event_id, "frame_number": second, "value_1": 0.0, "value_2": 0.0}
+    return DICTIONARY.pack(name, values, ticks=START + second * SECOND, sequence_count=second % 16_384)
+
+
+def receive(ground: Ground, folder: Path, packets: list[bytes]) -> None:
+    """Ingest packets as a downlink of the flown spacecraft."""
+    folder.mkdir(exist_ok=True)
+    file = folder / f"{len(list(folder.iterdir()))}.cadu"
+    file.write_bytes(encode_cadus(packets, spacecraft_id=SPACECRAFT))
+    ingest_file(ground, file)
+
+
+def alarms(ground: Ground, *states: str) -> list[Alarm]:
+    return ground.read(list_alarms, AlarmFilter(state=list(states))).items
+
+
+def facts(alarm: Alarm) -> tuple[object, ...]:
+    return (
+        alarm.name,
+        alarm.severity,
+        alarm.count,
+        alarm.active,
+        alarm.state,
+        alarm.value,
+        alarm.first,
+        alarm.last,
+    )
+
+
+def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(
+    either: Ground, tmp_path: Path
+) -> None:
+    receive(either, tmp_path / "in", [event(k) for k in range(82)])
+    receive(either, tmp_path / "in", [housekeeping(k, 20.0) for k in range(200, 240)])
+    (alarm,) = alarms(either)
+    assert (alarm.name, alarm.count, alarm.severity, alarm.state) == ("camera_fault", 82, "alarm", "raised")
+    assert not alarm.active
+    done = acknowledge_alarm(either, alarm.id, "camera restarted", actor="eva")
+    assert (done.state, done.acknowledged_by) == ("cleared", "eva")
+    assert [one.change for one in done.history] == ["raised", "acknowledged", "cleared"]
+    assert done.history[1].comment == "camera restarted"
+    assert either.read(list_audit, AuditFilter()).items[0].action == "acknowledge alarm"
+
+
+def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(
+    either: Ground, tmp_path: Path
+) -> None:
+    receive(either, tmp_path / "in", [housekeeping(k, 70.0 + k) for k in range(5)])
+    (alarm,) = alarms(either, "raised")
+    assert (alarm.name, alarm.severity, alarm.count, alarm.value) == ("temperature_c", "warning", 5, 74.0)
+    assert (alarm.active, alarm.limits, alarm.unit) == (True, "-20 to 60", "degC")
+    assert acknowledge_alarm(either, alarm.id, "", actor="eva").state == "acknowledged"
+    receive(either, tmp_path / "in", [housekeeping(10, 20.0)])
+    assert either.read(get_alarm, alarm.id).state == "cleared"
+    receive(either, tmp_path / "in", [housekeeping(20, 65.0)])
+    assert [(one.state, one.count) for one in alarms(either)] == [("raised", 1), ("cleared", 5)]
+
+
+def test_a_worse_condition_must_be_acknowledged_again(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path / "in", [housekeeping(0, 70.0)])
+    (alarm,) = alarms(ground)
+    acknowledge_alarm(ground, alarm.id, "", actor="eva")
+    receive(ground, tmp_path / "in", [housekeeping(1, 75.0)])
+    assert ground.read(get_alarm, alarm.id).state == "acknowledged"
+    receive(ground, tmp_path / "in", [housekeeping(2, 90.0)])
+    found = ground.read(get_alarm, alarm.id)
+    assert (found.state, found.severity) == ("raised", "alarm")
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_an_alarm_does_not_depend_on_the_order_of_arrival(
+    ground: Ground, tmp_path: Path, order: tuple[int, ...]
+) -> None:
+    parts = [
+        [housekeeping(0, 70.0), event(1)],
+        [housekeeping(10, 95.0), event(11), event(12, "event_medium")],
+        [housekeeping(20, 61.0)],
+    ]
+    for part in order:
+        receive(ground, tmp_path / "in", parts[part])
+    found = sorted(facts(one)[:6] for one in alarms(ground))
+    assert found == [
+        ("camera_fault", "alarm", 3, False, "raised", None),
+        ("temperature_c", "alarm", 3, True, "raised", 61.0),
+    ]
+
+
+def test_packets_that_arrive_again_are_not_counted_again(ground: Ground, tmp_path: Path) -> None:
+    packets = [event(k) for k in range(4)]
+    receive(ground, tmp_path / "in", packets)
+    receive(ground, tmp_path / "in", [*packets, event(4)])
+    assert [one.count for one in alarms(ground)] == [5]
+    with ground.database.reading() as connection:
+        vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
+    assert examine_packets(ground, vehicle) == 0
+
+
+def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path / "in", [event(10)])
+    acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
+    receive(ground, tmp_path / "in", [event(5)])
+    assert [(one.state, one.count) for one in alarms(ground)] == [("cleared", 2)]
+    receive(ground, tmp_path / "in", [event(20)])
+    assert [(one.state, one.count) for one in alarms(ground)] == [("raised", 1), ("cleared", 2)]
+
+
+def test_an_alarm_is_acknowledged_by_one_user(either: Ground, tmp_path: Path) -> None:
+    receive(either, tmp_path / "in", [housekeeping(0, 70.0)])
+    (alarm,) = alarms(either)
+    acknowledge_alarm(either, alarm.id, "", actor="eva")
+    with pytest.raises(Conflict, match=f"alarm {alarm.id}: expected state raised, found acknowledged by eva"):
+        acknowledge_alarm(either, alarm.id, "", actor="max")
+    with pytest.raises(NotFound):
+        acknowledge_alarm(either, alarm.id + 1, "", actor="max")
+
+
+def test_a_shelved_alarm_returns_at_its_time(either: Ground, tmp_path: Path) -> None:
+    receive(either, tmp_path / "in", [event(0)])
+    (alarm,) = alarms(either)
+    now = utc_now_ns()
+    hour = 3600 * 10**9
+    shelved = shelve_alarm(either, alarm.id, now + hour, "known fault", actor="eva")
+    assert (shelved.state, shelved.shelved_by) == ("shelved", "eva")
+    assert alarms(either, "raised") == [] and len(alarms(either, "shelved")) == 1
+    ended = shelve_alarm(either, alarm.id, now - hour, "", actor="eva")
+    assert ended.state == "raised" and len(alarms(either, "raised")) == 1
+    with pytest.raises(InvalidInput, match="expected a time within 30 days"):
+        shelve_alarm(either, alarm.id, now + 31 * 24 * hour, "", actor="eva")
+    acknowledge_alarm(either, alarm.id, "", actor="eva")
+    with pytest.raises(Conflict, match="expected an open alarm, found cleared"):
+        shelve_alarm(either, alarm.id, now + hour, "", actor="eva")
+
+
+def test_changes_are_published(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path / "in", [event(0)])
+    acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
+    found = [AlarmChanged.of(one) for one in read_events(ground.database, 0) if one.kind == "alarm"]
+    assert [one.state for one in found] == ["raised", "cleared"]
+
+
+def test_the_end_and_the_return_of_a_condition_are_published(ground: Ground, tmp_path: Path) -> None:
+    for second, value in enumerate((70.0, 71.0, 20.0, 21.0, 72.0)):
+        receive(ground, tmp_path / "in", [housekeeping(second, value)])
+    found = [AlarmChanged.of(one) for one in read_events(ground.database, 0) if one.kind == "alarm"]
+    assert [one.state for one in found] == ["raised", "condition ended", "condition returned"]
+
+
+def test_events_of_low_severity_raise_no_alarm(ground: Ground, tmp_path: Path) -> None:
+    receive(
+        ground, tmp_path / "in", [event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0)]
+    )
+    assert alarms(ground) == []
+
+
+def condition(ticks: int, severity: int, value: float) -> core.Condition:
+    return core.Condition("parameter", "temperature_c", severity, ticks, ticks, 1, value)
+
+
+@given(
+    st.lists(
+        st.builds(condition, st.integers(0, 5), st.sampled_from([1, 2]), st.floats(-90, 90)),
+        min_size=3,
+        max_size=6,
+    ),
+    st.randoms(),
+)
+def test_conditions_are_joined_in_any_order(conditions: list[core.Condition], random: Any) -> None:
+    def whole(parts: list[core.Condition]) -> core.Condition:
+        result = parts[0]
+        for one in parts[1:]:
+            result = core.joined(result, one)
+        return result
+
+    shuffled = random.sample(conditions, len(conditions))
+    assert whole(conditions) == whole(shuffled)
+
+
+def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None:
+    text = (
+        'name = "stopped"\n[spacecraft]\nid = 76\n[uploads]\n[[links]]\nname = "lab"\nkind = "tcp"\n'
+        'uplink = "127.0.0.1:9"\n'
+    )
+    moment = START // SECOND * 10**9
+    set_mission_clock(lambda: moment)
+    try:
+        with open_ground(tmp_path) as ground:
+            add_mission(ground, text.encode())
+            add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
+            entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
+            window = add_window(ground, entry, actor="planner").id
+            change_window(ground, window, actor="planner", changes={}, decision="approved")
+            note_reason(ground, window, "cannot be released")
+            plan_tick(ground, moment)
+            watch = Watch(ground, holds_s=0.0)
+            watch.tick()
+            names = {"no_link", "window_not_released", "plan_empty"}
+            assert {one.name for one in alarms(ground, "raised")} == names
+            watch.tick()  # no time has passed since
+            assert {one.name for one in alarms(ground, "raised")} == {*names, "mission_time_stopped"}
+            assert {(one.source, one.severity) for one in alarms(ground)} == {("operations", "alarm")}
+            moment += 10**9
+            watch.tick()
+            [ended] = [one for one in alarms(ground) if not one.active]
+            assert ended.name == "mission_time_stopped"
+            Watch(ground).tick()  # nothing has lasted for long
+            assert not any(one.active for one in alarms(ground))
+    finally:
+        set_mission_clock()
