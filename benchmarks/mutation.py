@@ -171,8 +171,8 @@ GROUPS = {
             f"{_FLIGHT}/onboard/commanding.py",
         ),
         (
-            f"{_GROUND_TESTS}/commanding/test_commanding.py",
-            f"{_GROUND_TESTS}/commanding/test_verification.py",
+            f"{_GROUND_TESTS}/contacts/commanding/test_commanding.py",
+            f"{_GROUND_TESTS}/contacts/commanding/test_verification.py",
             f"{_FLIGHT_TESTS}/test_commanding.py",
         ),
     ),
