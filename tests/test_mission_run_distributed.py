@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import socket
 import sys
 import threading
@@ -41,11 +40,6 @@ KILLED = (
 )
 
 
-def needs_servers() -> None:
-    if not shutil.which("redis-server") or not list(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
-        pytest.skip("PostgreSQL or Redis is not installed")
-
-
 def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the ground wait for the stations of a spacecraft that is killed meanwhile."""
     was_restarted = threading.Event()
@@ -62,7 +56,6 @@ def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.Monkey
 @pytest.mark.campaign
 @pytest.mark.timeout(900)
 def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    needs_servers()
     monkeypatch.delenv("LINNA_DATA", raising=False)
     scenario, data = parse_scenario(SCENARIO), DataFolder(None)
     terms = RunTerms(days=0.25, windows_per_day=4, window_s=600.0)
@@ -257,7 +250,6 @@ def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path: 
 
 
 def test_a_database_server_continues_with_its_files(tmp_path: Path) -> None:
-    needs_servers()
     first = PostgresServer(tmp_path)
     url = first.prepare_service()
     assert "//service@" in url

@@ -51,7 +51,6 @@ PAPER_DRIFT_PER_FRAME_M = 400.0
 SPHERICAL_ERROR_RTN_M = np.array([30.0, -40.0, 120.0])  # 130 m in 3-D
 FILTER_ERROR_RTN_M = np.array([10.0, 20.0, -20.0])  # 30 m in 3-D
 PIXEL_OFFSET = (0.5, -1.25)
-FALSE_ALARMS_PER_FRAME = 1
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -263,19 +263,23 @@ def _exact_gate(
             told = f"the candidate needs {now:.0f} MiB, the baseline {then:.0f} MiB"
         return Gate(MEMORY, outcome, then, now, rule.margin, limit, "MiB", frames=frames, reason=told)
     found = {name: counts(before[name], after[name])[rule.metric] for name in before}
+    found = {name: one for name, one in found.items() if math.isfinite(one.baseline + one.candidate)}
     then, now = sum(one.baseline for one in found.values()), sum(one.candidate for one in found.values())
+    if not found:
+        then = now = math.nan
     tolerated = rule.margin * frames if rule.metric == WRONG_FIXES else rule.margin
-    worst = max(found, key=lambda name: found[name].candidate - found[name].baseline)
+    worst = max(found, key=lambda name: found[name].candidate - found[name].baseline, default="")
     failed = now > then + tolerated
     unit = "packets" if rule.metric in (UNDECODABLE, TIMES) else "frames"
     more = sum(one.candidate > one.baseline for one in found.values()) - 1
     told = (
         f"{worst}: {found[worst].text}" + (f" (and {more} further passes)" if more else "") if failed else ""
     )
+    if not found:
+        told = "it is unknown without a reference"
     limit = then + tolerated
-    return Gate(
-        rule.metric, FAIL if failed else PASS, then, now, tolerated, limit, unit, frames=frames, reason=told
-    )
+    outcome = FAIL if failed else PASS if found else NOT_JUDGED
+    return Gate(rule.metric, outcome, then, now, tolerated, limit, unit, frames=frames, reason=told)
 
 
 def _sums(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ DELAY_TOLERANCE_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Number of faulty items of both builds on a pass; `text` states those of the candidate."""
+    """Number of faulty items of both builds on a pass, NaN where unknown; `text` states those of the candidate."""
 
     baseline: float
     candidate: float
@@ -100,7 +101,9 @@ def _frames(before: PassFrames, after: PassFrames) -> Count:
 
 
 def _wrong_fixes(before: PassFrames, after: PassFrames) -> Count:
-    sums = [
-        sum(float(np.nansum(one.wrong)) for one in frames.estimators.values()) for frames in (before, after)
-    ]
+    """Count the wrong fixes; NaN without a reference, which alone shows whether a fix is wrong."""
+    sums = []
+    for frames in (before, after):
+        wrong = np.concatenate([*(one.wrong for one in frames.estimators.values()), np.zeros(0)])
+        sums.append(float(np.nansum(wrong)) if np.isfinite(wrong).any() else math.nan)
     return Count(sums[0], sums[1], f"{sums[1]:.0f} fixes are wrong, against {sums[0]:.0f} of the baseline")

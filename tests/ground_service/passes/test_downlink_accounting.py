@@ -22,7 +22,6 @@ def stream(start_ticks: int, packets: int) -> bytes:
     return encode_cadus([event(start_ticks + (k << 16), k) for k in range(packets)], spacecraft_id=SPACECRAFT)
 
 
-LENGTH = len(event(0, 0))
 FIRST, SECOND = stream(10 * HOUR, 300), stream(20 * HOUR, 90)
 """Two passes; an event is 39 octets or so, a frame holds 28 of them."""
 

@@ -306,6 +306,15 @@ def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name: str, fault: Any
     assert name not in failed(judge(after, after, POLICY))
 
 
+def test_wrong_fixes_are_not_judged_without_a_reference() -> None:
+    """NaN: nobody knows whether a fix is wrong."""
+    before = suite(1, passes=1)
+    anchored = before["pass 0"].estimators["anchored"]
+    unknown = {"anchored": replace(anchored, wrong=np.full(FRAMES, np.nan))}
+    gates = judge(before, {"pass 0": replace(before["pass 0"], estimators=unknown)}, POLICY)
+    assert by_name(gates)["navigation.wrong_fixes"].outcome == "not judged"
+
+
 def test_exact_gates_tolerate_what_the_policy_says() -> None:
     before = suite(0, 1)
     # One in a hundred of 49 frames is none; a quarter of 250 MiB is 312.5.

@@ -1,14 +1,12 @@
 """Every page with and without data: layout, barriers, keyboard; the campaign takes every width, scheme and font.
 
 LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `make page-table`.
-LINNA_PAGE_PICTURES=FOLDER keeps a picture of each page, light and dark, at each width.
 """
 
 from __future__ import annotations
 
 import itertools
 import os
-import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -207,7 +205,7 @@ class Faults:
         self.keyboard: list[str] = []
         self.unmarked: list[str] = []
 
-    def find(self, page: Page, name: str, looks: Looks) -> None:
+    def find(self, page: Page, looks: Looks) -> None:
         """Look at an opened page in some forms: scheme, font and width."""
         page.evaluate(LONG_LOG)
         for scheme, font, width in looks:
@@ -219,8 +217,6 @@ class Faults:
             page.evaluate(FRAMES_DRAWN)
             if (wide := page.evaluate(WIDTH)) > width:
                 self.layout.append(f"{scheme}, {font}, {width} px: {wide} px wide")
-            if font == "DejaVu" and (folder := os.environ.get("LINNA_PAGE_PICTURES")):
-                page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png", full_page=True)
             if font == "Arial" and width in AXE_WIDTHS:
                 self.barriers += [f"{scheme}, {width} px: {one}" for one in barriers(page)]
         for width in (1280, 390) if looks == EVERY_LOOK else (390,):
@@ -272,11 +268,6 @@ def record(rows: list[str], path: str, state: str, found: Faults) -> None:
     assert {kind: texts for kind, texts in columns.items() if texts} == {}
 
 
-def file_name(path: str, state: str) -> str:
-    """Return a file name for pictures of a page."""
-    return f"{re.sub('[^a-z_]+', '-', path).strip('-') or 'overview'}-{state}"
-
-
 def new_page(context: BrowserContext) -> Page:
     """Return a page that counts its requests."""
     page = context.new_page()
@@ -321,7 +312,7 @@ def test_a_page_with_data_has_no_fault(
     found = Faults(page)
     settled(page, worked.paths.get(path, path))
     answered(page)
-    found.find(page, file_name(path, "with"), looks)
+    found.find(page, looks)
     page.close()
     record(rows, path, "with", found)
 
@@ -335,7 +326,7 @@ def test_a_page_without_data_has_no_fault(
     found = Faults(page)
     settled(page, path)
     answered(page)
-    found.find(page, file_name(path, "without"), looks)
+    found.find(page, looks)
     page.close()
     record(rows, path, "without", found)
 
@@ -348,6 +339,6 @@ def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[s
     expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
     answered(page)
     found = Faults(page)
-    found.find(page, file_name(SIGN_IN, "with"), looks)
+    found.find(page, looks)
     context.close()
     record(rows, SIGN_IN, "with", found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_told_so(
     new_postgres_database: Callable[[], str], tmp_path: Path
 ) -> None:
-    if shutil.which("redis-server") is None:
-        pytest.skip("redis-server is not installed")
     figures = run(tmp_path, new_postgres_database(), races=60, apis=2, seed=3, quiet=True)
     assert {name: figures[name] for name in FAULTS} == dict.fromkeys(FAULTS, 0), figures["examples"]
     assert holds(figures)
