@@ -96,10 +96,8 @@ class CraterCatalogue:
 
     @cached_property
     def position_mcmf_m(self) -> FloatArray:
-        """Return the centres at rim height, (n, 3); on the sphere if the height is unknown."""
-        return mcmf_from_spherical(
-            self.latitude_rad, self.longitude_rad, np.nan_to_num(self.rim_height_m, nan=0.0)
-        )
+        """Return the centres at rim height, (n, 3); NaN if the height is unknown."""
+        return mcmf_from_spherical(self.latitude_rad, self.longitude_rad, self.rim_height_m)
 
     @cached_property
     def size_class(self) -> NDArray[np.int8]:

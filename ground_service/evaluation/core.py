@@ -616,6 +616,11 @@ def _detector(
             reason = _refusal(inputs)
         missing["detector"] = missing["craters"] = reason
         return None, (), (), None
+    unknown = np.count_nonzero(~np.isfinite(inputs.catalogue.rim_height_m))
+    if unknown:
+        remarks.append(
+            f"rim heights unknown for {unknown} of {len(inputs.catalogue)} craters: they are not scored"
+        )
     if "camera sizes" in inputs.refused:
         remarks.append(inputs.refused["camera sizes"])
     track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
@@ -637,6 +642,8 @@ def _detector(
         missing["recall"] = (
             "no usable image came down"
             if not detections.usable.any()
+            else "rim heights unknown"
+            if unknown == len(inputs.catalogue) > 0
             else "the crater catalogue has no complete crater of 5 to 30 km in view"
         )
     chosen, worst = _choose_frames(inputs, expected, matches)

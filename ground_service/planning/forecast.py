@@ -9,7 +9,6 @@ import numpy as np
 
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
-from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
@@ -198,27 +197,23 @@ def _overlaps(windows: Sequence[Window], violations: dict[int, str]) -> list[Win
 
 
 def crater_density(ground: Ground, spacecraft_id: int) -> CraterDensity:
-    """Return the crater density of the catalogue of the mission description in force, otherwise of the public one."""
+    """Return the crater density of the catalogue of the mission description in force."""
     with ground.database.reading() as connection:
-        mission = missions.mission_in_force(connection, spacecraft_id)
+        mission = service.mission_of(connection, spacecraft_id)
     low, high = DENSITY_DIAMETER_KM
     found = CraterDensity(
         source=None,
-        reason="no mission description is in force, and there is no public catalogue",
+        reason=None,
         cell_deg=CELL_DEG,
         diameter_km=Span(min=low, max=high),
         rows=[],
     )
     try:
-        catalogue = (
-            service.public_catalogue(ground.data) if mission is None else catalogue_of(ground, mission)
-        )
+        catalogue = catalogue_of(ground, mission)
     except InvalidInput as error:
         return found.model_copy(update={"reason": str(error)})
-    if catalogue is None:
-        return found
     rows = [list(row) for row in _density(_Counted(catalogue))]
-    return found.model_copy(update={"source": catalogue.source, "reason": None, "rows": rows})
+    return found.model_copy(update={"source": catalogue.source, "rows": rows})
 
 
 class _Counted:

@@ -73,9 +73,6 @@ class WindowSearch(Given):
     latitude_deg: Limits | None = None
     craters_per_frame: Finite | None = Field(default=None, ge=0.0, le=10_000.0, examples=[5.0])
     crater_diameter_km: Limits = Limits(min=5.0, max=30.0)
-    catalogue_pass_id: int | None = Field(
-        default=None, ge=1, le=2**31 - 1, description="Take the crater catalogue of this pass"
-    )
     terrain: Literal["mare", "highland"] | None = None
     sunlit: bool = Field(default=False, description="The spacecraft has to be in full sunlight")
     minimum_duration_s: Finite = Field(default=300.0, ge=0.0, le=86_400.0)

@@ -21,6 +21,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
+from ground_service.missions.catalogues import catalogue_of
 from ground_service.missions.ephemerides import store as ephemerides
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.service import open_ephemeris
@@ -29,7 +30,6 @@ from ground_service.missions.model import Mission
 from ground_service.missions.places import outages_of, stations_of
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
-from ground_service.passes.store import get_pass
 from ground_service.planning import model, store
 from ground_service.planning.core import (
     Candidate,
@@ -56,7 +56,7 @@ from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
-from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
 from lunar.errors import EphemerisCoverageError
@@ -87,15 +87,15 @@ _DECIDABLE = {
 def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     """Search candidate windows over a reference ephemeris.
 
-    Without `ephemeris_id` the ephemeris that covers the start of the span best is used, without `catalogue_pass_id` the
-    available public crater catalogue.
+    Without `ephemeris_id` the ephemeris that covers the start of the span best is used. Craters are those of
+    the catalogue of the mission description in force.
 
     Raises
     ------
     InvalidInput
         If a constraint needs data that are not available, or the span is too long for its step.
     NotFound
-        If there is no such ephemeris or pass.
+        If there is no such ephemeris.
     """
     start = None if given.start is None else given.start.utc_ns
     stop = None if given.stop is None else given.stop.utc_ns
@@ -104,19 +104,10 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
         mission = mission_of(connection, given.spacecraft_id)
         constraints = observable(given.constraints(), mission)
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
-        catalogue_sha256 = None
-        if given.catalogue_pass_id is not None:
-            catalogue_sha256 = get_pass(connection, given.catalogue_pass_id).catalogue_sha256
-            if catalogue_sha256 is None:
-                raise InvalidInput("search", "catalogue_pass_id", "a pass with a crater catalogue", "none")
     start = reference.start.utc_ns if start is None else start
     stop = reference.stop.utc_ns if stop is None else stop
     _check_span(start, stop, given.step_s, reference)
-    catalogue = _catalogue(ground, catalogue_sha256) if constraints.craters_per_frame is not None else None
-    if constraints.craters_per_frame is not None and catalogue is None:
-        raise InvalidInput(
-            "search", "craters_per_frame", "a crater catalogue (catalogue_pass_id or public data)", "none"
-        )
+    catalogue = catalogue_of(ground, mission) if constraints.craters_per_frame is not None else None
     mare = _mare(ground.data) if constraints.mare is not None else None
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
@@ -619,19 +610,6 @@ def _check_entry(entry: WindowEntry) -> None:
         raise InvalidInput("window", "stop", "a time after the start", "one before it")
     if duration > 86_400:
         raise InvalidInput("window", "stop", "at most a day after the start", f"{duration:.0f} s")
-
-
-def _catalogue(ground: Ground, sha256: str | None) -> CraterCatalogue | None:
-    if sha256 is not None:
-        return load_catalogue(ground.files.path(sha256))
-    return public_catalogue(ground.data)
-
-
-@functools.lru_cache(maxsize=2)
-def public_catalogue(data: DataFolder) -> CraterCatalogue | None:
-    """Return the crater catalogue among the public data."""
-    path = data.catalogue_composite or data.catalogue_lu
-    return load_catalogue(path) if path is not None else None
 
 
 @functools.lru_cache(maxsize=2)

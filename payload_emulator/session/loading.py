@@ -277,6 +277,7 @@ def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> Catalog
     with np.errstate(invalid="ignore"):
         depth_ratio = catalogue.depth_m / catalogue.diameter_m
     known = np.isfinite(catalogue.rim_height_m) & ~(depth_ratio < _VISIBLE_DEPTH_RATIO)
+    known &= not scenario.has_flat_ground
     chosen = catalogue.select(known)
     navigation = scenario.navigation
     rng = np.random.default_rng((scenario.seed, 2**34))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar.arrays import BoolArray, FloatArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
@@ -172,7 +172,9 @@ def _latitude_limit_deg(world: World) -> float | None:
     camera = world.scenario.camera
     if camera.images == "reduced" or world.external is not None:
         return None
-    highest_m = _ALTITUDE_MARGIN * float(spherical_from_mcmf(_track(world))[2].max())
+    highest_m = _ALTITUDE_MARGIN * float(
+        spherical_from_mcmf(world.truth.positions_mcmf(_track_utc_ns(world)))[2].max()
+    )
     # Central angle of a corner of the image at nadir; without ground there, that of the limb.
     off_nadir = math.atan(
         math.hypot(1.0, camera.height_px / camera.width_px) * math.tan(math.radians(camera.fov_deg / 2.0))
@@ -183,12 +185,11 @@ def _latitude_limit_deg(world: World) -> float | None:
     return math.floor(math.degrees(POLE_LIMIT_RAD - reach))
 
 
-def _track(world: World) -> FloatArray:
-    """Return the positions of the flight so far (n, 3), one a minute."""
-    times = np.arange(
+def _track_utc_ns(world: World) -> IntArray:
+    """Return times of the flight so far (n,), one a minute."""
+    return np.arange(
         world.truth.start_utc_ns, world.truth.stop_utc_ns, round(_TRACK_STEP_S * NS), dtype=np.int64
     )
-    return world.truth.positions_mcmf(times)
 
 
 def _registration(world: World) -> dict[str, float | int]:
@@ -236,8 +237,7 @@ def live_mission_text(
     if operations is None:
         lines = [mission_text(world, data).rstrip()]
     else:
-        step_ns = round(_TRACK_STEP_S * NS)
-        times = np.arange(world.truth.start_utc_ns, world.truth.stop_utc_ns, step_ns, dtype=np.int64)
+        times = _track_utc_ns(world)
         latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
         low_deg, high_deg = scenario.window.latitude_band_deg
         band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]

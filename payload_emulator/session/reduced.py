@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import project_mcmf
-from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
-from lunar.frames import spherical_from_mcmf
+from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.camera import Exposure
@@ -59,21 +58,16 @@ class CatalogueDetector:
 
 
 def craters_in_view(
-    world: World, exposure: Exposure, smallest_px: float, craters: CraterCatalogue | None = None
+    world: World, exposure: Exposure, smallest_px: float
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the craters in an image: index, place (n, 2) and diameter (n,) in pixels.
-
-    Parameters
-    ----------
-    craters
-        Catalogue with rim heights; None uses the catalogue of the terrain, whose heights may be unknown.
-    """
+    """Return the craters in an image: index, place (n, 2) and diameter (n,) in pixels; unknown heights are 0."""
     position = world.truth.positions_mcmf(exposure.utc_ns)[0]
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-    craters, camera = world.terrain.catalogue if craters is None else craters, world.true_camera
+    craters, camera = world.terrain.catalogue, world.true_camera
     reach_m = min(2.5 * altitude * np.tan(camera.fov_rad / 2.0), 0.1 * MOON_RADIUS_M)
     near = craters.near(latitude, longitude, reach_m)
-    points = craters.position_mcmf_m[near]
+    height_m = np.nan_to_num(craters.rim_height_m[near], nan=0.0)
+    points = mcmf_from_spherical(craters.latitude_rad[near], craters.longitude_rad[near], height_m)
     uv = project_mcmf(camera, exposure.camera_from_mcmf, position, points)
     depth_m = (points - position) @ exposure.camera_from_mcmf[2]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -12,7 +12,7 @@ import numpy as np
 from lunar.arrays import BoolArray
 from lunar.catalogue import CraterCatalogue
 from payload_emulator.session.recipe import Box, inside_box
-from payload_emulator.session.world import World
+from payload_emulator.session.world import World, rims_of
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 
 CELL_DEG = 15
@@ -104,19 +104,12 @@ def _covered(terrain: TiledTerrain) -> BoolArray:
 
 
 def observed_craters(world: World, latitude_limit_deg: float = WINDOW_LATITUDE_DEG) -> CraterCatalogue:
-    """Return the craters around the observed boxes, with the heights of their rims where an estimator needs them."""
-    navigation, listed = world.scenario.navigation, world.terrain.catalogue
+    """Return the craters around the observed boxes, with the heights of their rims."""
+    listed = world.terrain.catalogue
     near = [one.widened(CATALOGUE_MARGIN_DEG) for one in observed_boxes(world.terrain, latitude_limit_deg)]
     places = np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad)
-    chosen = np.flatnonzero(
-        np.any([inside_box(one, *places) for one in near], axis=0)
-        & (listed.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km)
-        & (listed.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km)
-    )
-    if world.scenario.camera.images == "reduced" and "anchored" not in navigation.estimators:
-        # Nobody asks for the heights of rims: measuring them means making the ground.
-        return listed.select(chosen)
-    catalogue = world.terrain.measured(chosen)
+    inside = np.any([inside_box(one, *places) for one in near], axis=0)
+    catalogue = rims_of(world, np.flatnonzero(inside))
     world.terrain.release_ground()
     world.terrain.release_thread()
     return catalogue

@@ -337,6 +337,11 @@ class Scenario:
         return any(simulated_instruments()[name].gives_attitude for name in self.instruments)
 
     @property
+    def has_flat_ground(self) -> bool:
+        """Whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
+        return self.camera.images == "reduced" and "anchored" not in self.navigation.estimators
+
+    @property
     def epoch_utc_ns(self) -> int:
         return parse_utc(self.orbit.epoch)
 

@@ -523,13 +523,15 @@ def catalogue_near_track(world: World) -> CraterCatalogue:
         )
         for i in range(latitude.size)
     ]
-    chosen = np.unique(np.concatenate(near))
-    diameter_m = world.terrain.catalogue.diameter_m[chosen]
-    navigation = world.scenario.navigation
-    useful = (diameter_m >= 1e3 * navigation.catalogue_min_diameter_km) & (
-        diameter_m <= 1e3 * navigation.catalogue_max_diameter_km
-    )
-    if world.scenario.camera.images == "reduced" and "anchored" not in navigation.estimators:
-        # Nobody asks for the heights of rims: measuring them means making the ground of the whole track.
-        return world.terrain.catalogue.select(chosen[useful])
-    return world.terrain.measured(chosen[useful])
+    return rims_of(world, np.unique(np.concatenate(near)))
+
+
+def rims_of(world: World, craters: IntArray) -> CraterCatalogue:
+    """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground."""
+    listed, navigation = world.terrain.catalogue, world.scenario.navigation
+    diameter_m = listed.diameter_m[craters]
+    least_km, most_km = navigation.catalogue_min_diameter_km, navigation.catalogue_max_diameter_km
+    useful = craters[(diameter_m >= 1e3 * least_km) & (diameter_m <= 1e3 * most_km)]
+    if world.scenario.has_flat_ground:
+        return replace(listed.select(useful), rim_height_m=np.zeros(len(useful)))
+    return world.terrain.measured(useful)

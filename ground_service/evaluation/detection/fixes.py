@@ -56,11 +56,15 @@ class Pairs:
 def join_pairs(
     found: IdentificationSamples, detections: DetectionSamples, catalogue: CraterCatalogue
 ) -> Pairs:
-    """Identifications whose detection came down and whose crater the catalogue holds."""
+    """Identifications whose detection came down and whose crater the catalogue holds with its height."""
     order = np.argsort(catalogue.ids, kind="stable")
     ids = catalogue.ids[order]
     place = np.minimum(np.searchsorted(ids, found.crater_id), max(len(ids) - 1, 0))
-    known = ids[place] == found.crater_id if len(ids) else np.zeros(len(found), dtype=np.bool_)
+    known = (
+        (ids[place] == found.crater_id) & np.isfinite(catalogue.rim_height_m[order[place]])
+        if len(ids)
+        else np.zeros(len(found), dtype=np.bool_)
+    )
     frame = np.searchsorted(detections.utc_ns, found.utc_ns)
     frame = np.minimum(frame, max(len(detections) - 1, 0))
     if len(detections) == 0:

@@ -18,6 +18,7 @@ from ground_service.passes.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, above_horizon, ground_arc_m, horizon_arc_m, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
+from lunar.frames import mcmf_from_spherical
 from reports.values import (
     BinScore,
     CalibrationBin,
@@ -76,8 +77,13 @@ def expected_craters(
     """Return the craters of the catalogue whose centres the camera sees from each of the positions (f, 3), MCMF.
 
     `camera_from_mcmf` (f, 3, 3) is the attitude of each frame; None means a nadir camera with image up to the north.
+    A crater of unknown rim height is placed at the median height of the others and is not scored.
     """
-    points = catalogue.position_mcmf_m
+    known = np.isfinite(catalogue.rim_height_m)
+    usual_m = float(np.median(catalogue.rim_height_m[known])) if known.any() else 0.0
+    height_m = np.where(known, catalogue.rim_height_m, usual_m)
+    points = mcmf_from_spherical(catalogue.latitude_rad, catalogue.longitude_rad, height_m)
+    scored = catalogue.complete & known
     classes = size_class(catalogue.diameter_m).astype(np.int64)
     rotations = nadir_camera_from_mcmf(position_mcmf_m) if camera_from_mcmf is None else camera_from_mcmf
     distance = np.linalg.norm(position_mcmf_m, axis=-1)
@@ -85,12 +91,12 @@ def expected_craters(
     reach_m = _view_radius_m(camera, distance - radius_m, _off_nadir_rad(rotations, position_mcmf_m))
     counts = np.zeros(len(position_mcmf_m) + 1, dtype=np.int64)
     pieces: list[tuple[IntArray, FloatArray, FloatArray]] = []
-    known = (
+    seeing = (
         np.flatnonzero(np.isfinite(distance) & np.isfinite(rotations).all(axis=(1, 2)))
         if len(points)
         else np.zeros(0, dtype=np.int64)
     )
-    for frames in np.array_split(known, -(-len(known) // FRAMES_AT_ONCE) or 1):
+    for frames in np.array_split(seeing, -(-len(seeing) // FRAMES_AT_ONCE) or 1):
         nearby, lines = [], []
         for position, rotation, range_m, reach in zip(
             position_mcmf_m[frames], rotations[frames], distance[frames], reach_m[frames], strict=True
@@ -120,7 +126,7 @@ def expected_craters(
         uv[:, 1],
         diameter,
         classes[index],
-        catalogue.complete[index],
+        scored[index],
     )
 
 

@@ -356,20 +356,23 @@ def _controls(
         mine = rows[crater == one]
         if len(mine) < 2:
             continue
-        centre = catalogue.position_mcmf_m[one]
+        direction = np.asarray(mcmf_from_spherical(catalogue.latitude_rad[one], catalogue.longitude_rad[one]))
+        direction /= MOON_RADIUS_M
+        # from the same height as a new crater, not from the catalogued one
+        radius_m = MOON_RADIUS_M + _local_height_m(catalogue, direction)
+        known = np.isfinite(catalogue.rim_height_m[one])
+        centre = catalogue.position_mcmf_m[one] if known else direction * radius_m
         position = frames.position_mcmf_m[owner[mine]]
         depth = np.einsum("nij,nj->ni", frames.camera_from_mcmf[owner[mine]], centre - position)[:, 2]
         diameter_m = detections.diameter_px[mine] * depth / frames.camera.focal_px
-        # from the same height as a new crater, not from the catalogued one
-        radius_m = MOON_RADIUS_M + _local_height_m(catalogue, centre)
-        start = np.broadcast_to(centre / np.linalg.norm(centre) * radius_m, (len(mine), 3))
+        start = np.broadcast_to(direction * radius_m, (len(mine), 3))
         place = _triangulated(detections, frames, owner, mine, start, diameter_m)
         if place is None:
             continue
         turn = np.asarray(enu_from_mcmf(place.latitude_rad, place.longitude_rad))
         point = np.asarray(mcmf_from_spherical(place.latitude_rad, place.longitude_rad, place.height_m))
         offset = turn @ (point - centre)
-        if not np.isfinite(catalogue.rim_height_m[one]):
+        if not known:
             offset[2] = np.nan
         found.append((place, offset, place.diameter_m / float(catalogue.diameter_m[one])))
     return found

@@ -23,6 +23,9 @@ SEVERITIES = {WARNING: "warning", ALARM: "alarm"}
 EVENT_SEVERITIES = {"event_medium": WARNING, "event_high": ALARM}
 """Severity of the alarms of event packets; events of lower severity raise none."""
 
+OUTCOMES = ("fix_refused",)
+"""Events that are a normal outcome of a frame: requirements judge their share, single ones raise no alarm."""
+
 WATCHED_PACKETS = (*EVENT_SEVERITIES, *(one.name for one in STRUCTURES.values()))
 WATCHED_APIDS = tuple(sorted({DICTIONARY.packet(name).apid for name in WATCHED_PACKETS}))
 
@@ -115,8 +118,9 @@ def _conditions(tables: Mapping[str, Table]) -> Iterator[Condition]:
             continue
         ids = table.columns["event_id"]
         for code in np.unique(ids).tolist():
-            ticks = table.ticks[ids == code]
-            yield _condition("event", labels.get(code, f"event_{code}"), severity, ticks, None)
+            name = labels.get(code, f"event_{code}")
+            if name not in OUTCOMES:
+                yield _condition("event", name, severity, table.ticks[ids == code], None)
     for structure in STRUCTURES.values():
         table = tables.get(structure.name)
         if table is None:

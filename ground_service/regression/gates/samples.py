@@ -282,10 +282,11 @@ def terrain_kinds(catalogue: CraterCatalogue, expected: ExpectedCraters, rows: I
     scored = np.isin(size_class(catalogue.diameter_m), SCORED_CLASSES)
     area_1e6_km2 = math.pi * (DENSITY_ARC_M / 1e3) ** 2 / 1e6
     craters, row_of = np.unique(expected.index[rows], return_inverse=True)
-    latitude, longitude, _ = spherical_from_mcmf(catalogue.position_mcmf_m[craters])
     count = [
         np.count_nonzero(scored[catalogue.near(*place, DENSITY_ARC_M)])
-        for place in zip(latitude.tolist(), longitude.tolist(), strict=True)
+        for place in zip(
+            catalogue.latitude_rad[craters].tolist(), catalogue.longitude_rad[craters].tolist(), strict=True
+        )
     ]
     kind = np.array(count, dtype=np.float64) > CRATERED_PER_1E6_KM2 * area_1e6_km2
     return kind[row_of].astype(np.int64)

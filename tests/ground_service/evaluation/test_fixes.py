@@ -105,7 +105,8 @@ def test_without_times_or_pairs_no_fix_is_wrong() -> None:
 
 
 def test_identifications_are_joined_by_time_place_and_number() -> None:
-    catalogue = make_catalogue(np.radians([10.0, 11.0, 12.0]), np.zeros(3), np.full(3, 5e3), source="test")
+    latitude, heights = np.radians([10.0, 11.0, 12.0, 13.0]), [0.0, 0.0, 0.0, np.nan]
+    catalogue = make_catalogue(latitude, np.zeros(4), np.full(4, 5e3), source="test", rim_height_m=heights)
     detections = DetectionSamples(
         frame_number=np.array([0, 1]),
         utc_ns=UTC_NS,
@@ -120,11 +121,12 @@ def test_identifications_are_joined_by_time_place_and_number() -> None:
     )
     ids = catalogue.ids
     found = IdentificationSamples(
-        utc_ns=np.array([1000, 2000, 2000, 1500, 1000]),
+        utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
         detection=np.array(
-            [1, 0, 1, 0, 0]
+            [1, 0, 1, 0, 0, 0]
         ),  # the third names a detection that is not there, the fourth a time
-        crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6]),  # the last a crater that is not there
+        # the last two a crater that is not there, and one of unknown height
+        crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6, ids[3]]),
     )
     joined = join_pairs(found, detections, catalogue)
     assert joined.frame.tolist() == [0, 1]

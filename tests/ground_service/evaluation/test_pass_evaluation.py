@@ -503,6 +503,10 @@ def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_a
     found = inputs()
     assert found.catalogue is not None
     elsewhere = replace(found.catalogue, complete=np.zeros(len(found.catalogue), dtype=np.bool_))
+    flat = replace(found.catalogue, rim_height_m=np.full(len(found.catalogue), np.nan))
+    unknown = evaluate_pass(replace(found, catalogue=flat))
+    assert unknown.not_available["recall"] == "rim heights unknown"
+    assert any(one.startswith("rim heights unknown for 3") for one in unknown.remarks)
     report = evaluate_pass(inputs(catalogue=elsewhere))
     assert report.detector is not None and report.detector.micro is not None
     assert np.isnan([report.detector.micro.recall, report.detector.micro.precision]).all()

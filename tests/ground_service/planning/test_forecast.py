@@ -16,7 +16,8 @@ from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
 from ground_service.planning.filling import NS, Option, ResourceGrid, curves
-from ground_service.planning.model import WindowEntry
+from ground_service.planning.model import WindowEntry, WindowSearch
+from ground_service.planning.service import search_windows
 from ground_service.planning.store import get_window
 from lunar.catalogue import CraterCatalogue, save_catalogue
 from lunar.timescales import parse_utc
@@ -139,7 +140,7 @@ def test_an_empty_or_too_long_interval_is_an_error(planned: Ground, stop_s: floa
         shown(planned, 0.0, stop_s)
 
 
-def test_craters_are_counted_by_area(ground: Ground, tmp_path: Path) -> None:
+def test_craters_are_counted_by_area_and_searched_for(planned: Ground, tmp_path: Path) -> None:
     degrees = np.array([[1.0, 1.0, 6.0], [5.0, 9.0, 8.0], [85.0, -5.0, 7.0], [5.0, 5.0, 60.0]])
     ids, radians = np.arange(4), np.radians(degrees[:, :2])
     catalogue = CraterCatalogue(
@@ -153,11 +154,13 @@ def test_craters_are_counted_by_area(ground: Ground, tmp_path: Path) -> None:
         source="four",
     )
     save_catalogue(catalogue, tmp_path / "four.csv")
-    stored = ground.files.put_file(tmp_path / "four.csv")
-    add_catalogue(ground, stored, "four.csv")
+    stored = planned.files.put_file(tmp_path / "four.csv")
+    add_catalogue(planned, stored, "four.csv")
     text = MISSION.format(catalogue=f'[catalogue]\nsource = "four"\nsha256 = "{stored.sha256}"\n')
-    add_mission(ground, text.encode(), actor="ann")
-    found = forecast.crater_density(ground, 76)
+    add_mission(planned, text.encode(), actor="ann")
+    searched = search_windows(planned, WindowSearch(craters_per_frame=0.0, spacecraft_id=76))
+    assert "crater catalogue four" in searched.data
+    found = forecast.crater_density(planned, 76)
     assert found.source == "four" and found.reason is None
     rows = np.array(found.rows)
     assert rows.shape == (18, 36) and np.count_nonzero(rows) == 2
@@ -169,5 +172,4 @@ def test_craters_are_counted_by_area(ground: Ground, tmp_path: Path) -> None:
 def test_a_density_without_a_catalogue_states_the_reason(planned: Ground) -> None:
     found = forecast.crater_density(planned, 76)
     assert found.rows == [] and "catalogue" in (found.reason or "")
-    unknown = forecast.crater_density(planned, 5).reason
-    assert unknown == "no mission description is in force, and there is no public catalogue"
+    assert "expected the source or SHA-256" in (forecast.crater_density(planned, 5).reason or "")
