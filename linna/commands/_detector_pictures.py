@@ -55,7 +55,7 @@ def evaluate_set(arguments: argparse.Namespace) -> int:
         format_picture_figures,
     )
 
-    for name in ("report", "run", "rims", "source", "paper_classes"):
+    for name in ("report", "run", "source", "paper_classes"):
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
             raise UsageError(f"{option}: expected together with --dataset, found with --coco")

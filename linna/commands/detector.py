@@ -25,7 +25,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _add_export(verbs)
     _add_calibrate(verbs)
     _add_evaluate(verbs)
-    _add_compare(verbs)
     _detector_pictures.configure(verbs)
     _add_bench_and_info(verbs)
 
@@ -56,26 +55,6 @@ def _add_train(verbs: Any) -> None:
         "factor by which the network enlarges images, for high altitudes; --crop is in pixels before enlargement",
         1,
         choices=(1, 2),
-    )
-    option(
-        train,
-        "--visible-labels",
-        bool,
-        "choose and weigh labels by their visibility in the frame instead of their depth/diameter",
-    )
-    option(
-        train,
-        "--least-emphasis W",
-        float,
-        "least factor of a label's weight by diameter; 1 weighs all craters below 28 px the same",
-        0.5,
-    )
-    option(
-        train,
-        "--rims TABLE",
-        Path,
-        "labels on rims (binary table of `linna catalogue curate`) instead of the catalogue's circles",
-        None,
     )
     option(train, "--replicas", int, "threads that train side by side (0: one per core)", 0)
     finish(train, _train)
@@ -108,30 +87,13 @@ def _add_export(verbs: Any) -> None:
 
 
 def _add_calibrate(verbs: Any) -> None:
-    from payload_emulator.flight.vision.calibration import PARTS
-
     calibrate = verbs.add_parser(
         "calibrate",
-        help="fit scores by size, position errors and the pull of the Sun on validation frames, and store them",
+        help="fit the standard deviations of centres on validation frames, and store them",
     )
     add_model(calibrate)
     option(calibrate, "--dataset DIR", Path, nargs="+", required=True)
     option(calibrate, "--out M.onnx", Path, required=True)
-    option(
-        calibrate,
-        "--parts",
-        PARTS,
-        "what is stored (default: score and sigma)",
-        ["score", "sigma"],
-        nargs="*",
-    )
-    option(
-        calibrate,
-        "--precision P",
-        float,
-        "share of the detections used on board that are catalogued craters of 3 to 30 km",
-        0.85,
-    )
     finish(calibrate, _calibrate)
 
 
@@ -152,33 +114,9 @@ def _add_evaluate(verbs: Any) -> None:
         bool,
         "the paper's design: the class from its own heatmap instead of diameter and altitude",
     )
-    option(
-        evaluate,
-        "--rims TABLE",
-        Path,
-        "rims from `linna catalogue curate`: distances from these in addition to the catalogue positions",
-        None,
-    )
-    option(
-        evaluate,
-        "--rims-shift EAST_M NORTH_M",
-        float,
-        "offset of the terrain in the images from the table (default: 0 0)",
-        (0.0, 0.0),
-    )
     option(evaluate, "--report F.html", Path, "write one HTML report", None)
     option(evaluate, "--run", Path, "training run whose curves the report shows", None)
     finish(evaluate, _evaluate)
-
-
-def _add_compare(verbs: Any) -> None:
-    compare = verbs.add_parser("compare", help="two networks on the same frames, with paired intervals")
-    option(compare, "model M.onnx", Path, "ONNX file or name of a shipped network")
-    option(compare, "reference REFERENCE.onnx", Path)
-    option(compare, "--dataset DIR", Path, nargs="+", required=True)
-    option(compare, "--split", ("train", "val", "test"), "", "val")
-    option(compare, "--source", str, "only the frames of this source", "")
-    finish(compare, _compare)
 
 
 def _add_bench_and_info(verbs: Any) -> None:
@@ -201,7 +139,6 @@ def _train(arguments: argparse.Namespace) -> int:
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.data.feeder import TrainParameters
     from payload_emulator.training.data.landmarks import load_landmarks
-    from payload_emulator.training.data.refits import load_refitted
     from payload_emulator.training.model.train import train
 
     restart_for_training()
@@ -215,20 +152,16 @@ def _train(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         replicas=arguments.replicas,
         enlarge=arguments.enlarge,
-        visible_labels=arguments.visible_labels,
-        least_emphasis=arguments.least_emphasis,
         preparation=Preparation.normalise_first if arguments.normalise_first else Preparation.gray_first,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]
     landmarks = None if arguments.landmarks is None else load_landmarks(arguments.landmarks)
-    rims = None if arguments.rims is None else load_refitted(arguments.rims)
     figures = train(
         datasets,
         arguments.out,
         parameters,
         start_from=arguments.start_from,
         landmarks=landmarks,
-        rims=rims,
         report=log,
     )
     return emit(arguments, figures)
@@ -261,18 +194,13 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
     from linna.output import emit, progress
     from payload_emulator.training.data.dataset import Dataset, write_whole
     from payload_emulator.training.model.fit_calibration import fit_calibration, format_calibration_figures
 
-    if not 0.0 < arguments.precision < 1.0:
-        raise UsageError(f"--precision: expected a value between 0 and 1, found {arguments.precision:g}")
     octets, document = fit_calibration(
         model_octets(arguments.model),
         [Dataset(folder) for folder in arguments.dataset],
-        arguments.parts,
-        arguments.precision,
         lambda frames: progress(frames, len(frames), "calibrate", "frames"),
     )
     sha256 = write_whole(arguments.out, octets)
@@ -284,14 +212,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from linna.commands._detector_pictures import evaluate_set, refuse_options_of_sets
     from linna.output import emit, progress, save
     from payload_emulator.training.data.dataset import Dataset
-    from payload_emulator.training.data.refits import load_refitted
     from payload_emulator.training.evaluate.evaluate import format_figures, open_for_evaluation, run, summary
 
     if arguments.coco is not None:
         return evaluate_set(arguments)
     refuse_options_of_sets(arguments)
     datasets = [Dataset(folder) for folder in arguments.dataset]
-    rims = None if arguments.rims is None else load_refitted(arguments.rims, *arguments.rims_shift)
     detector = open_for_evaluation(model_octets(arguments.model))
     scored = run(
         detector,
@@ -302,7 +228,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         lambda frames: progress(frames, len(frames), "evaluate", "frames"),
         paper_classes=arguments.paper_classes,
     )
-    figures = summary(detector, datasets, scored, arguments.split, arguments.source, rims)
+    figures = summary(detector, datasets, scored, arguments.split, arguments.source)
     if arguments.report is not None:
         from payload_emulator.training.evaluate.report import detector_report
         from reports.render import render_html
@@ -311,21 +237,6 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         report = detector_report(detector, scored, figures, arguments.run)
         save(arguments.report, render_html(report).encode())
     return emit(arguments, figures, format_figures(figures))
-
-
-def _compare(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, progress
-    from payload_emulator.training.data.dataset import Dataset
-    from payload_emulator.training.evaluate.compare import compare, format_comparison
-
-    document, _ = compare(
-        (model_octets(arguments.model), model_octets(arguments.reference)),
-        [Dataset(folder) for folder in arguments.dataset],
-        arguments.split,
-        arguments.source,
-        lambda frames: progress(frames, len(frames), "compare", "frames"),
-    )
-    return emit(arguments, document, format_comparison(document))
 
 
 def _bench(arguments: argparse.Namespace) -> int:

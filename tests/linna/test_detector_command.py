@@ -191,70 +191,11 @@ def test_evaluating_on_no_data_set_is_refused(tmp_path, capsys):
     assert "expected a data set" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("precision", ["0", "1", "-0.5", "nan"])
-def test_a_precision_outside_zero_and_one_is_refused_before_any_work(capsys, tmp_path, precision):
-    command = ["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(tmp_path / "m.onnx")]
-    assert run([*command, f"--precision={precision}"]) == 2
-    assert "expected a value between 0 and 1" in capsys.readouterr().err
-
-
 def test_a_calibration_without_a_data_set_leaves_no_file(capsys, tmp_path):
     out = tmp_path / "m.onnx"
     assert run(["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(out)]) == 2
     assert "expected a data set" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_a_comparison_without_a_data_set_is_refused(capsys, tmp_path):
-    assert run(["detector", "compare", "craters", "craters", "--dataset", str(tmp_path)]) == 2
-    assert "expected a data set" in capsys.readouterr().err
-
-
-@pytest.fixture
-def trained(monkeypatch):
-    """Training that only takes what it is given."""
-    from linna.commands import detector
-    from payload_emulator.training.data import dataset
-    from payload_emulator.training.model import train
-
-    calls = []
-
-    def take(datasets, out, parameters, **rest):
-        calls.append((parameters, rest))
-        return {"steps": 0}
-
-    monkeypatch.setattr(train, "train", take)
-    monkeypatch.setattr(dataset, "Dataset", lambda folder: folder)
-    monkeypatch.setattr(detector, "restart_for_training", lambda: None)
-    return calls
-
-
-def test_training_gets_the_rims_and_the_least_emphasis(tmp_path, trained):
-    from tmtc.tables import CatalogueTable, pack_catalogue_table
-
-    table = tmp_path / "rims.table"
-    one = [np.array([value]) for value in (0.1, 0.2, 8_000.0, -500.0)]
-    table.write_bytes(pack_catalogue_table(CatalogueTable(np.array([77]), *one, np.full((1, 3), 50.0))))
-    train = ["detector", "train", str(tmp_path), "--out", str(tmp_path / "run")]
-    assert run([*train, "--rims", str(table), "--least-emphasis", "0.8", "--visible-labels"]) == 0
-    parameters, rest = trained[-1]
-    assert parameters.least_emphasis == 0.8 and parameters.visible_labels
-    assert rest["rims"].ids.tolist() == [77]
-    assert run(train) == 0
-    parameters, rest = trained[-1]
-    assert parameters.least_emphasis == 0.5 and not parameters.visible_labels and rest["rims"] is None
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--least-emphasis", "5"], "least emphasis: expected 0 to 4, found 5"),
-        (["--rims", "absent.table"], "absent.table: expected a table of rims"),
-    ],
-)
-def test_training_refuses_what_it_cannot_use(tmp_path, capsys, trained, words, expected):
-    assert run(["detector", "train", str(tmp_path), "--out", str(tmp_path / "run"), *words]) == 2
-    assert expected in capsys.readouterr().err and not trained
 
 
 def test_detect_lists_the_craters_and_draws_them(write_image, capsys, tmp_path):

@@ -9,7 +9,7 @@ not its business: that needs the altitude.
 What the eye (and the network) takes for the centre of a crater is the middle of its walls, which lies some way below
 the rim; away from the middle of a wide picture that displaces it inward, by parallax. The network cannot know where in
 the picture it looks, so the detector puts it right with the share of the depth that the model's metadata carry.
-Scores, standard deviations and the pull of the Sun are corrected by the calibration in the same metadata
+Standard deviations are corrected by the calibration in the same metadata
 (`flight.vision.calibration`); a network without one is taken as it is.
 
 The paper's own design, "classified detections only", is flown too: a network that gives three heatmaps, one for each
@@ -36,11 +36,10 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.vision.calibration import (
-    Calibration,
+    SigmaModel,
     load_calibration,
     sigma_features,
     with_sigma,
-    without_pull,
 )
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import (
@@ -109,7 +108,7 @@ class OnnxDetector:
     class_medians_m: FloatArray | None = field(init=False)
     score_threshold: float = field(init=False)
     parallax_per_px: float = field(init=False)
-    calibration: Calibration = field(init=False)
+    calibration: SigmaModel | None = field(init=False)
     _session: onnxruntime.InferenceSession = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -176,12 +175,9 @@ class OnnxDetector:
         Parallax is removed if the image has the size of the camera's frames.
         """
         whole = (height_px, width_px) == (self.parameters.height_px, self.parameters.width_px)
-        sigma = self.calibration.sigma
-        if sigma is not None:
+        if self.calibration is not None:
             features = sigma_features(found, sun_in_camera, width_px, height_px, whole=whole)
-            found = with_sigma(found, sigma, features)
-        if self.calibration.sun is not None:
-            found = without_pull(found, self.calibration.sun, sun_in_camera)
+            found = with_sigma(found, self.calibration, features)
         return remove_parallax(found, self.parallax_per_px, height_px, width_px) if whole else found
 
     def run_network(self, tile: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -189,25 +185,19 @@ class OnnxDetector:
         heatmap, geometry = self._session.run([HEATMAP_NAME, GEOMETRY_NAME], {INPUT_NAME: tile})
         return heatmap, geometry
 
-    def search(
-        self, gray: NDArray[np.float32], score_threshold: float | None = None, *, calibrated: bool = True
-    ) -> Detections:
+    def search(self, gray: NDArray[np.float32], score_threshold: float | None = None) -> Detections:
         """Detections of a prepared plane (H, W) of any size with the Sun at its top, best first.
 
-        `score_threshold` None takes that of the detector. `calibrated` False leaves scores as the network gives them.
+        `score_threshold` None takes that of the detector.
         """
         least = self.score_threshold if score_threshold is None else score_threshold
-        model = self.calibration.score if calibrated else None
         rows, columns = gray.shape
         found = [
-            self._search_tile(gray, top, left, least if model is None else model.least_score(least))
+            self._search_tile(gray, top, left, least)
             for top in _tile_starts(rows)
             for left in _tile_starts(columns)
         ]
         every = found[0] if len(found) == 1 else join(found)
-        if model is not None:
-            every = replace(every, score=model.probability(every.score, every.diameter_px))
-            every = every.select(every.score >= least)
         order = np.argsort(-every.score, kind="stable")
         kept = drop_duplicates(every.select(order), self.parameters)
         return kept.select(np.arange(min(len(kept), self.parameters.max_detections * len(found))))

@@ -107,9 +107,7 @@ def find_sun(detector: OnnxDetector, gray: NDArray[np.float32]) -> SunEstimate |
     evidence = np.zeros(4)
     found: list[list[Detections]] = []
     for turns in range(4):
-        found.append(
-            [detector.search(np.rot90(square, turns), EVIDENCE_SCORE, calibrated=False) for square in squares]
-        )
+        found.append([detector.search(np.rot90(square, turns), EVIDENCE_SCORE) for square in squares])
         evidence[turns] = sum(float((part.score**EVIDENCE_POWER).sum()) for part in found[-1])
     if not evidence.any():
         return None

@@ -21,7 +21,7 @@ import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,6 @@ from payload_emulator.flight.vision.preprocess import gray_levels
 from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.training.data.targets import Tier
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.data.visibility import HIDDEN, VISIBLE, visibility
 
 SCHEMA_VERSION = 1
 CATEGORIES = ((0, "5-10 km"), (1, "10-15 km"), (2, "15-30 km"), (3, "3-5 km"))
@@ -204,14 +203,11 @@ def choose_tiers(
     height_px: int,
     complete: bool,
     least_px: float = LABEL_MINIMUM_DIAMETER_PX,
-    seen: FloatArray | None = None,
 ) -> tuple[NDArray[np.int8], FloatArray]:
     """Tier and weight of the craters of a frame, (n,) each, by what can be seen of them.
 
     `complete` (procedural terrain) says that the terrain shows craters of any size; real terrain does so only for those
-    stamped on it (negative id) and for what its rasters resolve. `least_px` is the least diameter of a label. `seen` is
-    the visibility of the craters (n,): where it is given, hidden craters are ignored whatever their depth, and weights
-    grow with visibility instead of depth/diameter.
+    stamped on it (negative id) and for what its rasters resolve. `least_px` is the least diameter of a label.
     """
     resolved = complete | (craters["id"] < 0) | (craters["diameter_m"] >= LABEL_MINIMUM_DIAMETER_M)
     inside = (
@@ -229,12 +225,8 @@ def choose_tiers(
         & (craters["lit"] >= LABEL_MINIMUM_LIT)
         & ~craters["hidden"].astype(bool)
     )
-    if seen is not None:
-        label &= ~(seen < HIDDEN)
-        grown = (seen - HIDDEN) / (VISIBLE - HIDDEN)
-    else:
-        span = FULL_WEIGHT_DEPTH_RATIO - LABEL_MINIMUM_DEPTH_RATIO
-        grown = (craters["depth_ratio"] - LABEL_MINIMUM_DEPTH_RATIO) / span
+    span = FULL_WEIGHT_DEPTH_RATIO - LABEL_MINIMUM_DEPTH_RATIO
+    grown = (craters["depth_ratio"] - LABEL_MINIMUM_DEPTH_RATIO) / span
     weight = np.clip(LABEL_LEAST_WEIGHT + (1.0 - LABEL_LEAST_WEIGHT) * grown, LABEL_LEAST_WEIGHT, 1.0)
     return np.where(label, Tier.LABEL, Tier.IGNORE).astype(np.int8), np.nan_to_num(
         weight, nan=LABEL_LEAST_WEIGHT
@@ -258,16 +250,6 @@ def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
         height_px=dataset.height_px,
         sun_azimuth_image_rad=float(np.arctan2(frame.sun_camera[0], -frame.sun_camera[1])),
         block=int(frame.values["block"]),
-    )
-
-
-def with_visibility(dataset: Dataset, frame: Frame, truth: FrameTruth) -> FrameTruth:
-    """The frame's craters with their visibility in its image."""
-    return replace(
-        truth,
-        visibility=visibility(
-            dataset.gray(frame), truth.u_px, truth.v_px, truth.diameter_px, truth.sun_azimuth_image_rad
-        ),
     )
 
 

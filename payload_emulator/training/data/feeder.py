@@ -9,21 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray, IntArray, OctetArray
+from lunar.arrays import IntArray, OctetArray
 from lunar.catalogue import size_class
-from payload_emulator.errors import DatasetError
-from payload_emulator.flight.vision.preprocess import Preparation, gray_levels
+from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.augment import AugmentParameters, make_crop
 from payload_emulator.training.data.dataset import LABEL_MINIMUM_DIAMETER_PX, Dataset, Frame, choose_tiers
 from payload_emulator.training.data.targets import Tier, make_targets
-from payload_emulator.training.data.visibility import visibility
 
 LEAST_CROP_DIAMETER_PX = 8.0
 """A labelled crater that a crop shows smaller than this is ignored there."""
 
 EVEN_DIAMETER_PX = 28.0
-MOST_EMPHASIS = 4.0
-"""Small craters outnumber large ones twenty to one; without a counterweight the network hardly learns the large."""
+LEAST_EMPHASIS, MOST_EMPHASIS = 0.5, 4.0
+"""Limits of the factor by which a label counts for its diameter, 1 at 28 px. Small craters outnumber large ones twenty
+to one; without a counterweight the network hardly learns the large."""
 
 STAMPED_EMPHASIS = 0.6
 """Small craters that are stamped on real terrain outnumber those of the list."""
@@ -36,10 +35,6 @@ class TrainParameters:
     minutes : wall-clock budget; the learning rate falls to zero over it (0: `steps` counts instead).
     micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
     preparation : how RGB frames become gray; the paper's order needs a data set in colour.
-    soft_labels : the weight of a label grows with its depth/diameter; else all weigh the same.
-    visible_labels : labels are chosen and weighed by their visibility in the frame instead of their depth/diameter.
-    least_emphasis : least factor by which a label counts for its diameter; the factor is 1 at 28 px and grows with the
-        diameter. 1.0: all craters below 28 px count the same.
     backbone, stride_px, enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are
         shorter in the image by the enlargement.
     """
@@ -66,17 +61,8 @@ class TrainParameters:
     backbone: str = "small"
     stride_px: int = 4
     enlarge: int = 1
-    soft_labels: bool = True
-    visible_labels: bool = False
-    least_emphasis: float = 0.5
     preparation: Preparation = Preparation.gray_first
     augment: AugmentParameters = field(default_factory=AugmentParameters)
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.least_emphasis <= MOST_EMPHASIS:
-            raise DatasetError(
-                f"training, least emphasis: expected 0 to {MOST_EMPHASIS:g}, found {self.least_emphasis:g}"
-            )
 
 
 class Feeder:
@@ -93,15 +79,7 @@ class Feeder:
         self.parameters = parameters
         least_px = LABEL_MINIMUM_DIAMETER_PX / parameters.enlarge
         self.tiers = [
-            choose_tiers(
-                f.craters,
-                d.width_px,
-                d.height_px,
-                f.complete,
-                least_px,
-                _visibility_of_all(f, image) if parameters.visible_labels else None,
-            )
-            for (d, f), image in zip(frames, images, strict=True)
+            choose_tiers(f.craters, d.width_px, d.height_px, f.complete, least_px) for d, f in frames
         ]
 
     def batch(self, first: int, count: int) -> dict[str, NDArray[Any]]:
@@ -139,9 +117,7 @@ class Feeder:
         tier = np.where(
             inside & (crop.diameter_px >= LEAST_CROP_DIAMETER_PX / p.enlarge), tiers, Tier.IGNORE
         ).astype(np.int8)[near]
-        emphasis = np.clip(p.enlarge * crop.diameter_px / EVEN_DIAMETER_PX, p.least_emphasis, MOST_EMPHASIS)
-        if not p.soft_labels:
-            weights = np.ones_like(weights)
+        emphasis = np.clip(p.enlarge * crop.diameter_px / EVEN_DIAMETER_PX, LEAST_EMPHASIS, MOST_EMPHASIS)
         weights = weights * np.where(craters["id"] < 0, STAMPED_EMPHASIS, 1.0) * emphasis
         targets = make_targets(
             p.crop_px,
@@ -164,17 +140,6 @@ class Feeder:
             "regressed": targets.regressed,
             "incomplete": np.array(not frame.complete),
         }
-
-
-def _visibility_of_all(frame: Frame, image: OctetArray) -> FloatArray:
-    """Visibility of all craters of a frame, those without catalogue entry included."""
-    return visibility(
-        image if image.ndim == 2 else gray_levels(image),
-        frame.craters["u_px"],
-        frame.craters["v_px"],
-        frame.craters["diameter_px"],
-        float(np.arctan2(frame.sun_camera[0], -frame.sun_camera[1])),
-    )
 
 
 _orders: dict[tuple[int, int, int], IntArray] = {}

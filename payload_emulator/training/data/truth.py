@@ -9,10 +9,7 @@ from lunar.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """Catalogued craters in view of one frame, arrays (n,); `block` names the independent piece of ground.
-
-    `visibility` is that of `training.data.visibility`, NaN where unknown; None where it was not computed.
-    """
+    """Catalogued craters in view of one frame, arrays (n,); `block` names the independent piece of ground."""
 
     u_px: FloatArray
     v_px: FloatArray
@@ -24,4 +21,3 @@ class FrameTruth:
     height_px: int
     sun_azimuth_image_rad: float
     block: int
-    visibility: FloatArray | None = None

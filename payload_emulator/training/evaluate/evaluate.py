@@ -25,11 +25,8 @@ from payload_emulator.training.data.dataset import (
     diameter_on_ground_m,
     frame_truth,
     ground_points,
-    with_visibility,
 )
-from payload_emulator.training.data.refits import RefittedRims
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.localisation import against_rims
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.scoring import FrameDetections
 
@@ -160,7 +157,7 @@ def run(
     detect = detect_by_class if paper_classes else detect_with_model
     return Scored(
         frames,
-        [with_visibility(d, f, frame_truth(d, f)) for d, f in frames],
+        [frame_truth(d, f) for d, f in frames],
         [detect(detector, d, f) for d, f in progress(frames)],
         [
             Scene(
@@ -168,9 +165,8 @@ def run(
                 f.values["sun_elevation_deg"],
                 f.values["ground_m"],
                 f.source,
-                (f.values["altitude_m"] - f.values["ground_m"]) / d.focal_px,
             )
-            for d, f in frames
+            for _, f in frames
         ],
         thresholds,
     )
@@ -198,15 +194,10 @@ def summary(
     scored: Scored,
     split: str,
     source: str = "",
-    rims: RefittedRims | None = None,
 ) -> dict[str, Any]:
-    """Figures of scored frames with what they rest on; `rims` measured on the terrain give distances from those too."""
+    """Figures of scored frames with what they rest on."""
     frames = [f for _, f in scored.frames]
     figures = score(scored.truths, scored.found, scored.thresholds, scored.scenes)
-    if rims is not None:
-        figures["against_rims"] = against_rims(
-            scored.frames, scored.truths, scored.found, scored.thresholds.on_board, rims
-        )
     return {
         "model_sha256": detector.sha256,
         "dataset": ", ".join(sorted({str(d.index["name"]) for d in datasets})),
@@ -265,14 +256,6 @@ def format_figures(figures: dict[str, Any]) -> str:
         for item in figures["recall_by_degradation"]
     )
     lines.append(f"recall by depth/diameter (craters): {recalls}")
-    seen = ", ".join(
-        f"{item['low']:g}-{item['high']:g}: {item['recall']:.2f} ({item['expected']})"
-        for item in figures["recall_by_visibility"]
-        if item["expected"]
-    )
-    lines.append(f"recall by visibility (craters): {seen}")
-    for name, row in (("5-30", figures["visible"]), ("3-30", figures["visible_3_to_30_km"])):
-        lines.append(_row(f"{name} km visible", row) + f"   of {row['expected']}")
     clear = "; ".join(
         f"above {row['depth_ratio']:g} strict {_share(row['strict'])}, ignore-aware {_share(row['ignore_aware'])}"
         for row in figures["recall_of_clear_craters"]
@@ -284,11 +267,6 @@ def format_figures(figures: dict[str, Any]) -> str:
             f"freshest {_share(figures['recall_by_third_of_degradation'][-1])} (strict)"
         )
     lines += _bias_lines(figures)
-    again = figures["repeatability"]
-    lines.append(
-        f"found again in another frame {again['value']:.2f} ({again['pairs']} pairs), in the next frame "
-        f"{again['next_frame']['value']:.2f} ({again['next_frame']['pairs']})"
-    )
     average, scale = figures["average_precision_half_radius"], figures["radial_scale"]
     lines.append(
         f"AP within 0.5 R: strict {average['strict']:.3f}, ignore-aware {average['ignore_aware']:.3f}; scale about "
@@ -315,7 +293,7 @@ def _share(row: dict[str, Any]) -> str:
 
 
 def _bias_lines(figures: dict[str, Any]) -> list[str]:
-    """Signed bias by octant of the Sun's azimuth in the image, and distances from measured rims."""
+    """Signed bias by octant of the Sun's azimuth in the image."""
     bias = figures["bias_px"]
     lines = [
         f"bias px: right {bias['du_px']:+.2f}, down {bias['dv_px']:+.2f}, toward the Sun {bias['toward_sun_px']:+.2f}, "
@@ -338,24 +316,6 @@ def _bias_lines(figures: dict[str, Any]) -> list[str]:
         for row in figures["bias_px_by_sun_octant"]
         if row["pairs"]
     ]
-    alone = figures.get("bias_px_registered")
-    if alone is not None:
-        lengths = ", ".join(
-            f"{row['length_px']:.2f} ({row['noise_px']:.2f})"
-            for row in figures["bias_px_by_sun_octant_registered"]
-        )
-        lines.append(
-            f"bias without registration: longest by Sun octant {alone['worst_octant_px']:.2f} px "
-            f"(noise {alone['worst_octant_noise_px']:.2f}); by octant (noise) {lengths}"
-        )
-    rims = figures.get("against_rims")
-    if rims is not None:
-        lines.append(
-            f"{rims['refitted']['pairs']} craters with a measured rim: median {rims['refitted']['median_px']:.2f}, "
-            f"mean {rims['refitted']['mean_px']:.2f} px from it; {rims['catalogue']['median_px']:.2f}, "
-            f"{rims['catalogue']['mean_px']:.2f} px from the catalogue's place; bias longest by Sun octant "
-            f"{rims['bias_px']['worst_octant_px']:.2f} px (noise {rims['bias_px']['worst_octant_noise_px']:.2f})"
-        )
     return lines
 
 

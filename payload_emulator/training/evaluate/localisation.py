@@ -1,4 +1,4 @@
-"""Position errors of detections: signed errors by Sun and by place in the image, from listed and from measured rims.
+"""Position errors of detections: signed errors by Sun and by place in the image.
 
 Errors are detection minus crater in pixels, u right and v down. Beside the image's axes they are given toward the Sun
 in the image and across it (to the right of who looks toward the Sun): shadows would draw a detector along the first.
@@ -7,21 +7,17 @@ in the image and across it (to the right of who looks toward the Sun): shadows w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
-from payload_emulator.training.data.refits import RefittedRims, refitted_frame
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.scoring import FrameDetections, Tally, tally
+from payload_emulator.training.evaluate.scoring import Tally
 
 FEWEST_PAIRS = 20
 """A mean error of fewer craters says nothing to a quarter of a pixel: one of them may be two pixels off."""
 _ROUNDS = 400
-_ALTERNATIONS = 12
 
 
 def right(tallied: Tally, threshold: float) -> BoolArray:
@@ -116,39 +112,6 @@ def _resampled_means(errors: FloatArray, frame: IntArray) -> FloatArray:
     return means
 
 
-def without_registration(tallied: Tally, threshold: float, m_per_px: FloatArray) -> Tally:
-    """A tally whose errors lack the displacement of the catalogue from the ground.
-
-    Terrain and catalogue differ by tens of metres that are the same for all frames of a block of ground, whatever the
-    Sun. Their mean over the block is estimated together with the means of the octants, whose own mean is taken as zero:
-    a shift of all octants in the image is thus counted as registration. `m_per_px` (frames,) is the ground that a pixel
-    covers. Detections of blocks with fewer than twice `FEWEST_PAIRS` right ones are left out.
-    """
-    hit = right(tallied, threshold)
-    blocks, place = np.unique(tallied.detection_block, return_inverse=True)
-    pairs = np.bincount(place[hit], minlength=blocks.size)
-    judged = pairs[place] >= 2 * FEWEST_PAIRS if blocks.size else np.zeros(0, dtype=bool)
-    error = np.stack([tallied.error_u, tallied.error_v], axis=1)
-    step = 1.0 / m_per_px[tallied.detection_frame.astype(int)]
-    used = np.flatnonzero(hit & judged)
-    offset, octants = np.zeros((blocks.size, 2)), np.zeros((8, 2))
-    for _ in range(_ALTERNATIONS):
-        rest = error[used] - octants[tallied.detection_octant[used].astype(int)]
-        square = np.bincount(place[used], weights=step[used] ** 2, minlength=blocks.size)
-        for axis in range(2):
-            moment = np.bincount(place[used], weights=step[used] * rest[:, axis], minlength=blocks.size)
-            offset[:, axis] = moment / np.where(square > 0.0, square, 1.0)
-        rest = error[used] - offset[place[used]] * step[used, None]
-        octant = tallied.detection_octant[used].astype(int)
-        count = np.maximum(np.bincount(octant, minlength=8), 1)
-        for axis in range(2):
-            octants[:, axis] = np.bincount(octant, weights=rest[:, axis], minlength=8) / count
-        octants -= octants[np.bincount(octant, minlength=8) > 0].mean(axis=0) if used.size else 0.0
-    moved = error - offset[place] * step[:, None]
-    left = replace(tallied, error_u=moved[:, 0], error_v=moved[:, 1])
-    return left.select(judged, np.ones(tallied.crater_id.size, dtype=bool))
-
-
 def radial_scale(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> dict[str, float]:
     """Scale of the detections about the middle of the image, percent: -0.1 makes 30 km of altitude 30 m too high."""
     found = right(tallied, threshold)
@@ -164,42 +127,3 @@ def radial_scale(tallied: Tally, threshold: float, truths: Sequence[FrameTruth])
     slope = float((weight * lever * error).sum()) / moment
     spread = float(np.sqrt((weight**2 * lever**2 * (error - slope * lever) ** 2).sum())) / moment
     return {"percent": 100.0 * slope, "standard_error_percent": 100.0 * spread}
-
-
-def against_rims(
-    frames: Sequence[tuple[Dataset, Frame]],
-    truths: Sequence[FrameTruth],
-    found: Sequence[FrameDetections],
-    threshold: float,
-    rims: RefittedRims,
-) -> dict[str, Any]:
-    """Distances of detections of 5 to 30 km from craters with a measured rim: from the catalogue's place, from the rim.
-
-    Matching is done with each set of places in turn, as it is for the figures elsewhere. `bias` is that of the second.
-    """
-    moved, known = [], []
-    for (dataset, frame), truth in zip(frames, truths, strict=True):
-        shifted, which = refitted_frame(dataset, frame, rims)
-        place = frame_truth(dataset, shifted)
-        moved.append(replace(truth, u_px=place.u_px, v_px=place.v_px, diameter_px=place.diameter_px))
-        known.append(frame.craters["id"][which])
-    ids = np.unique(np.concatenate(known)) if known else np.zeros(0, np.int64)
-    displaced = tally(moved, found)
-    fitted = displaced.select(np.isin(displaced.matched_id, ids), np.ones(displaced.crater_id.size, bool))
-    octants = bias_by_octant(fitted, threshold, truths)
-    return {
-        "catalogue": _distances(tally(truths, found), threshold, ids),
-        "refitted": _distances(displaced, threshold, ids),
-        "bias_px_by_sun_octant": octants,
-        "bias_px": bias_overall(fitted, threshold, truths, octants),
-    }
-
-
-def _distances(tallied: Tally, threshold: float, ids: IntArray) -> dict[str, float | int]:
-    chosen = right(tallied, threshold) & np.isin(tallied.matched_id, ids)
-    error = np.hypot(tallied.error_u[chosen], tallied.error_v[chosen])
-    return {
-        "pairs": int(error.size),
-        "mean_px": float(error.mean()) if error.size else float("nan"),
-        "median_px": float(np.median(error)) if error.size else float("nan"),
-    }

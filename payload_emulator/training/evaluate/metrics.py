@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.catalogue import CLASS_LIMITS_M
+from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.flight.vision.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.data.visibility import VISIBILITY_EDGES, VISIBLE
 from payload_emulator.training.evaluate.localisation import (
     bias_by_octant,
     bias_overall,
     middle,
     radial_scale,
     right,
-    without_registration,
 )
 from payload_emulator.training.evaluate.scoring import (
     DEGRADATION_EDGES,
@@ -53,7 +50,6 @@ class Scene:
     sun_elevation_deg: float
     ground_m: float
     source: str
-    m_per_px: float = float("nan")  # ground that a pixel covers below the camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +103,6 @@ def score(
         "recall_by_degradation": _recall_by(
             strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
         ),
-        **_by_visibility(truths, found, (strict, wide), threshold),
         "recall_by_third_of_degradation": _recall_by_thirds(strict, threshold),
         "recall_of_clear_craters": [
             {"depth_ratio": low, "strict": _recall_above(strict, low, threshold)}
@@ -134,7 +129,6 @@ def score(
         "by_image_radius_px": _by_radius(pair, threshold, truths),
         "bias_px_by_sun_octant": octants,
         "bias_px": bias_overall(strict, threshold, truths, octants),
-        **_registered_bias(strict, threshold, truths, scenes),
         "radial_scale": radial_scale(fair, threshold, truths),
         "sigma_calibration": {
             **_calibration(fair, threshold),
@@ -142,49 +136,11 @@ def score(
             "by_image_radius_px": _calibration_by_radius(fair, threshold, truths),
         },
         "score_calibration": _score_calibration(strict),
-        "repeatability": repeatability(strict, threshold),
         "precision_recall": _curve(strict),
         "precision_recall_per_class": [_curve(tally(truths, found, classes=(k,))) for k in range(3)],
         "unique_craters": int(np.unique(strict.crater_id).size),
         "blocks": int(np.unique(strict.crater_block).size),
     }
-
-
-def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int | dict[str, float | int]]:
-    """P(found in one frame | found in another that shows the same crater), over ordered pairs of frames.
-
-    The frames of a data set differ in Sun and pose, so this is harder than from one exposure to the next of a pass;
-    `chance` is what independent detections of the same recall would give. `next_frame` is over neighbours in the data
-    set only: from one exposure to the next where the frames follow an orbit, neighbouring ground under another Sun
-    where they are drawn.
-    """
-    with np.errstate(invalid="ignore"):
-        hit = tallied.crater_score >= threshold
-    _, place = np.unique(tallied.crater_id, return_inverse=True)
-    seen = np.bincount(place).astype(float) if place.size else np.zeros(0)
-    times = np.bincount(place, weights=hit) if place.size else np.zeros(0)
-    pairs = float((times * (seen - 1.0)).sum())
-    again = float((times * (times - 1.0)).sum())
-    several = seen > 1.0
-    return {
-        "pairs": int(pairs),
-        "value": again / pairs if pairs else float("nan"),
-        "chance": float(times[several].sum() / seen[several].sum()) if several.any() else float("nan"),
-        "next_frame": _found_next(tallied, hit, place),
-    }
-
-
-def _found_next(tallied: Tally, hit: BoolArray, place: IntArray) -> dict[str, float | int]:
-    """P(found at t+1 | found at t, visible in both) over neighbouring frames."""
-    frame = tallied.crater_frame.astype(np.int64)
-    step = int(frame.max()) + 2 if frame.size else 1
-    key = place * step + frame
-    order = np.argsort(key)
-    after = np.searchsorted(key[order], key[hit] + 1)
-    there = after < key.size
-    there[there] = key[order][after[there]] == key[hit][there] + 1
-    again = hit[order][after[there]]
-    return {"pairs": int(again.size), "value": float(again.mean()) if again.size else float("nan")}
 
 
 def _class(
@@ -197,54 +153,6 @@ def _class(
         "size_class": k,
         "ignore_aware": fair.figures(threshold).to_dict(),
         "paper": PAPER_TABLE_2[k] if k < 3 else None,
-    }
-
-
-def _by_visibility(
-    truths: Sequence[FrameTruth],
-    found: Sequence[FrameDetections],
-    pair: tuple[Tally, Tally],
-    threshold: float,
-) -> dict[str, Any]:
-    """Recall by visibility, and figures of the visible craters, of a strict tally from 5 km and one from 3 km."""
-    names = ("", "_3_to_30_km")
-    recalls = {
-        f"recall_by_visibility{name}": _recall_by(
-            part, part.crater_visibility, VISIBILITY_EDGES, threshold, "visibility"
-        )
-        for name, part in zip(names, pair, strict=True)
-    }
-    return recalls | {
-        f"visible{name}": _visible(truths, found, threshold, low_m)
-        for name, low_m in zip(names, (CLASS_LIMITS_M[0], 3_000.0), strict=True)
-    }
-
-
-def _visible(
-    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], threshold: float, low_m: float
-) -> dict[str, Any]:
-    """Figures with the visible craters as truth; detections of other catalogued craters are not counted."""
-    part = tally(truths, found, low_m=low_m, visible_from=VISIBLE)
-    every = tally(truths, found, low_m=low_m).crater_visibility
-    return {
-        **_with_interval(part, threshold),
-        "visibility": VISIBLE,
-        "unknown": int(np.isnan(every).sum()),
-    }
-
-
-def _registered_bias(
-    strict: Tally, threshold: float, truths: Sequence[FrameTruth], scenes: Sequence[Scene]
-) -> dict[str, Any]:
-    """Bias by octant of the Sun without the displacement of the catalogue from the ground, which is no detector's."""
-    m_per_px = np.array([scene.m_per_px for scene in scenes])
-    if not np.isfinite(m_per_px).all():
-        return {}
-    moved = without_registration(strict, threshold, m_per_px)
-    octants = bias_by_octant(moved, threshold, truths)
-    return {
-        "bias_px_by_sun_octant_registered": octants,
-        "bias_px_registered": bias_overall(moved, threshold, truths, octants),
     }
 
 

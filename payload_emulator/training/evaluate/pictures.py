@@ -189,7 +189,6 @@ def tally_pictures(
                 picture.u_px[wanted],
                 picture.v_px[wanted],
                 np.full(wanted.size, number),
-                np.full(wanted.size, np.nan),
             )
         )
     columns = [

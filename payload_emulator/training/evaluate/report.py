@@ -58,13 +58,6 @@ def detector_report(
                 f"depth/diameter {row['low']:g}–{row['high']:g}", row["expected"], float("nan"), row["recall"]
             )
             for row in figures["recall_by_degradation"]
-        )
-        + tuple(
-            NamedScore(
-                f"visibility {row['low']:g}–{row['high']:g}", row["expected"], float("nan"), row["recall"]
-            )
-            for row in figures["recall_by_visibility"]
-            if row["expected"]
         ),
         by_source=_named(figures["by_source"], lambda row: str(row["name"])),
         groups=_groups(figures),
@@ -348,7 +341,7 @@ def _verdict(figures: dict[str, Any]) -> tuple[str, str]:
 
 def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
     average = figures["average_precision_half_radius"]
-    scale, again, state = figures["radial_scale"], figures["repeatability"], figures["degradation_state"]
+    scale, state = figures["radial_scale"], figures["degradation_state"]
     remarks = [
         f"Average precision within half a radius: {average['strict']:.3f} strict, {average['ignore_aware']:.3f} "
         "ignore-aware; by class "
@@ -358,10 +351,6 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
         + ".",
         f"Scale of the detections about the middle of the image: {_signed(scale['percent'])} ± "
         f"{scale['standard_error_percent']:.3f} %; −0.1 % reads as 30 m too high at 30 km.",
-        f"Repeatability: a crater found in one frame is found in another that shows it in "
-        f"{100 * again['value']:.0f} % of {again['pairs']} pairs of frames, which differ in Sun and pose "
-        f"({100 * again['chance']:.0f} % if detections were independent); in the frame that follows in the data set in "
-        f"{100 * again['next_frame']['value']:.0f} % of {again['next_frame']['pairs']}.",
         f"Craters of 3 to 5 km: precision {figures['class_3_to_5_km']['precision']:.2f}, recall "
         f"{figures['class_3_to_5_km']['recall']:.2f} strict, "
         f"{figures['class_3_to_5_km']['ignore_aware']['recall']:.2f} ignore-aware.",
@@ -383,19 +372,6 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
         )
         + "."
     )
-    seen = figures["visible"]
-    remarks.append(
-        f"Of the visible craters (visibility of at least {seen['visibility']:g}, {seen['expected']} of 5 to 30 km) "
-        f"{100 * seen['recall']:.0f} % are found, at a precision of {100 * seen['precision']:.0f} %; the visibility of "
-        f"{seen['unknown']} craters at the edge is unknown."
-    )
-    if "against_rims" in figures:
-        fitted, listed = figures["against_rims"]["refitted"], figures["against_rims"]["catalogue"]
-        remarks.append(
-            f"{fitted['pairs']} matched craters have a rim measured on the terrain: {fitted['median_px']:.2f} px "
-            f"median and {fitted['mean_px']:.2f} px mean from it, {listed['median_px']:.2f} and "
-            f"{listed['mean_px']:.2f} px from the catalogue's place."
-        )
     thirds = figures["recall_by_third_of_degradation"]
     if thirds:
         remarks.append(

@@ -114,8 +114,8 @@ class Tally:
     """Every detection and every wanted crater of a set of frames after matching, for one rule and one truth.
 
     Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
-    crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never),
-    visibility (NaN: unknown). Places in the image (u, v) and numbers of the frames say where and when;
+    crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
+    Places in the image (u, v) and numbers of the frames say where and when;
     matched_depth_ratio and matched_id are the crater's (NaN, -1: none), detection_depth_ratio what the network says
     (NaN: it does not).
     """
@@ -143,7 +143,6 @@ class Tally:
     crater_u: FloatArray
     crater_v: FloatArray
     crater_frame: IntArray
-    crater_visibility: FloatArray
 
     def select(self, detections: BoolArray, craters: BoolArray) -> Tally:
         """The part of a tally that masks of its detections and craters choose."""
@@ -199,13 +198,9 @@ def tally(
     high_m: float = CLASS_LIMITS_M[3],
     classes: tuple[int, ...] = (),
     ignore_aware: bool = False,
-    visible_from: float = 0.0,
     rule: MatchRule | None = None,
 ) -> Tally:
     """Match frame by frame. `classes` given: detections and craters of those size classes; else by diameter.
-
-    `visible_from` above 0 expects only craters of at least this visibility; detections of other catalogued craters
-    are then not counted.
 
     Detections are matched best first, so the outcome at every threshold is that of the detections above it.
     """
@@ -223,14 +218,11 @@ def tally(
             chosen = (found.diameter_m >= low_m) & (found.diameter_m <= high_m)
         if ignore_aware:
             wanted &= _could_be_seen(truth)
-        if visible_from > 0.0:
-            with np.errstate(invalid="ignore"):
-                wanted &= _visibility(truth) >= visible_from
         w = np.flatnonzero(wanted)
         d = np.flatnonzero(chosen)
         hit = match(found.u_px[d], found.v_px[d], truth.u_px[w], truth.v_px[w], truth.diameter_px[w], rule)
         outcome = (hit >= 0).astype(np.int8)
-        if ignore_aware or visible_from > 0.0:
+        if ignore_aware:
             other = np.flatnonzero(~wanted)
             near = match_any(
                 found.u_px[d],
@@ -243,7 +235,7 @@ def tally(
             outcome[(outcome == 0) & near] = -1
         parts.append(_detection_columns(number, truth, found, w, d, hit, outcome))
         craters.append(_crater_columns(number, truth, found.score[d], w, hit))
-    return Tally(*_columns(parts, 14), *_columns(craters, 10))
+    return Tally(*_columns(parts, 14), *_columns(craters, 9))
 
 
 def _in_frame(truth: FrameTruth) -> BoolArray:
@@ -254,11 +246,6 @@ def _in_frame(truth: FrameTruth) -> BoolArray:
         & (truth.v_px >= -0.5)
         & (truth.v_px <= truth.height_px - 0.5)
     )
-
-
-def _visibility(truth: FrameTruth) -> FloatArray:
-    """Return the visibility of craters, NaN where unknown."""
-    return np.full(truth.u_px.size, np.nan) if truth.visibility is None else truth.visibility
 
 
 def _could_be_seen(truth: FrameTruth) -> BoolArray:
@@ -327,7 +314,6 @@ def _crater_columns(
         truth.u_px[wanted],
         truth.v_px[wanted],
         np.full(wanted.size, number),
-        _visibility(truth)[wanted],
     )
 
 
@@ -402,20 +388,6 @@ def bootstrap_f1(tallied: Tally, threshold: float) -> tuple[float, float]:
     blocks = np.unique(np.concatenate([tallied.crater_block, tallied.detection_block]))
     f1 = _resampled_f1(tallied, threshold, blocks)
     return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
-
-
-def bootstrap_f1_difference(
-    tallied: Tally, reference: Tally, threshold: float, *, reference_threshold: float | None = None
-) -> tuple[float, float]:
-    """95 % interval of F1 less the reference's, both of the same frames, over the same resampled blocks of ground.
-
-    `reference_threshold` None takes the same threshold for both.
-    """
-    both = (tallied, reference)
-    blocks = np.unique(np.concatenate([c for t in both for c in (t.crater_block, t.detection_block)]))
-    limits = (threshold, threshold if reference_threshold is None else reference_threshold)
-    one, other = (_resampled_f1(t, limit, blocks) for t, limit in zip(both, limits, strict=True))
-    return float(np.percentile(one - other, 2.5)), float(np.percentile(one - other, 97.5))
 
 
 def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray) -> FloatArray:

@@ -1,6 +1,7 @@
-"""Fit of a network's calibration on validation frames: scores by size, the pull of the Sun, and position errors.
+"""Fit of a network's calibration on validation frames: standard deviations of the centres.
 
-Real terrain is used where there is any, as for the thresholds. Registration of the terrain (a displacement of the
+Real terrain is used where there is any, as for the thresholds. Detections that are probably craters, by their score
+and size, are paired with the catalogue. Registration of the terrain (a displacement of the
 catalogue from the drawn ground, metres east and north in each cell of 15 by 10 degrees) is estimated with the pull of
 the Sun and removed from the errors, since it is not the detector's.
 
@@ -11,7 +12,6 @@ scatter about the crater's own mean is new in every frame, the rest lasts.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -23,14 +23,9 @@ from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision.calibration import (
     CALIBRATION_KEY,
     REFERENCE_DIAMETER_PX,
-    Calibration,
-    ScoreModel,
     SigmaModel,
-    SunModel,
     format_calibration,
-    logit,
     sigma_features,
-    sun_directions,
     with_metadata,
 )
 from payload_emulator.flight.vision.detections import Detections
@@ -46,19 +41,9 @@ from payload_emulator.training.evaluate.evaluate import (
 from payload_emulator.training.evaluate.scoring import (
     FrameDetections,
     MatchRule,
-    best_threshold,
     match,
     tally,
-    threshold_for_precision,
 )
-from payload_emulator.training.model.calibrate import NAVIGATION_PRECISION
-
-ON_BOARD_PRECISION = 0.85
-"""Share of the detections of 3 to 30 km used on board that are catalogued craters, over the validation frames."""
-
-DEFAULT_PARTS = ("score", "sigma")
-"""The pull of the Sun is left out: on validation frames it is below 0.1 px at 20 px, with opposite signs on real and on
-procedural terrain."""
 
 _KNOTS_PX = (10.0, 14.0, 20.0, 32.0, 48.0, 80.0)
 _SCORED_M = (3_000.0, 30_000.0)
@@ -78,8 +63,7 @@ _FRESH_OUTLIER_SIGMAS = 6.0
 detection that jumps refuses a whole fix if the stated sigma is that of the quiet ones."""
 _ROUNDS = 6
 _RIDGE = 1e-3
-_THRESHOLDS = ("score_threshold", "f1_threshold", "navigation_threshold")
-_RAW_THRESHOLDS = "network_thresholds"
+_LARGEST_PULLED_PX = 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,22 +85,58 @@ class Pairs:
         return Pairs(*(getattr(self, one.name)[which] for one in fields(self)))
 
 
+@dataclass(frozen=True, slots=True)
+class ScoreModel:
+    """Logit of the probability: an offset, linear between knots of ln diameter_px, plus slope times logit of score."""
+
+    log_diameter_px: tuple[float, ...]
+    offset: tuple[float, ...]
+    slope: float
+
+    def probability(self, score: FloatArray, diameter_px: FloatArray) -> FloatArray:
+        """Probabilities (n,) of scores and diameters (n,)."""
+        size = np.log(np.maximum(diameter_px, 1e-3))
+        offset = np.interp(size, self.log_diameter_px, self.offset)
+        return np.asarray(1.0 / (1.0 + np.exp(-(offset + self.slope * logit(score)))))
+
+
+def logit(probability: FloatArray) -> FloatArray:
+    """Logarithm of the odds."""
+    inside = np.clip(probability, 1e-6, 1.0 - 1e-6)
+    return np.asarray(np.log(inside / (1.0 - inside)))
+
+
+def sun_directions(diameter_px: FloatArray, sun_in_camera: FloatArray) -> FloatArray:
+    """Displacements (n, 2, 3) in the image, right and down, of one unit of each coefficient of the pull of the Sun.
+
+    The first is toward the Sun, the second too but in proportion to the diameter (20 px: 1), the third across, to the
+    right of who looks toward the Sun, times the sine of twice the angle by which the Sun is to the right of the top of
+    the turned image.
+    """
+    azimuth = float(np.arctan2(sun_in_camera[0], -sun_in_camera[1]))
+    tilt = azimuth - 0.5 * np.pi * np.rint(azimuth / (0.5 * np.pi))
+    toward = np.array([np.sin(azimuth), -np.cos(azimuth)])
+    across = np.array([np.cos(azimuth), np.sin(azimuth)])
+    size = np.minimum(diameter_px, _LARGEST_PULLED_PX) / REFERENCE_DIAMETER_PX
+    one = np.ones_like(size)
+    return np.stack(
+        [one[:, None] * toward, size[:, None] * toward, one[:, None] * np.sin(2.0 * tilt) * across], axis=-1
+    )
+
+
 def plain_model(model_octets: bytes) -> bytes:
-    """The model without a calibration, with the thresholds that belong to the network's own scores."""
+    """The model without a calibration."""
     metadata = dict(OnnxDetector(model_octets).metadata)
     metadata.pop(CALIBRATION_KEY, None)
-    metadata |= json.loads(metadata.pop(_RAW_THRESHOLDS, "{}"))
     return with_metadata(model_octets, metadata)
 
 
 def fit_calibration(
     model_octets: bytes,
     datasets: Sequence[Dataset],
-    parts: Sequence[str] = DEFAULT_PARTS,
-    precision: float = ON_BOARD_PRECISION,
     progress: Callable[[Sequence[Any]], Iterable[Any]] = iter,
 ) -> tuple[bytes, dict[str, Any]]:
-    """The model with the named parts of a calibration, and what was fitted with its evidence.
+    """The model with its calibration, and what was fitted with its evidence.
 
     Raises
     ------
@@ -136,36 +156,18 @@ def fit_calibration(
         refuse_other_camera(detector, dataset)
     truths = [frame_truth(d, f) for d, f in frames]
     found = [detect_with_model(detector, d, f) for d, f in progress(frames)]
-    score = fit_score(truths, found)
-    pairs = _pairs(frames, truths, found, score)
-    sun, residual_px, evidence = fit_sun(pairs)
+    pairs = _pairs(frames, truths, found, fit_score(truths, found))
+    residual_px, evidence = fit_sun(pairs)
     sigma, sigma_evidence = fit_sigma(replace(pairs, error_px=residual_px))
-    calibration = Calibration(
-        score if "score" in parts else None,
-        sigma if "sigma" in parts else None,
-        sun if "sun" in parts else None,
-    )
-    thresholds = {name: float(detector.metadata.get(name, "0.4")) for name in _THRESHOLDS}
-    metadata = dict(detector.metadata)
-    if calibration.score is not None:
-        metadata[_RAW_THRESHOLDS] = json.dumps({name: metadata.get(name, "0.4") for name in _THRESHOLDS})
-        thresholds = _thresholds(truths, found, score, precision)
-        metadata |= {name: str(value) for name, value in thresholds.items()}
     notes = {
         "frames": len(frames),
         "pairs": int(pairs.place.size),
         "labels_sha256": [dataset.digest for dataset in datasets],
     }
-    if parts:
-        metadata[CALIBRATION_KEY] = format_calibration(calibration, plain, notes)
+    metadata = dict(detector.metadata) | {CALIBRATION_KEY: format_calibration(sigma, plain, notes)}
     document = {
         **notes,
-        "parts": list(parts),
-        "thresholds": thresholds,
-        "score_threshold_by_diameter_px": _raw_thresholds(score, thresholds["score_threshold"])
-        if calibration.score is not None
-        else [],
-        "sun": {"coefficients_px": list(sun.coefficients), **evidence},
+        "sun": evidence,
         "sigma": {"fresh": list(sigma.fresh), "total": list(sigma.total), **sigma_evidence},
     }
     return with_metadata(plain, metadata), document
@@ -209,43 +211,6 @@ def fit_score(truths: Sequence[FrameTruth], found: Sequence[FrameDetections]) ->
         if np.abs(step).max() < 1e-8:
             break
     return ScoreModel(tuple(float(x) for x in knots), tuple(float(x) for x in weight[:-1]), float(weight[-1]))
-
-
-def _raw_thresholds(score: ScoreModel, probability: float) -> list[dict[str, float]]:
-    """The network's own score at which the probability is reached, by diameter."""
-    wanted = float(logit(np.array(probability)))
-    return [
-        {
-            "diameter_px": float(np.exp(size)),
-            "score": float(1.0 / (1.0 + np.exp(-(wanted - offset) / score.slope))),
-        }
-        for size, offset in zip(score.log_diameter_px, score.offset, strict=True)
-    ]
-
-
-def _thresholds(
-    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], score: ScoreModel, precision: float
-) -> dict[str, float]:
-    """Thresholds of the calibrated score: on board, of the greatest F1, and of the precision for navigation."""
-    calibrated = []
-    for part in found:
-        moved = replace(part, score=score.probability(part.score, part.diameter_px))
-        calibrated.append(_ordered(moved, np.argsort(-moved.score, kind="stable")))
-    on_board = threshold_for_precision(
-        tally(truths, calibrated, low_m=_SCORED_M[0], high_m=_SCORED_M[1]), precision
-    )
-    tallied = tally(truths, calibrated)
-    balanced, _ = best_threshold(tallied)
-    navigation = max(on_board, threshold_for_precision(tallied, NAVIGATION_PRECISION))
-    return dict(
-        zip(_THRESHOLDS, (round(value, 3) for value in (on_board, balanced, navigation)), strict=True)
-    )
-
-
-def _ordered(part: FrameDetections, order: IntArray) -> FrameDetections:
-    columns = (getattr(part, one.name) for one in fields(part))
-    ordered: list[Any] = [None if values is None else values[order] for values in columns]
-    return FrameDetections(*ordered)
 
 
 def _pairs(
@@ -310,8 +275,8 @@ def _place(frame: Frame) -> int:
     )
 
 
-def fit_sun(pairs: Pairs) -> tuple[SunModel, FloatArray, dict[str, Any]]:
-    """The pull of the Sun with the registration of each cell, errors without both (n, 2), and standard errors.
+def fit_sun(pairs: Pairs) -> tuple[FloatArray, dict[str, Any]]:
+    """Errors (n, 2) without the pull of the Sun and the registration of each cell, and both with standard errors.
 
     Weighted least squares; pairs beyond 3.5 sigma are left out.
     """
@@ -335,6 +300,7 @@ def fit_sun(pairs: Pairs) -> tuple[SunModel, FloatArray, dict[str, Any]]:
     sigma = np.sqrt(np.diag(spread))
     of_cell = np.bincount(pairs.place[keep], minlength=cells)
     evidence = {
+        "coefficients_px": [float(value) for value in solution[:count]],
         "standard_errors_px": [float(value) for value in sigma[:count]],
         "registration": [
             {
@@ -346,7 +312,7 @@ def fit_sun(pairs: Pairs) -> tuple[SunModel, FloatArray, dict[str, Any]]:
             for k in range(cells)
         ],
     }
-    return SunModel(tuple(float(value) for value in solution[:count])), residual, evidence
+    return residual, evidence
 
 
 def fit_sigma(pairs: Pairs) -> tuple[SigmaModel, dict[str, Any]]:
@@ -434,11 +400,7 @@ def _log_linear(
 
 def format_calibration_figures(document: dict[str, Any]) -> str:
     """What was fitted, in lines."""
-    thresholds, sun, sigma = document["thresholds"], document["sun"], document["sigma"]
-    limits = ", ".join(
-        f"{row['score']:.2f} at {row['diameter_px']:.0f} px"
-        for row in document["score_threshold_by_diameter_px"]
-    )
+    sun, sigma = document["sun"], document["sigma"]
     pulls = ", ".join(
         f"{name} {value:+.3f} ± {error:.3f}"
         for name, value, error in zip(
@@ -449,11 +411,7 @@ def format_calibration_figures(document: dict[str, Any]) -> str:
         )
     )
     lines = [
-        f"{document['frames']} validation frames, {document['pairs']} detections of catalogued craters; parts "
-        f"{', '.join(document['parts']) or 'none'}",
-        f"threshold on board {thresholds['score_threshold']:.2f}, balanced {thresholds['f1_threshold']:.2f}, "
-        f"navigation {thresholds['navigation_threshold']:.2f}; score of the network on board: "
-        f"{limits or 'the same for all sizes'}",
+        f"{document['frames']} validation frames, {document['pairs']} detections of catalogued craters",
         f"pull of the Sun px: {pulls}",
         f"sigma: mean square error over variance {sigma['mean_square_over_variance']:.2f}, "
         f"{100 * sigma['outlier_share']:.1f} % outliers",

@@ -30,7 +30,6 @@ from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.data.landmarks import Landmarks, with_landmarks
-from payload_emulator.training.data.refits import RefittedRims, refitted_frame
 from payload_emulator.training.model.curves import append_curve
 
 if TYPE_CHECKING:
@@ -58,19 +57,16 @@ def train(
     *,
     start_from: Path | None = None,
     landmarks: Landmarks | None = None,
-    rims: RefittedRims | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Train (or resume) a run; the best validation figures come back.
 
-    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists, `rims` circles measured on
-    the terrain that replace those of the catalogue.
+    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists.
 
     Raises
     ------
     DatasetError
-        No training or no validation frames, data sets of different cameras, rims of other craters, or a run begun with
-        other rims.
+        No training or no validation frames, or data sets of different cameras.
     """
     import cv2
     import torch
@@ -78,7 +74,9 @@ def train(
     from payload_emulator.training.model.model import CraterNet
     from payload_emulator.training.model.restore import count_statistics
 
-    frames, moved = _training_frames(datasets, landmarks, rims)
+    frames = [(d, f) for d in datasets for f in d.frames("train")]
+    if landmarks is not None:
+        frames = [(d, with_landmarks(d, f, landmarks)) for d, f in frames]
     validation = [(d, f) for d in datasets for f in d.frames("val")]
     _check_datasets(datasets, frames, validation, parameters)
     run.mkdir(parents=True, exist_ok=True)
@@ -104,7 +102,7 @@ def train(
         origin = _start_from(start_from, network, average)
         report(f"started from {start_from.name}")
     images = _load_images(frames, report, parameters.preparation is Preparation.normalise_first)
-    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin, moved)
+    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
     feeder = Feeder(frames, images, parameters)
     if origin is not None and start_from is not None and start_from.suffix == ".onnx":
         count_statistics(network, feeder, average)
@@ -122,31 +120,6 @@ def train(
         "train_frames": len(frames),
         "validation_frames": len(validation),
     }
-
-
-def _training_frames(
-    datasets: Sequence[Dataset],
-    landmarks: Landmarks | None,
-    rims: RefittedRims | None,
-) -> tuple[list[tuple[Dataset, Frame]], int]:
-    """Return the frames to learn from, with landmarks and on measured rims, and how many craters were moved to rims.
-
-    Raises
-    ------
-    DatasetError
-        Rims are given, but none is of a crater of these frames.
-    """
-    frames = [(d, f) for d in datasets for f in d.frames("train")]
-    moved = 0
-    if rims is not None:
-        placed = [(d, *refitted_frame(d, f, rims)) for d, f in frames]
-        moved = sum(int(np.count_nonzero(known)) for _, _, known in placed)
-        frames = [(d, f) for d, f, _ in placed]
-        if frames and not moved:
-            raise DatasetError(
-                f"training, rims: expected rims of craters in the training frames, found none among {len(rims)}"
-            )
-    return frames if landmarks is None else [(d, with_landmarks(d, f, landmarks)) for d, f in frames], moved
 
 
 def _check_datasets(
@@ -496,17 +469,11 @@ def _write_run(
     replicas: int,
     device: str,
     origin: dict[str, Any] | None,
-    moved: int,
 ) -> None:
     path = run / "run.json"
     if path.is_file():
         before = json.loads(path.read_text(encoding="utf-8"))
         origin = before.get("started_from") if origin is None else origin
-        if before.get("labels_on_rims", 0) != moved:
-            raise DatasetError(
-                f"{path}: expected the rims that the run began with ({before.get('labels_on_rims', 0)} labels on "
-                f"rims), found {moved} labels on rims"
-            )
     document = {
         "parameters": asdict(parameters),
         "model": config,
@@ -516,6 +483,5 @@ def _write_run(
         "replicas": replicas,
         "device": device,
         "started_from": origin,
-        "labels_on_rims": moved,
     }
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")

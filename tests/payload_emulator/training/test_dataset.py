@@ -281,17 +281,6 @@ def test_what_can_be_seen_is_a_label_and_the_rest_is_ignored(change, tier):
     assert 0.3 <= weights[0] <= 1.0
 
 
-def test_labels_by_visibility_ignore_what_is_hidden_and_weigh_what_is_seen():
-    def tier_and_weight(seen, **change):
-        tiers, weights = store.choose_tiers(craters(**change), 512, 512, False, seen=np.array([seen]))
-        return tiers[0], weights[0]
-
-    assert tier_and_weight(0.1, depth_ratio=0.15)[0] == Tier.IGNORE
-    assert tier_and_weight(0.3)[0] == tier_and_weight(np.nan)[0] == Tier.LABEL
-    assert tier_and_weight(0.21)[1] < tier_and_weight(0.35)[1] < tier_and_weight(0.6)[1] == 1.0
-    assert tier_and_weight(np.nan)[1] == store.LABEL_LEAST_WEIGHT
-
-
 def test_deeper_craters_weigh_more():
     _, shallow = store.choose_tiers(craters(depth_ratio=0.03), 512, 512, False)
     _, deep = store.choose_tiers(craters(depth_ratio=0.1), 512, 512, False)

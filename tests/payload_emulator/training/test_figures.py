@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.metrics import Scene, Thresholds, repeatability, score
+from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.scoring import FrameDetections, average_precision, tally
 
 THRESHOLDS = Thresholds(0.5, 0.3, 0.7)
@@ -121,22 +121,6 @@ def test_no_detections_at_all_give_nan_and_zero_rather_than_an_error():
     assert figures["micro"]["recall"] == 0.0
     assert np.isnan(figures["radial_scale"]["percent"])
     assert figures["sigma_calibration"]["pairs"] == 0
-
-
-def test_repeatability_is_counted_over_ordered_pairs_of_frames():
-    # One crater in three frames, found in two: ordered pairs (found, other) 4, of which found again 2.
-    parts = [scene([100], [100], found=[hit]) for hit in (True, True, False)]
-    value = repeatability(tally([t for t, _ in parts], [d for _, d in parts]), 0.5)
-    assert value["pairs"] == 4
-    assert value["value"] == pytest.approx(0.5)
-    assert value["chance"] == pytest.approx(2 / 3)
-
-
-def test_repeatability_from_one_frame_to_the_next_counts_neighbours_only():
-    # Found, found, missed, found: of the two followed by a frame that shows it, one is found again.
-    parts = [scene([100], [100], found=[hit]) for hit in (True, True, False, True)]
-    following = repeatability(tally([t for t, _ in parts], [d for _, d in parts]), 0.5)["next_frame"]
-    assert following == {"pairs": 2, "value": pytest.approx(0.5)}
 
 
 def test_recall_of_clear_craters_leaves_worn_ones_out_and_names_its_interval():

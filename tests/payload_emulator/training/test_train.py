@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from payload_emulator.errors import DatasetError, ModelError
+from payload_emulator.training.data import feeder as feeding
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.data.landmarks import Landmarks
-from payload_emulator.training.data.refits import RefittedRims
 from payload_emulator.training.model import train as training
 from payload_emulator.training.model.export import load_network
 from payload_emulator.training.model.train import train
@@ -144,63 +144,17 @@ def test_landmarks_are_labels_of_the_second_round(blob_dataset, tmp_path, monkey
     assert seen[1] - seen[0] == len(blob_dataset.frames("train"))
 
 
-def one_rim(number):
-    return RefittedRims(np.array([number]), *(np.array([value]) for value in (0.0, 0.0, 8_000.0, 0.0)))
-
-
-def test_labels_are_the_rims_of_a_table(blob_dataset, tmp_path, monkeypatch):
-    """Training sees what `refitted_frame` makes of each frame; the run states the labels and resumes with them only."""
-    moved = []
-
-    def shifted(dataset, frame, rims):
-        craters = {**frame.craters, "u_px": frame.craters["u_px"] + 3.0}
-        moved.append(replace(frame, craters=craters))
-        return moved[-1], np.arange(craters["u_px"].size) == 0
-
-    monkeypatch.setattr(training, "refitted_frame", shifted)
-    seen = []
-    original = training.Feeder.__init__
-
-    def watched(self, frames, *rest):
-        seen.extend(frame for _, frame in frames)
-        original(self, frames, *rest)
-
-    monkeypatch.setattr(training.Feeder, "__init__", watched)
-    train([blob_dataset], tmp_path, replace(SHORT, steps=1), rims=one_rim(3))
-    assert seen and all(frame is other for frame, other in zip(seen, moved, strict=True))
-    assert json.loads((tmp_path / "run.json").read_text())["labels_on_rims"] == len(seen)
-    with pytest.raises(
-        DatasetError, match=r"expected the rims that the run began with \(24 labels on rims\)"
-    ):
-        train([blob_dataset], tmp_path, replace(SHORT, steps=2))
-
-
-def test_rims_of_other_craters_are_refused(blob_dataset, tmp_path):
-    with pytest.raises(
-        DatasetError, match="expected rims of craters in the training frames, found none among 1"
-    ):
-        train([blob_dataset], tmp_path, replace(SHORT, steps=1), rims=one_rim(99_999_999))
-
-
-def test_the_weight_of_small_craters_is_bounded_below(blob_dataset):
-    """Weights grow with the diameter from the stated share on; with 1.0 small craters count as those of 28 px."""
+def test_the_weight_of_small_craters_is_bounded_below(blob_dataset, monkeypatch):
+    """Weights grow with the diameter from the least emphasis on."""
     frames = [(blob_dataset, frame) for frame in blob_dataset.frames("train")]
     images = [blob_dataset.gray(frame) for _, frame in frames]
 
     def least(share):
-        parameters = replace(SHORT, soft_labels=False, least_emphasis=share)
-        weight = Feeder(frames, images, parameters).batch(0, 24)["weight"]
+        monkeypatch.setattr(feeding, "LEAST_EMPHASIS", share)
+        weight = Feeder(frames, images, SHORT).batch(0, 24)["weight"]
         return weight[weight > 0.0].min()
 
-    assert least(0.05) < least(0.9) < 1.0
-    assert least(0.9) == pytest.approx(0.9)
-    assert least(1.0) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("share", [-0.1, 4.1, float("nan")])
-def test_a_least_emphasis_without_meaning_is_refused(share):
-    with pytest.raises(DatasetError, match="least emphasis: expected 0 to 4, found"):
-        replace(SHORT, least_emphasis=share)
+    assert least(0.05) < least(0.9) < least(1.0) <= 1.0
 
 
 @pytest.mark.parametrize(("splits", "lacking"), [({"test": 1}, "train"), ({"train": 1}, "val")])
