@@ -57,24 +57,33 @@ class ReceivedLink(Entity):
     sections: tuple[ReceivedSection, ...]
 
 
-class ReceivedControlWords(Entity):
-    """Telecommand channel of a spacecraft as reported in the frames of one file, see `tmtc.clcw.UplinkSeen`."""
+class ControlWords(Entity):
+    """Telecommand channel as its command link control words show it, see `tmtc.clcw.UplinkSeen`."""
 
-    spacecraft_id: int
-    virtual_channel: int
-    frames: int
-    changes: int
+    virtual_channel: int = Field(ge=0, le=63, examples=[0])
+    frames: int = Field(
+        description="Frames of the reception that carry a word of the channel", examples=[120]
+    )
+    changes: int = Field(description="Number of changes of the word in the reception")
     frames_lockout: int
     frames_wait: int
     frames_retransmit: int
     frames_no_rf: int
-    report_value: int
-    farm_b_counter: int
-    lockout: bool
+    report_value: int = Field(
+        ge=0, le=255, description="Number of the sequence-controlled frame that is expected next"
+    )
+    farm_b_counter: int = Field(ge=0, le=3, description="Expedited frames accepted, modulo 4", examples=[3])
+    lockout: bool = Field(description="Flags are those of the newest word")
     wait: bool
     retransmit: bool
     no_rf_available: bool
     no_bit_lock: bool
+
+
+class ReceivedControlWords(ControlWords):
+    """Telecommand channel of a spacecraft as reported in the frames of one file."""
+
+    spacecraft_id: int
 
 
 class IngestResult(Entity):

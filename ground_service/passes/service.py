@@ -22,6 +22,7 @@ from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import sample_store, store
 from ground_service.passes.cache import Cache
+from ground_service.passes.core import Buckets
 from ground_service.passes.model import (
     Crater,
     Detection,
@@ -49,7 +50,6 @@ from ground_service.passes.span import (
     pass_span,
     vehicle_span,
 )
-from ground_service.passes.trends import trend_of
 from ground_service.store import rollups
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
@@ -57,7 +57,10 @@ from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from reports.values import PacketAccounting
 from tmtc.dictionary import DICTIONARY
+from tmtc.schema import Field
 
+DAY_NS = 86_400_000_000_000
+LIMIT_STATES = ("within", "warning", "alarm")
 TREND_DAYS = 30
 TREND_POINTS = 60
 
@@ -321,4 +324,35 @@ def _trends(connection: Connection, vehicle: int) -> list[Trend]:
     definition = DICTIONARY.packet("housekeeping")
     read = reading.series({name: definition.field(name).unit for name in PARAMETERS})
     trends = (trend_of(definition.field(one.name), one.buckets) for one in read)
-    return [Trend.of(asdict(trend)) for trend in trends if trend is not None]
+    return [trend for trend in trends if trend is not None]
+
+
+def trend_of(field: Field, buckets: Buckets) -> Trend | None:
+    """The trend of a parameter from its stretches; None where there are no samples."""
+    total = int(buckets.count.sum())
+    if total == 0:
+        return None
+    low, high = float(buckets.low.min()), float(buckets.high.max())
+    worst = int(field.limit_states(np.array([low, high])).max())
+    return Trend(
+        parameter=field.name,
+        unit=field.unit,
+        samples=total,
+        low=low,
+        high=high,
+        mean=float(np.sum(buckets.mean * buckets.count) / total),
+        slope_per_day=_slope_per_day(buckets),
+        limit_state=LIMIT_STATES[worst],
+    )
+
+
+def _slope_per_day(buckets: Buckets) -> float:
+    """Least squares through the means at the middles of the stretches, weighted by their samples."""
+    middle = (buckets.start_utc_ns // 2 + buckets.stop_utc_ns // 2).astype(np.float64)
+    days = (middle - middle[0]) / DAY_NS
+    weight = buckets.count.astype(np.float64)
+    days = days - np.average(days, weights=weight)
+    square = float(np.sum(weight * days**2))
+    if len(days) < 2 or square <= 0.0:
+        return float("nan")
+    return float(np.sum(weight * days * (buckets.mean - np.average(buckets.mean, weights=weight))) / square)

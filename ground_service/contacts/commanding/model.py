@@ -10,6 +10,7 @@ from pydantic import Field
 from ground_service.contacts.commanding.core import DUPLICATE, STAGES, CommandFate
 from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
+from ground_service.ingest.model import ControlWords
 from ground_service.text import LINE_PATTERN_JSON
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.codes import FAILURES
@@ -171,27 +172,9 @@ class CommandView:
         )
 
 
-class UplinkChannel(Entity):
-    """A telecommand channel as the command link control words of one reception show it; flags are of the last word."""
+class UplinkChannel(ControlWords):
+    """A telecommand channel as the newest reception shows it."""
 
-    virtual_channel: int = Field(ge=0, le=63, examples=[0])
-    report_value: int = Field(
-        ge=0, le=255, description="Number of the sequence-controlled frame that is expected next"
-    )
-    farm_b_counter: int = Field(ge=0, le=3, description="Expedited frames accepted, modulo 4", examples=[3])
-    lockout: bool
-    wait: bool
-    retransmit: bool
-    no_rf_available: bool
-    no_bit_lock: bool
-    frames: int = Field(
-        description="Frames of the reception that carry a word of the channel", examples=[120]
-    )
-    changes: int = Field(description="Number of changes of the word in the reception")
-    frames_lockout: int
-    frames_wait: int
-    frames_retransmit: int
-    frames_no_rf: int
     ingest_id: int = Field(examples=[1])
     received: UtcTime
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
+from typing import Any, TypeVar
 
-from ground_service.evaluation.performance.model import PassPerformance, Performance
+from ground_service.evaluation.performance.model import Performance
+from ground_service.http.model import Entity
 from reports.values import (
     HeadlineFigure,
     LevelChange,
@@ -13,6 +16,8 @@ from reports.values import (
     MonthPass,
     RequirementOverTime,
 )
+
+Value = TypeVar("Value", MonthPass, MeanByGroup, LevelChange, RequirementOverTime)
 
 
 def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
@@ -29,47 +34,13 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
         verdict_level=level,
         evidence_level=levels[0] if len(levels) == 1 else "",
         headline=_headline(found),
-        passes=tuple(_month_pass(one) for one in found.passes),
-        groups=tuple(
-            MeanByGroup(
-                one.factor,
-                one.group,
-                one.metric,
-                one.passes,
-                _number(one.mean),
-                _number(one.low),
-                _number(one.high),
-            )
-            for one in found.groups
+        passes=tuple(
+            _value(MonthPass, one, start_utc_ns=one.start.utc_ns, estimator=one.estimator or "")
+            for one in found.passes
         ),
-        changes=tuple(
-            LevelChange(
-                one.metric,
-                one.pass_id,
-                one.time.utc_ns,
-                one.before,
-                one.after,
-                one.passes_before,
-                one.passes_after,
-                one.p_value,
-            )
-            for one in found.changes
-        ),
-        requirements=tuple(
-            RequirementOverTime(
-                one.name,
-                one.unit,
-                one.limit,
-                one.passes,
-                one.met,
-                one.not_met,
-                one.unknown,
-                _number(one.share_met),
-                _number(one.low),
-                _number(one.high),
-            )
-            for one in found.requirements
-        ),
+        groups=tuple(_value(MeanByGroup, one) for one in found.groups),
+        changes=tuple(_value(LevelChange, one, utc_ns=one.time.utc_ns) for one in found.changes),
+        requirements=tuple(_value(RequirementOverTime, one, limit=one.limit) for one in found.requirements),
         window_days=found.window_days,
         false_alarm_rate=found.false_alarm_rate,
         provenance={
@@ -124,24 +95,9 @@ def _headline(found: Performance) -> tuple[HeadlineFigure, ...]:
     )
 
 
-def _month_pass(one: PassPerformance) -> MonthPass:
-    return MonthPass(
-        one.pass_id,
-        one.name,
-        one.start.utc_ns,
-        one.estimator or "",
-        _number(one.recall),
-        _number(one.drift_percent),
-        _number(one.median_error_m),
-        _number(one.altitude_km),
-        _number(one.sun_elevation_deg),
-        one.terrain,
-        one.build,
-        one.packets,
-        one.packets_lost,
-        one.verdict_level,
-    )
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+def _value(kind: type[Value], entity: Entity, **values: Any) -> Value:
+    """Return the fields of an entity as a value of a report, NaN where unknown; `values` replace them."""
+    names = (one.name for one in fields(kind))
+    found = {name: values[name] if name in values else getattr(entity, name) for name in names}
+    unknown = {name: math.nan for name, value in found.items() if value is None and name not in values}
+    return kind(**found | unknown)

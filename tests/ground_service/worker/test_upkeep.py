@@ -15,8 +15,7 @@ from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
 from ground_service.passes.core import downsample
-from ground_service.passes.service import spacecraft_trends
-from ground_service.passes.trends import trend_of
+from ground_service.passes.service import spacecraft_trends, trend_of
 from ground_service.regression.archives import working_folder
 from ground_service.store import repository
 from ground_service.store.events import publish
