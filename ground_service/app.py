@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI
@@ -17,7 +20,7 @@ from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
 from ground_service.http.limits import BodyLimit, HeadersAndTags, LastRequests
-from ground_service.http.openapi import DescribedApi
+from ground_service.http.model import Problem
 from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
@@ -38,6 +41,20 @@ from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
 from ground_service.worker.scheduler import Scheduler
+
+_PAGE = re.compile(r"PageOf_(\w+?)_(?=\")")
+
+
+class DescribedApi(FastAPI):
+    """Application whose OpenAPI document has problem documents as errors and pages named after their entity."""
+
+    def openapi(self) -> dict[str, Any]:
+        if self.openapi_schema is None:
+            document: dict[str, Any] = super().openapi()
+            document["components"]["schemas"]["Problem"] = Problem.model_json_schema()
+            self.openapi_schema = json.loads(_PAGE.sub(r"\1Page", json.dumps(document)))
+        return self.openapi_schema
+
 
 log = logging.getLogger(__name__)
 

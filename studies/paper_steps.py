@@ -243,8 +243,8 @@ def sample_dataset(shop: Workshop) -> dict[str, Any]:
     folder = shop.out / f"samples-{recipe.digest[:8]}-{shop.effort.sample_frames}"
 
     def make() -> dict[str, Any]:
+        from payload_emulator.training.data.integrity import summarise
         from payload_emulator.training.data.sheet import draw_sheet
-        from payload_emulator.training.data.summary import summarise
 
         _build(shop, recipe, folder, shop.effort.sample_frames)
         sheet = draw_sheet(Dataset(folder), "", SAMPLE_COLUMNS, SAMPLE_ROWS, 320)

@@ -58,7 +58,7 @@ def test_every_import_contract_is_kept() -> None:
         ("lunar/camera.py", "import tmtc"),
         ("ground_service/evaluation/core.py", "import sqlalchemy"),
         ("ground_service/ingest/service.py", "import ground_service.evaluation.service"),
-        ("payload_emulator/sim/render/lens.py", "import payload_emulator.session.world"),
+        ("payload_emulator/sim/render/renderer.py", "import payload_emulator.session.world"),
         ("tmtc/tables.py", "import lunar.constants"),
     ],
 )

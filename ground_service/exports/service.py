@@ -26,8 +26,7 @@ from ground_service.exports import messages
 from ground_service.exports.formats import FORMATS, Format
 from ground_service.exports.maps import MAPS, map_octets
 from ground_service.exports.model import ExportFormatInfo, ExportRequest
-from ground_service.exports.packet_files import parquet_files
-from ground_service.exports.table_files import csv_files, netcdf_octets
+from ground_service.exports.table_files import csv_files, netcdf_octets, parquet_files
 from ground_service.exports.tables import pass_tables
 from ground_service.ground import Ground
 from ground_service.missions.timekeeping.store import load_correlations

@@ -11,14 +11,20 @@ import csv
 import io
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ground_service.exports.tables import Column, Table
+from lunar.timescales import parse_utc
 from tmtc.errors import MissingLibrary
+from tmtc.export import Record, column_metadata, record_columns
+from tmtc.parquet import parquet_octets
+
+_UTC = {"utc": {"description": "time of the packet: on-board time with the time correlation of the pass"}}
+
 
 CSV_METADATA = "csv-metadata.json"
 _UTC_UNITS = "nanoseconds since 1970-01-01T00:00:00"
@@ -109,3 +115,25 @@ def _variable(table: Table, column: Column) -> Any:
         # The file takes texts of a fixed length, and an empty array has none.
         values = values.astype("U") if len(values) else values.astype("U1")
     return (f"{table.name}_row", values, attributes)
+
+
+def parquet_files(
+    packets: Iterable[tuple[str, bool, list[Record]]], about: Mapping[str, str]
+) -> Iterator[tuple[str, bytes]]:
+    """Yield name and content of a file for each packet type.
+
+    UTC is a time stamp; the metadata of a column state its unit and description.
+
+    Raises
+    ------
+    MissingLibrary
+        If pyarrow is not installed.
+    """
+    for name, own, records in packets:
+        columns = record_columns(records)
+        columns["utc"] = [parse_utc(str(text)) for text in columns["utc"]]
+        stated = column_metadata(name) if own else {}
+        octets = parquet_octets(
+            columns, utc_columns=("utc",), fields={**stated, **_UTC}, about={**about, "packet": name}
+        )
+        yield f"{name.replace('/', '.')}.parquet", octets

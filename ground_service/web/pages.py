@@ -18,15 +18,15 @@ from fastapi.responses import RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from ground_service.access.security import caller_of
-from ground_service.errors import NotAuthorised, NotFound
+from ground_service.errors import InvalidInput, NotAuthorised, NotFound
 from ground_service.evaluation.performance.store import get_monthly_report
 from ground_service.evaluation.store import get_report
+from ground_service.evaluation.surface import albedo_picture
 from ground_service.ground import Ground
 from ground_service.http.common import Key
 from ground_service.missions.model import Approval
 from ground_service.passes.series import STATE_VALUES
 from ground_service.regression.service import report_of
-from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.schema import Field, PacketDefinition
 
@@ -295,3 +295,21 @@ def _field(field: Field) -> dict[str, Any]:
         "warning": field.warning,
         "alarm": field.alarm,
     }
+
+
+@lru_cache(maxsize=2)
+def basemap_jpeg(path: Path) -> bytes:
+    """The map, half as high as it is wide, its grey values stretched over the whole range.
+
+    Raises
+    ------
+    InvalidInput
+        If the file is no picture.
+    """
+    import cv2
+
+    picture = albedo_picture(path)
+    good, octets = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    if not good:
+        raise InvalidInput(str(path), "", "a map that can be written as JPEG", str(picture.shape))
+    return octets.tobytes()

@@ -14,7 +14,7 @@ import contextlib
 import json
 import logging
 from collections import Counter, deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,15 +25,43 @@ from starlette.concurrency import run_in_threadpool
 from ground_service.access.security import SESSION_COOKIE
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.clock import utc_now_ns
-from ground_service.errors import GroundError, NotAuthorised
+from ground_service.errors import GroundError, NotAuthorised, NotFound
 from ground_service.events import TelemetryReceived, last_number, read_events
 from ground_service.ground import Ground
 from ground_service.http.problems import problem
 from ground_service.http.proxies import address_key
 from ground_service.http.times import time_text
+from ground_service.passes.live import newest_packets
 from ground_service.store.events import LoggedEvent
 from ground_service.store.wakeups import listen
-from ground_service.web.newest import NewestValues, Source
+
+Source = tuple[int, str]
+"""Vehicle and kind of packet: a message replaces an older one of the same source that was not sent yet."""
+
+
+class NewestValues:
+    """Newest packets of the vehicles as they were last sent."""
+
+    def __init__(self, ground: Ground) -> None:
+        self._ground = ground
+        self._sent: dict[Source, str] = {}
+
+    def changed(self, vehicles: Iterable[int]) -> list[tuple[Source, str]]:
+        """Return the newest packets of vehicles that were not returned before, as JSON."""
+        found = []
+        for vehicle in sorted(vehicles):
+            try:
+                packets = newest_packets(self._ground, vehicle)
+            except NotFound:
+                continue
+            for packet in packets:
+                source = (vehicle, packet.packet)
+                known = packet.model_dump_json(exclude={"age_s"})
+                if self._sent.get(source) != known:
+                    self._sent[source] = known
+                    found.append((source, packet.model_dump_json()))
+        return found
+
 
 log = logging.getLogger(__name__)
 

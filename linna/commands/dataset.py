@@ -44,7 +44,7 @@ def _build(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
     from payload_emulator.session.recipe import load_recipe
     from payload_emulator.training.data.build import build
-    from payload_emulator.training.data.summary import summarise
+    from payload_emulator.training.data.integrity import summarise
 
     chosen = {key: getattr(arguments, key) for key in ("seed", "bits", "renderer")}
     recipe = dataclasses.replace(
@@ -76,8 +76,7 @@ def _build(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
-    from payload_emulator.training.data.integrity import check
-    from payload_emulator.training.data.summary import summarise
+    from payload_emulator.training.data.integrity import check, summarise
 
     problems = check(arguments.folder)
     for problem in problems:
@@ -91,7 +90,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _stats(arguments: argparse.Namespace) -> int:
     from linna.output import emit
-    from payload_emulator.training.data.summary import summarise
+    from payload_emulator.training.data.integrity import summarise
 
     figures = summarise(arguments.folder)
     return emit(arguments, figures, _text(figures))

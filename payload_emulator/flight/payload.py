@@ -21,8 +21,7 @@ from payload_emulator.flight.onboard.housekeeping import StageTimer
 from payload_emulator.flight.onboard.housekeeping_packets import send_large_data, send_structure
 from payload_emulator.flight.onboard.instrument_suite import NO_SAMPLES, Samples
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
-from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation
-from payload_emulator.flight.onboard.memory import ProtectedMemory
+from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation, ProtectedMemory
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
 from payload_emulator.flight.onboard.parameters import ParameterStore

@@ -41,7 +41,7 @@ from payload_emulator.flight.navigation.attitude_monitor import (
     is_examined,
     monitored,
 )
-from payload_emulator.flight.navigation.correction import Fix, correct
+from payload_emulator.flight.navigation.correction import Fix, correct, is_usable, predicted
 from payload_emulator.flight.navigation.dynamics import OrbitModel, process_noise
 from payload_emulator.flight.navigation.filter import FilterState
 from payload_emulator.flight.navigation.landmark_map import (
@@ -53,7 +53,6 @@ from payload_emulator.flight.navigation.landmark_map import (
 )
 from payload_emulator.flight.navigation.lost_in_space import PlaceIndex, place_index
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.flight.navigation.prediction import is_usable, predicted
 from payload_emulator.flight.navigation.relative import Remembered, tie, with_clone, without_clone
 from payload_emulator.flight.navigation.scalar import Innovation, ScalarMeasurement, scalar_update
 from payload_emulator.flight.navigation.sighting import (

@@ -17,17 +17,64 @@ from payload_emulator.flight.onboard.housekeeping import (
     Structure,
 )
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightParameters, FlightTables
-from payload_emulator.flight.onboard.memory import ProtectedMemory
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
 from payload_emulator.flight.onboard.parameters import ParameterStore
 from payload_emulator.flight.onboard.schedule import Schedule
 from payload_emulator.flight.onboard.settings import Settings
-from payload_emulator.flight.ports import Board, Load
+from payload_emulator.flight.ports import Board, Load, Memory
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.telemetry.store import PacketStore
 from tmtc.dictionary import STRUCTURES
 from tmtc.large_data import LargeDataReceiver
+from tmtc.tables import table_hash
+
+
+@dataclass(slots=True, eq=False)
+class ProtectedMemory:
+    """Regions of working memory, by number of the dictionary's table of tables.
+
+    Attributes
+    ----------
+    repairs
+        Regions restored since boot.
+    """
+
+    board: Board
+    repairs: int = 0
+    _regions: dict[int, Memory] = field(default_factory=dict)
+    _hashes: dict[int, int] = field(default_factory=dict)
+
+    def load(self, number: int, octets: bytes, *, keep: bool = True) -> None:
+        """Put octets into working memory, and keep a copy that survives resets."""
+        if keep and self.board.read_table(number) != octets:
+            self.board.write_table(number, octets)
+        self._regions[number] = self.board.load(number, octets)
+        self._hashes[number] = table_hash(octets)
+
+    def hash_of(self, number: int) -> int:
+        """First 32 bits of the SHA-256 of what was loaded, 0 where nothing was."""
+        return self._hashes.get(number, 0)
+
+    def damaged(self) -> list[tuple[int, int]]:
+        """(region, hash found) of every region that is not what was loaded."""
+        found = [(number, table_hash(memory.tobytes())) for number, memory in self._regions.items()]
+        return [(number, value) for number, value in found if value != self._hashes[number]]
+
+    def repair(self, number: int) -> bytes | None:
+        """Restore a region from its kept copy; its octets, None where that copy is damaged too."""
+        octets = self.board.read_table(number)
+        if not octets or table_hash(octets) != self._hashes[number]:
+            return None
+        self._regions[number] = self.board.load(number, octets)
+        self.repairs += 1
+        return octets
+
+    @property
+    def octets(self) -> int:
+        """Octets of all regions."""
+        return sum(memory.size for memory in self._regions.values())
+
 
 PARAMETERS_NUMBER = 4
 _UPLINK_LIMIT_OCTETS = 16 << 20

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
 from lunar.lens import BrownCamera
 from payload_emulator.errors import TerrainError
-from payload_emulator.sim.render.lens import pixel_shifts
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.terrain.photograph import PhotographTerrain
@@ -422,3 +422,14 @@ def _incoming_shadow(
         np.asarray(np.interp(places, index, shadow), dtype=np.float32),
         np.asarray(np.interp(places, index, distance), dtype=np.float32),
     )
+
+
+@lru_cache(maxsize=4)
+def pixel_shifts(camera: BrownCamera) -> tuple[Image, Image]:
+    """Where every pixel of the picture would lie without distortion, less where it lies: u and v (H, W) in pixels."""
+    v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
+    ideal = camera.focal_px * camera.undistorted(np.stack([u, v], axis=-1)) + np.array(camera.centre_px)
+    shift_u, shift_v = (ideal[..., 0] - u).astype(np.float32), (ideal[..., 1] - v).astype(np.float32)
+    shift_u.setflags(write=False)
+    shift_v.setflags(write=False)
+    return shift_u, shift_v

@@ -11,6 +11,7 @@ run.json (settings and provenance).
 from __future__ import annotations
 
 import copy
+import csv
 import hashlib
 import json
 import math
@@ -30,7 +31,23 @@ from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.data.landmarks import Landmarks, with_landmarks
-from payload_emulator.training.model.curves import append_curve
+
+CURVE_COLUMNS = (
+    "step",
+    "minutes",
+    "total",
+    "heat",
+    "offset",
+    "diameter",
+    "sigma",
+    "depth",
+    "f1",
+    "precision",
+    "recall",
+    "loc_px",
+    "threshold",
+)
+
 
 if TYPE_CHECKING:
     from payload_emulator.training.model.model import ModelConfig
@@ -485,3 +502,15 @@ def _write_run(
         "started_from": origin,
     }
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")
+
+
+def append_curve(run: Path, step: int, minutes: float, losses: FloatArray, figures: dict[str, float]) -> None:
+    """Add a line to curves.csv: losses since the last one, figures of the validation."""
+    path = run / "curves.csv"
+    fresh = not path.is_file()
+    with path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        if fresh:
+            writer.writerow(CURVE_COLUMNS)
+        scores = [f"{figures[key]:.5f}" for key in CURVE_COLUMNS[8:]]
+        writer.writerow([step, f"{minutes:.3f}", *(f"{value:.5f}" for value in losses), *scores])

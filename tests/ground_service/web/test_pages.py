@@ -8,8 +8,7 @@ import pytest
 
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.surface import WIDTH_PX
-from ground_service.web.basemap import basemap_jpeg
-from ground_service.web.pages import PAGES, POLICY
+from ground_service.web.pages import PAGES, POLICY, basemap_jpeg
 from tests.ground_service.web.test_displays import ask
 
 PATHS = [page.path.replace("{pass_id}", "1").replace("{revision}", "0" * 16) for page in PAGES]

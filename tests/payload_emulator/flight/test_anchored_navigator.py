@@ -23,13 +23,12 @@ from payload_emulator.flight.navigation.anchored import (
     Observation,
 )
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
-from payload_emulator.flight.navigation.correction import Fix, frame_limit
+from payload_emulator.flight.navigation.correction import Fix, frame_limit, is_usable
 from payload_emulator.flight.navigation.filter import FilterState
 from payload_emulator.flight.navigation.identification import Identification
 from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.lost_in_space import Place
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.flight.navigation.prediction import is_usable
 from payload_emulator.flight.navigation.relative import RelativeParameters, without_clone
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import RendererError
-from payload_emulator.sim.render.exr import read_exr
+from payload_emulator.sim.render.cycles import read_exr
 from tests.payload_emulator.sim.exr_file import exr_octets
 
 PLANES = {

@@ -13,8 +13,8 @@ from lunar.frames import mcmf_from_spherical
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim.render import raymarch, renderer
 from payload_emulator.sim.render.labels import project_craters
-from payload_emulator.sim.render.lens import pixel_shifts
 from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.renderer import pixel_shifts
 
 BARREL = {"k1": -0.02, "k2": 1.0e-3, "k3": 1.0e-4, "p1": 1.0e-3, "p2": -5.0e-4}
 PLACE = math.radians(10.2), math.radians(20.3)

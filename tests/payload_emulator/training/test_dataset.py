@@ -12,9 +12,8 @@ from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import clipped, ellipse_polygon, polygon_area
-from payload_emulator.training.data.integrity import check
+from payload_emulator.training.data.integrity import check, summarise
 from payload_emulator.training.data.sheet import CLASS_COLOURS, draw_frame, draw_sheet
-from payload_emulator.training.data.summary import summarise
 from payload_emulator.training.data.targets import Tier
 
 
