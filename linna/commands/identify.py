@@ -1,166 +1,196 @@
-"""`linna identify`: how often craters are found and taken for others, on simulated detections or rendered frames."""
+"""`linna identify lost`: lost in space on rendered frames and what the network finds in them."""
 
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.output import add_json_flag, emit, log
+from linna.output import emit, finish, log, progress
 from linna.parser import option
 
 if TYPE_CHECKING:
-    from payload_emulator.sim.detector import SimulatedDetector
-    from studies.identification import StudyWorld
+    from lunar.arrays import IntArray
+    from payload_emulator.flight.vision.detector import OnnxDetector
+    from payload_emulator.session.world import World
+    from studies.lost_in_space import HostileSearches, LostRow, SeenFrames, Share
 
-LEVEL = "level 1-2: simulated detections of the craters of a catalogue (stated recall, precision and errors), no images"
+LEAST_CATALOGUED = 6
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     lost = commands.add_parser(
         "lost", help="lost in space: places found from one frame or four, without a prior"
     )
     option(
         lost,
-        "catalogue FILE",
-        str,
-        "anchoring table of `linna catalogue curate`, or a catalogue (default: the available one)",
-        nargs="?",
-    )
-    option(lost, "--frames", int, "", 300)
-    option(lost, "--seed", int, "", 1)
-    option(lost, "--recall", float, "", 0.5)
-    option(lost, "--precision", float, "", 0.8)
-    option(lost, "--sigma-px", float, "per axis", 1.4)
-    option(lost, "--log-diameter-sigma", float, "", 0.05)
-    add_json_flag(lost)
-    option(lost, "--attitude-deg", float, "error of nadir and heading, 1 sigma per axis", 0.5)
-    option(lost, "--sets", int, "sets of four frames (default: a third of the frames)")
-    rendered = lost.add_argument_group("rendered", "frames along a scenario and the detector that flies")
-    option(
-        rendered,
         "--scenario FILE",
         str,
-        "render frames of a scenario in sets of four; its terrain's craters are the map, FILE is not used",
+        "frames along a scenario in sets of four; its terrain's craters are the map",
+        required=True,
     )
-    option(rendered, "--min-diameter-km", float, "smallest craters of the map", 3.0)
-    option(rendered, "--detections F.npz", Path, "keep the detections here, or take those kept here")
+    option(lost, "--frames", int, "", 300)
+    option(lost, "--attitude-deg", float, "error of nadir and heading, 1 sigma per axis", 0.5)
+    option(lost, "--min-diameter-km", float, "smallest craters of the map", 3.0)
+    option(lost, "--detections F.npz", Path, "keep the detections here, or take those kept here")
     option(
-        rendered,
+        lost,
         "--hostile",
         bool,
         "search each frame also with its detections mirrored, turned and scattered: each fix is wrong",
     )
-    lost.set_defaults(handler=run_lost)
+    finish(lost, run)
 
 
-def run_lost(arguments: argparse.Namespace) -> int:
-    import math
-
+def run(arguments: argparse.Namespace) -> int:
+    from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.flight.navigation.lost_in_space import place_index
-    from studies.identification import KINDS, study_lost, study_lost_in_frames
+    from payload_emulator.flight.navigation.lost_in_space import FRAMES_COMBINED, LostParameters
+    from payload_emulator.session.mission import level_of, level_text, unseen_share
+    from payload_emulator.session.scenario import load_scenario
+    from payload_emulator.session.world import build_world
+    from studies import lost_in_space as study
 
-    if arguments.scenario is not None:
-        from linna.commands._identify_rendered import run as run_rendered
-
-        return run_rendered(arguments)
-    if arguments.hostile:
-        raise UsageError("--hostile: expected --scenario, found none")
-    model = _model(arguments)
-    world = _world(arguments)
-    attitude_rad = math.radians(arguments.attitude_deg)
-    hostile = max(arguments.frames // 3, 1)
-    scores = []
-    for kind in KINDS:
-        frames = arguments.frames if kind == "true" else hostile
-        log(f"{frames} frames, {kind}")
-        scores.append(
-            study_lost(world, frames, arguments.seed, kind=kind, model=model, attitude_rad=attitude_rad)
-        )
-    sets = hostile if arguments.sets is None else arguments.sets
-    log(f"{sets} sets of four frames")
-    scores.append(study_lost_in_frames(world, sets, arguments.seed, model=model, attitude_rad=attitude_rad))
-    figures: dict[str, Any] = {
-        "single_correct_share": scores[0].correct_share,
-        "four_frames_correct_share": scores[-1].correct_share,
-        "wrong": sum(score.wrong for score in scores),
-        "searches": sum(score.frames for score in scores),
-        "median_cpu_s": scores[0].median_cpu_s,
-        "scores": [asdict(score) | {"correct_share": score.correct_share} for score in scores],
-        "craters": len(world.board),
-        "index_octets": place_index(world.board).octets,
-        "altitude_km": [14.0, 50.0],
-        "attitude_sigma_deg": arguments.attitude_deg,
-        "least_true_detections": 6,
-        **_provenance(arguments, world.name, model),
-    }
-    lines = [
-        f"{'frames':<12}{'searches':>9}{'correct':>9}{'wrong':>7}{'no fix':>8}{'error m':>9}{'p95':>7}{'CPU s':>7}"
-    ]
-    for score in scores:
-        none = score.frames - score.correct - score.wrong
-        lines.append(
-            f"{score.kind:<12}{score.frames:>9}{score.correct:>9}{score.wrong:>7}{none:>8}"
-            f"{score.median_error_m:>9.0f}{score.p95_error_m:>7.0f}{score.median_cpu_s:>7.2f}"
-        )
-    return emit(
-        arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"])
-    )
-
-
-def _provenance(arguments: argparse.Namespace, name: str, model: SimulatedDetector) -> dict[str, object]:
-    return {
-        "detections": {
-            "recall": arguments.recall,
-            **{name: getattr(model, name) for name in ("precision", "sigma_px", "log_diameter_sigma")},
-        },
-        "seed": arguments.seed,
-        "level": LEVEL,
-        "data": [f"crater catalogue {name}"],
-    }
-
-
-def _model(arguments: argparse.Namespace) -> SimulatedDetector:
-    from linna.errors import UsageError
-    from payload_emulator.sim.detector import SimulatedDetector
-
-    if arguments.frames < 1:
-        raise UsageError(f"--frames: expected at least 1, found {arguments.frames}")
-    for name in ("recall", "precision"):
-        if not 0.0 < getattr(arguments, name) <= 1.0:
-            raise UsageError(
-                f"--{name}: expected a share above 0 and up to 1, found {getattr(arguments, name):g}"
-            )
-    if not (arguments.sigma_px > 0.0 and arguments.log_diameter_sigma >= 0.0):
+    _check(arguments, FRAMES_COMBINED)
+    scenario = study.pointed(load_scenario(arguments.scenario), arguments.attitude_deg)
+    world = build_world(scenario, data_folder())
+    numbers = study.frames_in_sets(world, math.ceil(arguments.frames / FRAMES_COMBINED))
+    if not numbers.size:
         raise UsageError(
-            f"--sigma-px, --log-diameter-sigma: expected positive sizes, found {arguments.sigma_px:g} and "
-            f"{arguments.log_diameter_sigma:g}"
+            f"--scenario {arguments.scenario}: expected {FRAMES_COMBINED} frames in a row, found none"
         )
-    return SimulatedDetector(
-        recall=(arguments.recall,) * 4,
-        recall_outside=arguments.recall,
-        precision=arguments.precision,
-        sigma_px=arguments.sigma_px,
-        log_diameter_sigma=arguments.log_diameter_sigma,
+    detector, seen = _seen(arguments, world, numbers)
+    log("map of the search")
+    true, board = study.search_map(world, numbers, 1e3 * arguments.min_diameter_km)
+    parameters = LostParameters(attitude_sigma_rad=math.radians(arguments.attitude_deg))
+    single, sets = study.search_frames(
+        world, seen, true, board, parameters, lambda rows, total: progress(rows, total, "searches", "frame")
     )
-
-
-def _world(arguments: argparse.Namespace) -> StudyWorld:
-    from linna.commands._catalogue_choice import open_catalogue
-    from payload_emulator.sim.terrain.curation import catalogue_of_table
-    from studies.identification import study_world
-
-    name = arguments.catalogue
-    table = None
-    if name is not None and Path(name).is_file():
-        table = catalogue_of_table(Path(name))
-    craters = open_catalogue(name, arguments.seed) if table is None else table
-    sized = (craters.diameter_m >= 5e3 if table is None else craters.diameter_m >= 3e3) & (
-        craters.diameter_m <= 30e3
+    hostile = []
+    if arguments.hostile:
+        hostile = study.search_hostile(
+            seen, board, world.camera, parameters, scenario.seed,
+            lambda rows, total: progress(rows, total, "hostile searches", "frame"),
+        )  # fmt: skip
+    rows = {
+        "all frames": study.share(single),
+        f"frames, {LEAST_CATALOGUED} known": study.share(single, LEAST_CATALOGUED),
+        "all sets of four": study.share(sets),
+        f"sets, {LEAST_CATALOGUED} known in each": study.share(sets, LEAST_CATALOGUED),
+    }
+    unseen = unseen_share(world)
+    found = level_of("real-terrain" if world.terrain.is_real else "procedural", unseen)
+    level = f"level {level_text(found, unseen)}: frames rendered along {scenario.name}, the shipped detector"
+    figures: dict[str, Any] = {
+        "single_correct_share": rows[f"frames, {LEAST_CATALOGUED} known"].correct_share,
+        "four_frames_correct_share": rows[f"sets, {LEAST_CATALOGUED} known in each"].correct_share,
+        "wrong": rows["all frames"].wrong
+        + rows["all sets of four"].wrong
+        + sum(one.fixes for one in hostile),
+        "searches": len(single) + len(sets) + sum(one.searches for one in hostile),
+        "hostile": [_hostile_as_json(one) for one in hostile],
+        "scores": {name: _as_json(row) for name, row in rows.items()},
+        "by_altitude": [
+            {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}
+            for low, high, row in study.by_altitude(single, LEAST_CATALOGUED)
+        ],
+        **_statistics(single, study.WRONG_PLACE_M),
+        "craters": len(board),
+        "min_diameter_km": arguments.min_diameter_km,
+        "attitude_sigma_deg": arguments.attitude_deg,
+        "least_true_detections": LEAST_CATALOGUED,
+        "wrong_beyond_m": study.WRONG_PLACE_M,
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "model_sha256": detector.sha256,
+        "level": level,
+        "data": list(world.data_names),
+    }
+    table = _table(rows, study.by_altitude(single, LEAST_CATALOGUED))
+    table += [f"{one.kind:<24}{one.searches:>9}{0:>9}{'':>8}{one.fixes:>7}" for one in hostile]
+    last = (
+        f"{figures['catalogued_per_frame']:.1f} of {figures['detections_per_frame']:.1f} detections a frame are of "
+        f"the {len(board)} craters of the map; {figures['median_cpu_s']:.2f} s "
+        f"(largest {figures['largest_cpu_s']:.2f}) a search"
     )
-    with_depth = ~(craters.depth_m < 0.03 * craters.diameter_m)
-    chosen = craters.select(sized & with_depth)
-    return study_world(chosen, arguments.seed, craters.source)
+    return emit(arguments, figures, text="\n".join([*table, last, level]))
+
+
+def _seen(arguments: argparse.Namespace, world: World, numbers: IntArray) -> tuple[OnnxDetector, SeenFrames]:
+    """Return the detector that flies and what it finds in frames, kept or found now."""
+    from payload_emulator.flight.models import load_shipped_model
+    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
+    from payload_emulator.session.scenario import format_scenario
+    from studies import lost_in_space as study
+
+    camera = world.camera
+    detector = OnnxDetector(
+        load_shipped_model(), DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
+    )
+    key = _key(format_scenario(world.scenario), numbers.tobytes(), detector.sha256)
+    if arguments.detections is not None and arguments.detections.exists():
+        seen = study.load_seen_frames(arguments.detections, key)
+    else:
+        seen = study.see_frames(
+            world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
+        )
+        if arguments.detections is not None:
+            study.save_seen_frames(arguments.detections, seen, key)
+    return detector, seen
+
+
+def _statistics(single: Sequence[LostRow], wrong_m: float) -> dict[str, float | None]:
+    """Return errors of the frames placed within ``wrong_m``, processor times, and counts per frame."""
+    import numpy as np
+
+    errors = np.array([row.error_m for row in single])
+    right = errors[errors <= wrong_m]
+    spent = np.array([row.cpu_s for row in single])
+    return {
+        "median_error_m": float(np.median(right)) if right.size else None,
+        "p95_error_m": float(np.percentile(right, 95.0)) if right.size else None,
+        "median_cpu_s": float(np.median(spent)),
+        "largest_cpu_s": float(np.max(spent)),
+        "catalogued_per_frame": float(np.mean([row.catalogued for row in single])),
+        "detections_per_frame": float(np.mean([row.detections for row in single])),
+    }
+
+
+def _check(arguments: argparse.Namespace, least_frames: int) -> None:
+    from linna.errors import UsageError
+
+    if arguments.frames < least_frames:
+        raise UsageError(f"--frames: expected at least {least_frames}, found {arguments.frames}")
+    if not 1.0 <= arguments.min_diameter_km <= 20.0:
+        raise UsageError(f"--min-diameter-km: expected 1 to 20, found {arguments.min_diameter_km:g}")
+    if not 0.0 < arguments.attitude_deg <= 2.0:
+        raise UsageError(f"--attitude-deg: expected above 0 and up to 2, found {arguments.attitude_deg:g}")
+
+
+def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Share]]) -> list[str]:
+    """Return the lines of a table of correct and wrong searches."""
+    named = [*rows.items(), *((f"  {low:.0f} to {high:.0f} km", row) for low, high, row in by_altitude)]
+    return [f"{'':<24}{'searches':>9}{'correct':>9}{'share':>8}{'wrong':>7}"] + [
+        f"{name:<24}{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
+        for name, row in named
+    ]
+
+
+def _as_json(row: Share) -> dict[str, Any]:
+    return asdict(row) | {"correct_share": row.correct_share if row.searches else None}
+
+
+def _hostile_as_json(one: HostileSearches) -> dict[str, Any]:
+    least = one.least_log10_false
+    return asdict(one) | {"least_log10_false": least if math.isfinite(least) else None}
+
+
+def _key(scenario: str, numbers: bytes, model_sha256: str) -> str:
+    """What detections depend on, as one hash."""
+    import hashlib
+
+    return hashlib.sha256(b"|".join([scenario.encode(), numbers, model_sha256.encode()])).hexdigest()

@@ -20,11 +20,11 @@ from typing import Protocol
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.catalogue import CraterCatalogue, make_catalogue
+from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.registration import Registration, Rims, clear_rims, fit_registration
-from tmtc.tables import MAGIC, CatalogueTable, table_hash, unpack_catalogue_table
+from tmtc.tables import CatalogueTable
 
 Mask = BoolArray
 
@@ -461,25 +461,3 @@ def _smoothed(values: FloatArray, sigma: float) -> FloatArray:
             weight * np.take(padded, range(k, k + size), axis=axis) for k, weight in enumerate(kernel)
         )
     return np.asarray(values)
-
-
-def catalogue_of_table(path: Path) -> CraterCatalogue | None:
-    """Return the craters of an uploadable table; None where the file is no table at all.
-
-    Raises
-    ------
-    TableError
-        The table is damaged or of another kind.
-    """
-    octets = path.read_bytes()
-    if not octets.startswith(MAGIC):
-        return None
-    table = unpack_catalogue_table(octets)
-    return make_catalogue(
-        table.latitude_rad,
-        table.longitude_rad,
-        table.diameter_m,
-        source=f"anchoring table {table_hash(octets):08x}",
-        ids=table.ids,
-        rim_height_m=table.rim_height_m,
-    )

@@ -256,22 +256,11 @@ def format_figures(figures: dict[str, Any]) -> str:
         for item in figures["recall_by_degradation"]
     )
     lines.append(f"recall by depth/diameter (craters): {recalls}")
-    clear = "; ".join(
-        f"above {row['depth_ratio']:g} strict {_share(row['strict'])}, ignore-aware {_share(row['ignore_aware'])}"
-        for row in figures["recall_of_clear_craters"]
-    )
-    lines.append(f"recall by depth/diameter {clear}")
-    if figures["recall_by_third_of_degradation"]:
-        lines.append(
-            f"recall of the most degraded third {_share(figures['recall_by_third_of_degradation'][0])}, of the "
-            f"freshest {_share(figures['recall_by_third_of_degradation'][-1])} (strict)"
-        )
     lines += _bias_lines(figures)
-    average, scale = figures["average_precision_half_radius"], figures["radial_scale"]
+    average = figures["average_precision_half_radius"]
     lines.append(
-        f"AP within 0.5 R: strict {average['strict']:.3f}, ignore-aware {average['ignore_aware']:.3f}; scale about "
-        f"the middle {scale['percent']:+.3f} +- {scale['standard_error_percent']:.3f} %; errors inside one sigma "
-        f"{figures['sigma_calibration']['inside_one_sigma']:.2f}"
+        f"AP within 0.5 R: strict {average['strict']:.3f}, ignore-aware {average['ignore_aware']:.3f}; errors inside "
+        f"one sigma {figures['sigma_calibration']['inside_one_sigma']:.2f}"
     )
     for row in figures["by_terrain"]:
         lines.append(_row(f"{row['name']} ({row['frames']} frames) strict", row["strict"]))
@@ -285,11 +274,6 @@ def _row(name: str, row: dict[str, float]) -> str:
         + "".join(f"{v:7.3f}" for v in values)
         + f"{row['loc_px']:8.2f}{row['loc_median_px']:8.2f}"
     )
-
-
-def _share(row: dict[str, Any]) -> str:
-    low, high = row["recall_interval_95"]
-    return f"{row['recall']:.2f} [{low:.2f}, {high:.2f}] of {row['expected']}"
 
 
 def _bias_lines(figures: dict[str, Any]) -> list[str]:

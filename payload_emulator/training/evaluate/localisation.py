@@ -1,4 +1,4 @@
-"""Position errors of detections: signed errors by Sun and by place in the image.
+"""Position errors of detections: signed errors by Sun.
 
 Errors are detection minus crater in pixels, u right and v down. Beside the image's axes they are given toward the Sun
 in the image and across it (to the right of who looks toward the Sun): shadows would draw a detector along the first.
@@ -24,11 +24,6 @@ def right(tallied: Tally, threshold: float) -> BoolArray:
     """Which detections are right at a threshold."""
     chosen: BoolArray = (tallied.score >= threshold) & (tallied.outcome == 1)
     return chosen
-
-
-def middle(truths: Sequence[FrameTruth]) -> tuple[float, float]:
-    """The middle of the image, u and v."""
-    return 0.5 * (truths[0].width_px - 1), 0.5 * (truths[0].height_px - 1)
 
 
 def bias_by_octant(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> list[dict[str, Any]]:
@@ -110,20 +105,3 @@ def _resampled_means(errors: FloatArray, frame: IntArray) -> FloatArray:
     drawn = np.random.default_rng(0).integers(0, count.size, (_ROUNDS, count.size))
     means: FloatArray = sums[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None]
     return means
-
-
-def radial_scale(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> dict[str, float]:
-    """Scale of the detections about the middle of the image, percent: -0.1 makes 30 km of altitude 30 m too high."""
-    found = right(tallied, threshold)
-    u, v = middle(truths)
-    lever = np.concatenate([tallied.detection_u[found] - u, tallied.detection_v[found] - v])
-    error = np.concatenate([tallied.error_u[found], tallied.error_v[found]])
-    weight = np.tile(1.0 / np.maximum(tallied.sigma_px[found], 0.3) ** 2, 2)
-    inner = np.abs(error) < 4.0 / np.sqrt(weight)
-    lever, error, weight = lever[inner], error[inner], weight[inner]
-    moment = float((weight * lever * lever).sum())
-    if moment == 0.0:
-        return {"percent": float("nan"), "standard_error_percent": float("nan")}
-    slope = float((weight * lever * error).sum()) / moment
-    spread = float(np.sqrt((weight**2 * lever**2 * (error - slope * lever) ** 2).sum())) / moment
-    return {"percent": 100.0 * slope, "standard_error_percent": 100.0 * spread}

@@ -15,8 +15,6 @@ from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.localisation import (
     bias_by_octant,
     bias_overall,
-    middle,
-    radial_scale,
     right,
 )
 from payload_emulator.training.evaluate.scoring import (
@@ -36,8 +34,6 @@ LOWLAND_M = -1_000.0
 
 _ALTITUDE_EDGES_KM = (12.0, 20.0, 30.0, 40.0, 50.0)
 _ELEVATION_EDGES_DEG = (3.0, 6.0, 9.0, 12.0, 15.0, 30.0, 60.0)
-_RADIUS_EDGES_PX = (0.0, 90.0, 150.0, 210.0, 270.0, 370.0)
-_CLEAR_DEPTH_RATIOS = (0.06, 0.10)
 _CURVE_THRESHOLDS = tuple(round(0.10 + 0.05 * k, 2) for k in range(17))
 RADIUS_RULE = MatchRule(radii=0.5)
 
@@ -103,12 +99,6 @@ def score(
         "recall_by_degradation": _recall_by(
             strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
         ),
-        "recall_by_third_of_degradation": _recall_by_thirds(strict, threshold),
-        "recall_of_clear_craters": [
-            {"depth_ratio": low, "strict": _recall_above(strict, low, threshold)}
-            | {"ignore_aware": _recall_above(fair, low, threshold)}
-            for low in _CLEAR_DEPTH_RATIOS
-        ],
         "degradation_state": _state(fair, threshold),
         "by_altitude_km": _by_frame(
             pair, threshold, np.array([s.altitude_km for s in scenes]), _ALTITUDE_EDGES_KM
@@ -126,14 +116,11 @@ def score(
             pair, threshold, ["lowland" if s.ground_m < LOWLAND_M else "upland" for s in scenes]
         ),
         "by_source": _by_name(pair, threshold, [s.source for s in scenes]),
-        "by_image_radius_px": _by_radius(pair, threshold, truths),
         "bias_px_by_sun_octant": octants,
         "bias_px": bias_overall(strict, threshold, truths, octants),
-        "radial_scale": radial_scale(fair, threshold, truths),
         "sigma_calibration": {
             **_calibration(fair, threshold),
             "by_altitude_km": _calibration_by_altitude(fair, threshold, scenes),
-            "by_image_radius_px": _calibration_by_radius(fair, threshold, truths),
         },
         "score_calibration": _score_calibration(strict),
         "precision_recall": _curve(strict),
@@ -217,25 +204,6 @@ def _by_name(pair: tuple[Tally, Tally], threshold: float, names: Sequence[str]) 
     return rows
 
 
-def _radii(part: Tally, truths: Sequence[FrameTruth]) -> tuple[FloatArray, FloatArray]:
-    """Distance from the middle of the image of detections and of craters, px."""
-    u, v = middle(truths)
-    return np.hypot(part.detection_u - u, part.detection_v - v), np.hypot(
-        part.crater_u - u, part.crater_v - v
-    )
-
-
-def _by_radius(
-    pair: tuple[Tally, Tally], threshold: float, truths: Sequence[FrameTruth]
-) -> list[dict[str, Any]]:
-    distances = [_radii(part, truths) for part in pair]
-    rows = []
-    for low, high in itertools.pairwise(_RADIUS_EDGES_PX):
-        masks = [((d >= low) & (d < high), (c >= low) & (c < high)) for d, c in distances]
-        rows.append({"low": low, "high": high, **_group(pair, threshold, masks)})
-    return rows
-
-
 def _recall_by(
     tallied: Tally, values: FloatArray, edges: Sequence[float], threshold: float, name: str
 ) -> list[dict[str, Any]]:
@@ -256,23 +224,6 @@ def _recall_by(
             }
         )
     return rows
-
-
-def _recall_above(tallied: Tally, depth_ratio: float, threshold: float) -> dict[str, Any]:
-    """Recall of the craters above a depth/diameter."""
-    row = _recall_by(tallied, -tallied.crater_depth_ratio, (-np.inf, -depth_ratio), threshold, "")[0]
-    return {key: row[key] for key in ("expected", "recall", "recall_interval_95")}
-
-
-def _recall_by_thirds(tallied: Tally, threshold: float) -> list[dict[str, Any]]:
-    """Recall of thirds of the craters by depth/diameter, the most degraded first."""
-    if tallied.crater_depth_ratio.size < 3:
-        return []
-    low, high = np.quantile(tallied.crater_depth_ratio, (1.0 / 3.0, 2.0 / 3.0))
-    top = float(tallied.crater_depth_ratio.max()) + 1e-9
-    return _recall_by(
-        tallied, tallied.crater_depth_ratio, (0.0, float(low), float(high), top), threshold, "depth_ratio"
-    )
 
 
 def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
@@ -328,20 +279,6 @@ def _calibration_by_altitude(
         chosen, _ = _of_frames(tallied, (altitude >= low) & (altitude < high))
         rows.append({"low": low, "high": high, **_calibration(tallied, threshold, chosen)})
     return rows
-
-
-def _calibration_by_radius(
-    tallied: Tally, threshold: float, truths: Sequence[FrameTruth]
-) -> list[dict[str, float]]:
-    distance, _ = _radii(tallied, truths)
-    return [
-        {
-            "low": low,
-            "high": high,
-            **_calibration(tallied, threshold, (distance >= low) & (distance < high)),
-        }
-        for low, high in itertools.pairwise(_RADIUS_EDGES_PX)
-    ]
 
 
 def _score_calibration(tallied: Tally) -> list[dict[str, float]]:

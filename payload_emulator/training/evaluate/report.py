@@ -224,11 +224,6 @@ def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
             _named(figures["by_sun_octant"], lambda row: f"{span(row)}°"),
             f"Azimuth of the Sun in the image, clockwise from its top. {rule}",
         ),
-        ScoreGroup(
-            "By place in the image",
-            _named(figures["by_image_radius_px"], lambda row: f"{span(row)} px"),
-            f"Distance from the middle of the image. {rule}",
-        ),
     )
 
 
@@ -262,10 +257,6 @@ def _mean_with_interval(row: dict[str, Any], key: str) -> tuple[float, float, fl
 def _sigma(calibration: dict[str, Any]) -> tuple[SigmaBin, ...]:
     rows = [("all", calibration)]
     rows += [(f"{row['low']:g}–{row['high']:g} km up", row) for row in calibration["by_altitude_km"]]
-    rows += [
-        (f"{row['low']:g}–{row['high']:g} px from the middle", row)
-        for row in calibration["by_image_radius_px"]
-    ]
     return tuple(
         SigmaBin(
             label,
@@ -318,10 +309,6 @@ def _headline(figures: dict[str, Any]) -> tuple[HeadlineFigure, ...]:
     )
 
 
-def _signed(value: float) -> str:
-    return f"{value:+.3f}".replace("-", "−")
-
-
 def _verdict(figures: dict[str, Any]) -> tuple[str, str]:
     beaten = [
         k
@@ -341,7 +328,7 @@ def _verdict(figures: dict[str, Any]) -> tuple[str, str]:
 
 def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
     average = figures["average_precision_half_radius"]
-    scale, state = figures["radial_scale"], figures["degradation_state"]
+    state = figures["degradation_state"]
     remarks = [
         f"Average precision within half a radius: {average['strict']:.3f} strict, {average['ignore_aware']:.3f} "
         "ignore-aware; by class "
@@ -349,8 +336,6 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
             f"{label} {value:.3f}" for label, value in zip(_CLASS_LABELS, average["per_class"], strict=True)
         )
         + ".",
-        f"Scale of the detections about the middle of the image: {_signed(scale['percent'])} ± "
-        f"{scale['standard_error_percent']:.3f} %; −0.1 % reads as 30 m too high at 30 km.",
         f"Craters of 3 to 5 km: precision {figures['class_3_to_5_km']['precision']:.2f}, recall "
         f"{figures['class_3_to_5_km']['recall']:.2f} strict, "
         f"{figures['class_3_to_5_km']['ignore_aware']['recall']:.2f} ignore-aware.",
@@ -362,28 +347,7 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
             f"{100 * state['agreement']:.0f} % of {state['craters']} matched craters; median error of depth/diameter "
             f"{state['depth_ratio_median_error']:.3f}."
         )
-    clear = figures["recall_of_clear_craters"]
-    remarks.append(
-        "Recall of clear craters, strict (ignore-aware): "
-        + "; ".join(
-            f"above a depth/diameter of {row['depth_ratio']:g} {_with_interval(row['strict'])} "
-            f"({_with_interval(row['ignore_aware'])})"
-            for row in clear
-        )
-        + "."
-    )
-    thirds = figures["recall_by_third_of_degradation"]
-    if thirds:
-        remarks.append(
-            f"Recall of the most degraded third of the craters {_with_interval(thirds[0])}, of the freshest "
-            f"{_with_interval(thirds[-1])} (strict)."
-        )
     return tuple(remarks)
-
-
-def _with_interval(row: dict[str, Any]) -> str:
-    low, high = row["recall_interval_95"]
-    return f"{row['recall']:.2f} [{low:.2f} to {high:.2f}]"
 
 
 def _frame_order(strict: Tally, threshold: float, frames: int) -> list[int]:
