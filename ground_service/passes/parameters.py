@@ -17,12 +17,11 @@ from ground_service.missions.definitions import DeclaredPackets, PacketDefinitio
 from ground_service.missions.timekeeping.core import utc_ns_of_ticks
 from ground_service.passes import sample_store, store
 from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
-from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, SampleSource
+from ground_service.passes.series import PARAMETERS, STATE_VALUES, SampleSource, kind_samples
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store import parameters as declared_values
 from ground_service.store import rollups
 from ground_service.store.vehicles import find_vehicle
-from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.export import Record, format_records, packet_records
@@ -97,84 +96,25 @@ class DeclaredReading:
     parameters: dict[str, DeclaredParameter]
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredSamples:
-    """Values of one container as a source of series; `places` are those of the values by name."""
+def declared_samples(version: int, container: int, places: Mapping[str, int]) -> SampleSource:
+    """Return the values of one container as a source of series; `places` are those of the values by name."""
 
-    version: int
-    part: int
-    places: Mapping[str, int]
-
-    @property
-    def code(self) -> int:
-        """Code of the kind in the roll-ups."""
-        return rollups.PARAMETERS_CODE
-
-    def index(self, name: str) -> int:
-        """Return the place of a value in the roll-ups."""
-        return self.places[name]
-
-    def arrays(
-        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
-    ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) in a span."""
-        places = [self.places[name] for name in names]
-        ticks, values = self._values(connection, span, places)
+    def read(connection: Connection, span: PassSpan, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+        where = (span.vehicle, version, container, span.start_ticks, span.stop_ticks)
+        ticks, values = declared_values.read_values(connection, *where, [places[name] for name in names])
         return {"ticks": ticks, **{name: values[:, k] for k, name in enumerate(names)}}
 
-    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
-        """Return stretches of a value."""
-        ticks, found = self._values(connection, span, [self.places[name]])
-        if not ticks.size:
-            return np.zeros((0, 7))
-        value = found[:, 0]
-        known = np.isfinite(value)
-        first = np.flatnonzero(np.concatenate(([True], np.diff(ticks // width_ticks) > 0)))
-        last = np.concatenate((first[1:], [len(ticks)])) - 1
-        count = np.add.reduceat(known.astype(np.int64), first)
-        parts = (
-            np.add.reduceat(np.where(known, value, 0.0), first),
-            np.minimum.reduceat(np.where(known, value, np.inf), first),
-            np.maximum.reduceat(np.where(known, value, -np.inf), first),
-        )
-        figures = [np.where(count > 0, part, np.nan) for part in parts]
-        return np.column_stack([ticks[first], ticks[last], last - first + 1, count, *figures])
-
-    def _values(
-        self, connection: Connection, span: PassSpan, places: list[int]
-    ) -> tuple[IntArray, FloatArray]:
-        where = (span.vehicle, self.version, self.part, span.start_ticks, span.stop_ticks)
-        return declared_values.read_values(connection, *where, places)
+    return SampleSource(rollups.PARAMETERS_CODE, version, container, places, read)
 
 
-@dataclass(frozen=True, slots=True)
-class PacketSamples:
-    """Values of one field of a packet, or of its items, decoded from the stored packets; they have no roll-ups."""
+def packet_samples(packet: PacketDefinition, field: str, version: int) -> SampleSource:
+    """Return the values of one field of a packet, or of its items, read from the stored packets, without roll-ups."""
 
-    packet: PacketDefinition
-    field: str
-    version: int
-    part: int = 0
-
-    @property
-    def code(self) -> int:
-        """Code of the kind in the roll-ups, which has none."""
-        return rollups.PACKETS_CODE
-
-    def index(self, name: str) -> int:
-        """Return the place of a value in the roll-ups."""
-        raise LookupError(name)
-
-    def arrays(
-        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
-    ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) in a span, in order of time."""
-        ticks, values = sample_store.packet_values(connection, span, self.packet, self.field)
+    def read(connection: Connection, span: PassSpan, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+        ticks, values = sample_store.packet_values(connection, span, packet, field)
         return {"ticks": ticks, **dict.fromkeys(names, values)}
 
-    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
-        """Return stretches of a value; without roll-ups a series is never long."""
-        raise LookupError(name)
+    return SampleSource(rollups.PACKETS_CODE, version, 0, {}, read)
 
 
 def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
@@ -296,20 +236,20 @@ def series_source(
     """Return the source of the series of a parameter, its span, the name of its value there, and its unit."""
     if parameter in PARAMETERS:
         unit = DICTIONARY.packet(OWN_PACKET).field(parameter).unit
-        return KindSamples(OWN_PACKET, span.dictionary_version), span, parameter, unit
+        return kind_samples(OWN_PACKET, span.dictionary_version), span, parameter, unit
     if parameter in STATE_PARAMETERS:
         code, value = STATE_PARAMETERS[parameter]
-        source = KindSamples("navigation_states", span.dictionary_version, code)
+        source = kind_samples("navigation_states", span.dictionary_version, code)
         return source, span, value, state_unit(value)
     if parameter in PACKET_FIELDS:
         packet, field = PACKET_FIELDS[parameter]
-        return PacketSamples(packet, field.name, span.dictionary_version), span, parameter, field.unit
+        return packet_samples(packet, field.name, span.dictionary_version), span, parameter, field.unit
     found = declared_reading(connection, span.vehicle)
     one = None if found is None else found.parameters.get(parameter)
     if found is None or one is None:
         raise NotFound("parameter", parameter[:80])
     number = one.declared.numbers[one.container]
-    declared = DeclaredSamples(found.decoding.definition_id, number, {parameter: one.index})
+    declared = declared_samples(found.decoding.definition_id, number, {parameter: one.index})
     return declared, span_of(span, one.declared), parameter, one.value.type.unit
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,16 @@ from ground_service.passes.span import PassSpan
 from ground_service.store import rollups, telemetry
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES
-from lunar.arrays import FloatArray
 
-__all__ = ["PARAMETERS", "STATE_VALUES", "KindSamples", "Series", "SeriesReading", "series_document"]
+__all__ = [
+    "PARAMETERS",
+    "STATE_VALUES",
+    "SampleSource",
+    "Series",
+    "SeriesReading",
+    "kind_samples",
+    "series_document",
+]
 
 FEW_ROWS = 50_000
 """Up to this many samples are read one by one, which is exact to the sample and quick enough."""
@@ -45,61 +52,31 @@ class Series:
     buckets: Buckets
 
 
-class SampleSource(Protocol):
-    """Samples that a series is read from, and their roll-ups: `code`, `version` and `part` of these."""
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleSource:
+    """Samples that a series is read from, and their roll-ups.
 
-    @property
-    def code(self) -> int: ...
-    @property
-    def version(self) -> int: ...
-    @property
-    def part(self) -> int: ...
+    `code`, `version` and `part` are those of the roll-ups, and `places` the places of the values there, by name. `read`
+    returns ``ticks`` and the named values (n,) in a span, in order of time.
+    """
 
-    def index(self, name: str) -> int:
-        """Return the place of a value in the roll-ups."""
-
-    def arrays(
-        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
-    ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) in a span, in order of time."""
-
-    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
-        """Return stretches of a value as `telemetry.sample_aggregates` does."""
-
-
-@dataclass(frozen=True, slots=True)
-class KindSamples:
-    """Samples of one kind (a table) decoded with one dictionary version; of one estimator where `part` is one."""
-
-    kind: str
+    code: int
     version: int
-    part: int = 0
+    part: int
+    places: Mapping[str, int]
+    read: Callable[[Connection, PassSpan, tuple[str, ...]], dict[str, NDArray[Any]]]
 
-    @property
-    def code(self) -> int:
-        """Code of the kind in the roll-ups."""
-        return rollups.KINDS[self.kind][0]
 
-    def index(self, name: str) -> int:
-        """Return the place of a value in the roll-ups."""
-        return rollups.KINDS[self.kind][2].index(name)
+def kind_samples(kind: str, version: int, part: int = 0) -> SampleSource:
+    """Return the samples of one kind (a table) decoded with one dictionary version; of one estimator by `part`."""
+    code, column, values = rollups.KINDS[kind]
+    equal = {} if column is None else {column: part}
 
-    def arrays(
-        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
-    ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) in a span."""
-        where = (span.vehicle, span.start_ticks, span.stop_ticks, self.version)
-        return telemetry.sample_arrays(connection, self.kind, *where, ("ticks", *names), **self._equal)
+    def read(connection: Connection, span: PassSpan, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+        where = (span.vehicle, span.start_ticks, span.stop_ticks, version)
+        return telemetry.sample_arrays(connection, kind, *where, ("ticks", *names), **equal)
 
-    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
-        """Return stretches of a value, aggregated by the database."""
-        where = (span.vehicle, span.start_ticks, span.stop_ticks, self.version)
-        return telemetry.sample_aggregates(connection, self.kind, *where, name, width_ticks, **self._equal)
-
-    @property
-    def _equal(self) -> dict[str, int]:
-        column = rollups.KINDS[self.kind][1]
-        return {} if column is None else {column: self.part}
+    return SampleSource(code, version, part, {name: k for k, name in enumerate(values)}, read)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +90,9 @@ class SeriesReading:
 
     def series(self, units: Mapping[str, str]) -> list[Series]:
         """Values of the samples, named with their units, all read at once."""
-        level, length = self._level()
-        if length is None:
-            columns = self.source.arrays(self.connection, self.span, tuple(units))
+        level = self._level()
+        if level is None:
+            columns = self.source.read(self.connection, self.span, tuple(units))
             utc_ns, used = utc_ns_of_ticks(columns["ticks"], self.span.correlations)
             correlation = int(used[-1]) if len(used) else IDEAL_CLOCK
             return [
@@ -128,40 +105,27 @@ class SeriesReading:
                 )
                 for name, unit in units.items()
             ]
-        return [self._long_series(name, unit, level, length) for name, unit in units.items()]
+        return [self._long_series(name, unit, level) for name, unit in units.items()]
 
-    def _long_series(self, name: str, unit: str, level: int | None, length: float) -> Series:
-        found, correlation = self._grouped(name, length) if level is None else self._aggregates(name, level)
+    def _long_series(self, name: str, unit: str, level: int) -> Series:
+        found, correlation = self._aggregates(name, level)
         return Series(
             name, unit, int(found.rows.sum()), correlation, downsample_aggregates(found, self.max_points)
         )
 
-    def _level(self) -> tuple[int | None, float | None]:
-        """The coarsest level of roll-ups that is fine enough, None where there is none; on-board ticks to a point.
-
-        No ticks to a point where samples are few.
-        """
+    def _level(self) -> int | None:
+        """The coarsest level of roll-ups that is fine enough; None where samples are few or all are coarse."""
         key = (self.source.code, self.span.vehicle, self.source.version, self.source.part)
         count, first, last = rollups.rolled_extent(
             self.connection, *key, self.span.start_ticks, self.span.stop_ticks
         )
         if count <= FEW_ROWS:
-            return None, None
+            return None
         wanted = (min(last, self.span.stop_ticks) - max(first, self.span.start_ticks)) / self.max_points
         if rollups.width_ticks(0) > COARSE * wanted:
-            return None, wanted
+            return None
         fine = [level for level in range(rollups.LEVELS) if rollups.width_ticks(level) <= wanted]
-        return (fine[-1] if fine else 0), wanted
-
-    def _grouped(self, name: str, length: float) -> tuple[Aggregates, int]:
-        """Stretches of half the length (ticks), put together by the database from the samples."""
-        width = max(int(length / 2.0), 1)
-        found = self.source.aggregates(self.connection, self.span, name, width)
-        first, last, rows, count = found[:, :4].astype(np.int64).T
-        begin, used = utc_ns_of_ticks(first, self.span.correlations)
-        end, _ = utc_ns_of_ticks(last, self.span.correlations)
-        grouped = Aggregates(begin, end, rows, count, *found[:, 4:].T)
-        return grouped, int(used[-1]) if len(used) else IDEAL_CLOCK
+        return fine[-1] if fine else 0
 
     def _aggregates(self, name: str, level: int) -> tuple[Aggregates, int]:
         """Whole buckets from the roll-ups; the samples of the two that the span cuts."""
@@ -177,7 +141,7 @@ class SeriesReading:
             level,
             first,
             last,
-            self.source.index(name),
+            self.source.places[name],
         )
         begin, used = utc_ns_of_ticks(rows[0], self.span.correlations)
         end, _ = utc_ns_of_ticks(rows[1], self.span.correlations)
@@ -192,7 +156,7 @@ class SeriesReading:
 
     def _edge(self, name: str, start: int, stop: int) -> Aggregates:
         span = replace(self.span, start_ticks=start, stop_ticks=stop)
-        columns = self.source.arrays(self.connection, span, (name,))
+        columns = self.source.read(self.connection, span, (name,))
         utc_ns = utc_ns_of_ticks(columns["ticks"], self.span.correlations)[0]
         return aggregate(utc_ns, columns[name].astype(np.float64))
 

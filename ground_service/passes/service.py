@@ -39,9 +39,9 @@ from ground_service.passes.sample_store import detection_frames, detection_sampl
 from ground_service.passes.series import (
     PARAMETERS,
     STATE_VALUES,
-    KindSamples,
     Series,
     SeriesReading,
+    kind_samples,
 )
 from ground_service.passes.span import (
     LAST_TICKS,
@@ -251,7 +251,7 @@ def state_series(
         _, span, cache = _opened(ground, connection, pass_id)
         if estimator not in codes:
             raise NotFound("estimator", estimator[:80])
-        source = KindSamples("navigation_states", span.dictionary_version, codes[estimator])
+        source = kind_samples("navigation_states", span.dictionary_version, codes[estimator])
         reading = SeriesReading(connection, span, source, max_points)
         found = cache.answer(
             ("states", pass_id, estimator, values, max_points),
@@ -320,7 +320,7 @@ def _trends(connection: Connection, vehicle: int) -> list[Trend]:
         return []
     first = max(last - (TREND_DAYS * 86_400 << 16), 0)
     span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
-    reading = SeriesReading(connection, span, KindSamples("housekeeping", version), TREND_POINTS)
+    reading = SeriesReading(connection, span, kind_samples("housekeeping", version), TREND_POINTS)
     definition = DICTIONARY.packet("housekeeping")
     read = reading.series({name: definition.field(name).unit for name in PARAMETERS})
     trends = (trend_of(definition.field(one.name), one.buckets) for one in read)

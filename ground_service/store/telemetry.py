@@ -124,43 +124,6 @@ def sample_arrays(
     }
 
 
-def sample_aggregates(
-    connection: Connection,
-    kind: str,
-    vehicle: int,
-    start_ticks: int,
-    stop_ticks: int,
-    dictionary_version: int,
-    name: str,
-    width_ticks: int,
-    **equal: int,
-) -> NDArray[np.float64]:
-    """One value of the samples, put together by the database in stretches of a length, in order of time (n, 7).
-
-    First and last on-board time, samples, known ones among them, and the sum, the least and the greatest of those (NaN
-    where there is none).
-    """
-    table = SAMPLES[kind]
-    ticks, value = table.c.ticks, table.c[name]
-    query = (
-        _samples(kind, vehicle, start_ticks, stop_ticks, dictionary_version, (), equal)
-        .with_only_columns(
-            func.min(ticks),
-            func.max(ticks),
-            func.count(),
-            func.count(value),
-            func.sum(value),
-            func.min(value),
-            func.max(value),
-        )
-        .group_by(ticks // width_ticks)
-        .order_by(None)
-        .order_by(func.min(ticks))
-    )
-    rows = [tuple(row) for row in connection.execute(query)]
-    return np.array(rows, dtype=np.float64).reshape(-1, 7)
-
-
 def _samples(
     kind: str,
     vehicle: int,

@@ -182,7 +182,7 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
     assert exact.buckets.high.max() == values.max()
     assert np.average(exact.buckets.mean, weights=exact.buckets.count) == pytest.approx(values.mean())
     monkeypatch.setattr(series, "FEW_ROWS", 10)
-    for coarse in (10**9, 0):  # from roll-ups, from stretches of samples
+    for coarse in (10**9, 0):  # from roll-ups, from samples
         monkeypatch.setattr(series, "COARSE", coarse)
         rolled = parameter_series(either, pass_id, "RATE", 11).buckets
         assert int(rolled.count.sum()) == 2000

@@ -64,7 +64,7 @@ def read(ground: Ground, vehicle: int, name: str, start: int, stop: int, points:
         return series.SeriesReading(
             connection,
             PassSpan(vehicle, start, stop, (), DICTIONARY.version),
-            series.KindSamples("navigation_states", DICTIONARY.version, 1),
+            series.kind_samples("navigation_states", DICTIONARY.version, 1),
             points,
         ).series({name: ""})[0]
 
@@ -84,9 +84,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize("coarse", [0, 10**9], ids=["by the database", "roll-ups"])
+@pytest.mark.parametrize("coarse", [0, 10**9], ids=["samples", "roll-ups"])
 @pytest.mark.parametrize(("skip", "drop"), [(0, 0), (333, 200)])
-def test_a_series_put_together_ahead_or_by_the_database_holds_every_sample_once(
+def test_a_series_of_samples_or_roll_ups_holds_every_sample_once(
     ground: Ground, skip: int, drop: int, coarse: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(series, "COARSE", coarse)
@@ -110,7 +110,7 @@ def test_a_series_put_together_ahead_or_by_the_database_holds_every_sample_once(
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize("coarse", [0, 10**9], ids=["by the database", "roll-ups"])
+@pytest.mark.parametrize("coarse", [0, 10**9], ids=["samples", "roll-ups"])
 def test_a_series_of_all_time_is_as_fine_as_asked_for(
     ground: Ground, coarse: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
