@@ -70,14 +70,23 @@ def optional(name: str, *arguments: Any, **options: Any) -> Column[Any]:
     return Column(name, *arguments, **options)
 
 
+def columns(kind: Any, *names: str) -> tuple[Column[Any], ...]:
+    """Return columns of one type without NULL."""
+    return tuple(column(name, kind) for name in names)
+
+
+def optionals(kind: Any, *names: str) -> tuple[Column[Any], ...]:
+    """Return columns of one type that may be NULL."""
+    return tuple(optional(name, kind) for name in names)
+
+
 FILES = Table(
     "files",
     METADATA,
     key("sha256", String(64)),
     column("kind", String(32)),
     column("name", Text),
-    column("octets", BigInteger),
-    column("received_utc_ns", BigInteger),
+    *columns(BigInteger, "octets", "received_utc_ns"),
 )
 """A file of the archive, stored once under the SHA-256 of its octets."""
 
@@ -88,10 +97,8 @@ VEHICLES = Table(
     key("id", Integer),
     column("ccsds_id", Integer),
     column("instance", String(96)),
-    optional("decoded_version", SmallInteger),
-    optional("redecoding_version", SmallInteger),
-    optional("redecoded_to", BigInteger),
-    optional("redecode_until", BigInteger),
+    *optionals(SmallInteger, "decoded_version", "redecoding_version"),
+    *optionals(BigInteger, "redecoded_to", "redecode_until"),
     UniqueConstraint("ccsds_id", "instance"),
 )
 """A spacecraft in one instance: a domain of time, boots and sequence counts.
@@ -114,8 +121,7 @@ INGESTS = Table(
     column("received_utc_ns", BigInteger),
     optional("finished_utc_ns", BigInteger),
     column("accounting", JSON),
-    optional("first_ticks", BigInteger),
-    optional("last_ticks", BigInteger),
+    *optionals(BigInteger, "first_ticks", "last_ticks"),
     Index("ix_ingests_extent", "last_ticks", "first_ticks"),
 )
 """One run of the ingest over one file: what was in it and what of it was new.
@@ -129,8 +135,7 @@ PACKETS = Table(
     METADATA,
     key("id", BigKey),
     column("vehicle_id", Integer),
-    column("apid", SmallInteger),
-    column("sequence_count", SmallInteger),
+    *columns(SmallInteger, "apid", "sequence_count"),
     column("ticks", BigInteger),
     column("digest", LargeBinary(16)),
     column("octets", LargeBinary),
@@ -190,12 +195,8 @@ FRAGMENTS = Table(
     key("id", BigKey),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("channel", String(24)),
-    column("begins", SmallInteger),
-    column("ends", SmallInteger),
-    column("count", SmallInteger),
-    column("next_count", SmallInteger),
-    column("first", BigInteger),
-    column("last", BigInteger),
+    *columns(SmallInteger, "begins", "ends", "count", "next_count"),
+    *columns(BigInteger, "first", "last"),
     column("stream", String(200)),
     column("fit", Integer),
     column("digest", LargeBinary(16)),
@@ -248,8 +249,7 @@ def image_samples(name: str, *columns: Column[Any]) -> Table:
 
 DETECTIONS = image_samples(
     "detections",
-    column("image_quality", SmallInteger),
-    column("count", SmallInteger),
+    *columns(SmallInteger, "image_quality", "count"),
     column("items", LargeBinary),
 )
 """Detections of one image; `items` packed as `store.codec.DETECTION_ITEM`."""
@@ -257,18 +257,10 @@ DETECTIONS = image_samples(
 
 NAVIGATION_STATES = image_samples(
     "navigation_states",
-    column("estimator", SmallInteger),
-    column("outcome", SmallInteger),
-    optional("latitude_deg", Double),
-    optional("longitude_deg", Double),
-    optional("altitude_m", Double),
-    optional("velocity_x_m_s", Float),
-    optional("velocity_y_m_s", Float),
-    optional("velocity_z_m_s", Float),
-    optional("sigma_r_m", Float),
-    optional("sigma_t_m", Float),
-    optional("sigma_n_m", Float),
-    optional("nis", Float),
+    *columns(SmallInteger, "estimator", "outcome"),
+    *optionals(Double, "latitude_deg", "longitude_deg", "altitude_m"),
+    *optionals(Float, "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s", "sigma_r_m"),
+    *optionals(Float, "sigma_t_m", "sigma_n_m", "nis"),
     column("matched", SmallInteger),
 )
 """State of one on-board estimator."""
@@ -276,14 +268,10 @@ NAVIGATION_STATES = image_samples(
 
 FRAME_OUTCOMES = image_samples(
     "frame_outcomes",
-    column("estimator", SmallInteger),
-    column("outcome", SmallInteger),
-    column("reset_trigger", SmallInteger),
-    column("detections", SmallInteger),
+    *columns(SmallInteger, "estimator", "outcome", "reset_trigger", "detections"),
     column("candidate_pairs", Integer),
     column("pairs", SmallInteger),
-    optional("shift_east_m", Float),
-    optional("shift_north_m", Float),
+    *optionals(Float, "shift_east_m", "shift_north_m"),
     column("anchor_reads", BigInteger),
 )
 """What one estimator made of one image."""
@@ -294,8 +282,7 @@ EVENTS = samples(
     column("severity", SmallInteger),
     column("event_id", Integer),
     column("frame_number", BigInteger),
-    optional("value_1", Double),
-    optional("value_2", Double),
+    *optionals(Double, "value_1", "value_2"),
 )
 """An event report; `ticks` is the packet's time, `severity` 1 (info) to 4 (high)."""
 
@@ -412,9 +399,7 @@ ROLLUPS = Table(
     key("part", SmallInteger, autoincrement=False),
     key("level", SmallInteger, autoincrement=False),
     key("bucket", BigInteger, autoincrement=False),
-    column("first_ticks", BigInteger),
-    column("last_ticks", BigInteger),
-    column("rows", BigInteger),
+    *columns(BigInteger, "first_ticks", "last_ticks", "rows"),
     column("statistics", LargeBinary),
     **CLUSTERED,
 )
@@ -428,13 +413,9 @@ CORRELATIONS = Table(
     column("vehicle_id", ForeignKey("vehicles.id"), index=True),
     column("method", String(32)),
     optional("boot_count", Integer),
-    column("start_ticks", BigInteger),
-    column("stop_ticks", BigInteger),
-    column("reference_ticks", BigInteger),
-    column("reference_utc_ns", BigInteger),
+    *columns(BigInteger, "start_ticks", "stop_ticks", "reference_ticks", "reference_utc_ns"),
     column("drift_ppb", Double),
-    optional("residual_rms_ns", Double),
-    optional("residual_max_ns", Double),
+    *optionals(Double, "residual_rms_ns", "residual_max_ns"),
     column("points", Integer),
     column("rejected", Integer, default=0),
     column("superseded", Flag, default=0),
@@ -467,11 +448,9 @@ EPHEMERIDES = Table(
     METADATA,
     key("id", Integer),
     column("file_sha256", ForeignKey("files.sha256")),
-    column("name", Text),
-    column("object_name", Text),
+    *columns(Text, "name", "object_name"),
     column("frame", String(16)),
-    column("start_utc_ns", BigInteger),
-    column("stop_utc_ns", BigInteger),
+    *columns(BigInteger, "start_utc_ns", "stop_utc_ns"),
     column("states", Integer),
     column("precedence", Integer, default=0),
     column("created_utc_ns", BigInteger),
@@ -499,8 +478,7 @@ PASSES = Table(
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("name", Text),
-    column("start_utc_ns", BigInteger),
-    column("stop_utc_ns", BigInteger),
+    *columns(BigInteger, "start_utc_ns", "stop_utc_ns"),
     optional("archive_digest", String(64), unique=True),
     column("manifest", JSON),
     optional("ephemeris_id", ForeignKey("ephemerides.id")),
@@ -557,8 +535,7 @@ JOBS = Table(
     optional("error", Text),
     optional("traceparent", String(55)),
     column("created_utc_ns", BigInteger),
-    optional("started_utc_ns", BigInteger),
-    optional("finished_utc_ns", BigInteger),
+    *optionals(BigInteger, "started_utc_ns", "finished_utc_ns"),
 )
 """A piece of background work, visible from queued to its end; `traceparent` is the step that entered it."""
 
@@ -591,8 +568,7 @@ USERS = Table(
     METADATA,
     key("id", Integer),
     column("name", String(64), unique=True),
-    column("role", String(16)),
-    column("state", String(16)),
+    *columns(String(16), "role", "state"),
     column("created_utc_ns", BigInteger),
     optional("issuer", String(512)),
     optional("subject", String(255)),
@@ -612,9 +588,7 @@ TOKENS = Table(
     column("token_sha256", String(64), unique=True),
     column("created_utc_ns", BigInteger),
     column("hint", String(16)),
-    optional("expires_utc_ns", BigInteger),
-    optional("revoked_utc_ns", BigInteger),
-    optional("used_utc_ns", BigInteger),
+    *optionals(BigInteger, "expires_utc_ns", "revoked_utc_ns", "used_utc_ns"),
     optional("parent_id", ForeignKey("tokens.id")),
     optional("provider_session", String(255)),
 )
@@ -635,8 +609,7 @@ AUDIT = Table(
     column("action", String(48)),
     column("target", Text),
     column("detail", JSON),
-    column("previous_sha256", String(64)),
-    column("sha256", String(64)),
+    *columns(String(64), "previous_sha256", "sha256"),
 )
 """Action of a user; entries are only appended, numbered from 1 without gaps (see `store.audit`)."""
 
@@ -675,14 +648,11 @@ ALARMS = Table(
     column("active", Flag),
     column("count", BigInteger),
     optional("value", Double),
-    column("first_ticks", BigInteger),
-    column("last_ticks", BigInteger),
-    column("raised_utc_ns", BigInteger),
+    *columns(BigInteger, "first_ticks", "last_ticks", "raised_utc_ns"),
     optional("acknowledged_by", String(64)),
     optional("acknowledged_utc_ns", BigInteger),
     optional("shelved_by", String(64)),
-    optional("shelved_until_utc_ns", BigInteger),
-    optional("cleared_utc_ns", BigInteger),
+    *optionals(BigInteger, "shelved_until_utc_ns", "cleared_utc_ns"),
     UniqueConstraint("vehicle_id", "source", "name", "open"),
     Index("ix_alarms_newest", "open", "last_ticks"),
 )
@@ -718,8 +688,7 @@ DISPLAY_OBJECTS = Table(
     "display_objects",
     METADATA,
     key("key", String(64)),
-    column("name", Text),
-    column("type", Text),
+    *columns(Text, "name", "type"),
     column("version", Integer),
     column("document", Text),
     column("octets", Integer),
@@ -769,9 +738,7 @@ TELECOMMANDS = Table(
     optional("sequence_count", SmallInteger),
     optional("request_id", BigInteger),
     optional("octets", LargeBinary),
-    optional("sent_utc_ns", BigInteger),
-    optional("sent_after_ticks", BigInteger),
-    optional("timeout_noted_utc_ns", BigInteger),
+    *optionals(BigInteger, "sent_utc_ns", "sent_after_ticks", "timeout_noted_utc_ns"),
     optional("window_id", Integer, index=True),
     optional("carrier_id", BigInteger),
     optional("mission_id", ForeignKey("missions.id")),
@@ -795,12 +762,8 @@ LINKS = Table(
     column("state", String(16)),
     optional("reason", Text),
     column("octets", BigInteger),
-    optional("heard_utc_ns", BigInteger),
-    optional("clock_offset_ns", BigInteger),
-    column("considered_utc_ns", BigInteger),
-    column("send_requested", BigInteger),
-    column("send_done", BigInteger),
-    column("changed_utc_ns", BigInteger),
+    *optionals(BigInteger, "heard_utc_ns", "clock_offset_ns"),
+    *columns(BigInteger, "considered_utc_ns", "send_requested", "send_done", "changed_utc_ns"),
 )
 """State of a connection to a ground station; one process at a time owns it.
 
@@ -823,15 +786,12 @@ CONTACTS = Table(
     "contacts",
     METADATA,
     key("id", BigKey),
-    column("link", String(64)),
-    column("station", String(64)),
+    *columns(String(64), "link", "station"),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("state", String(16)),
     optional("reason", Text),
     column("start_utc_ns", BigInteger),
-    optional("stop_utc_ns", BigInteger),
-    optional("predicted_start_utc_ns", BigInteger),
-    optional("predicted_stop_utc_ns", BigInteger),
+    *optionals(BigInteger, "stop_utc_ns", "predicted_start_utc_ns", "predicted_stop_utc_ns"),
     column("octets", BigInteger),
     column("telecommands", Integer),
     Index("ix_contacts_link_id", "link", "id"),
@@ -870,11 +830,9 @@ WINDOWS = Table(
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("name", Text),
-    column("start_utc_ns", BigInteger),
-    column("stop_utc_ns", BigInteger),
+    *columns(BigInteger, "start_utc_ns", "stop_utc_ns"),
     column("cadence_s", Double),
-    column("decision", String(16)),
-    column("state", String(16)),
+    *columns(String(16), "decision", "state"),
     optional("reason", Text),
     optional("predecessor_id", ForeignKey("windows.id")),
     optional("ephemeris_id", ForeignKey("ephemerides.id")),
@@ -885,11 +843,9 @@ WINDOWS = Table(
     column("closed", Flag, server_default="0"),
     optional("uploads", JSON),
     column("version", Integer),
-    column("created_by", String(64)),
-    column("edited_by", String(64)),
+    *columns(String(64), "created_by", "edited_by"),
     optional("decided_by", String(64)),
-    column("created_utc_ns", BigInteger),
-    column("changed_utc_ns", BigInteger),
+    *columns(BigInteger, "created_utc_ns", "changed_utc_ns"),
     optional("request_id", ForeignKey("standing_requests.id")),
     Index("ix_windows_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),
 )
@@ -917,8 +873,7 @@ STANDING_REQUESTS = Table(
     column("anchor_utc_ns", BigInteger),
     column("version", Integer),
     column("created_by", String(64)),
-    column("created_utc_ns", BigInteger),
-    column("changed_utc_ns", BigInteger),
+    *columns(BigInteger, "created_utc_ns", "changed_utc_ns"),
 )
 """Standing request with its last plan; `plans` counts plans, so that one of several processes stores each."""
 
@@ -931,8 +886,7 @@ AUTOMATION_ACTIONS = Table(
     column("trigger", String(32)),
     column("rule", String(100)),
     column("position", SmallInteger),
-    column("action", String(32)),
-    column("subject", String(32)),
+    *columns(String(32), "action", "subject"),
     optional("vehicle_id", Integer),
     optional("pass_id", Integer, index=True),
     optional("window_id", Integer),
@@ -944,8 +898,7 @@ AUTOMATION_ACTIONS = Table(
     column("attempts", SmallInteger),
     optional("next_attempt_utc_ns", BigInteger),
     optional("decided_by", String(64)),
-    column("created_utc_ns", BigInteger),
-    column("changed_utc_ns", BigInteger),
+    *columns(BigInteger, "created_utc_ns", "changed_utc_ns"),
     UniqueConstraint("event_number", "rule", "position", "subject"),
 )
 """Action of an automation rule that an event caused; one for the same event, rule, place in it and subject.
@@ -961,24 +914,15 @@ LANDMARKS = Table(
     key("id", Integer),
     column("spacecraft_id", Integer),
     column("state", String(16)),
-    column("latitude_deg", Double),
-    column("longitude_deg", Double),
-    column("height_m", Double),
-    column("sigma_east_m", Double),
-    column("sigma_north_m", Double),
-    column("sigma_up_m", Double),
-    column("diameter_m", Double),
-    column("diameter_sigma_m", Double),
-    column("passes", Integer),
-    column("sightings", Integer),
-    column("looks", Integer),
+    *columns(Double, "latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m"),
+    *columns(Double, "sigma_up_m", "diameter_m", "diameter_sigma_m"),
+    *columns(Integer, "passes", "sightings", "looks"),
     column("score", Double),
     column("evidence", JSON),
     optional("decided_by", String(64)),
     optional("decided_utc_ns", BigInteger),
     optional("reason", Text),
-    column("created_utc_ns", BigInteger),
-    column("changed_utc_ns", BigInteger),
+    *columns(BigInteger, "created_utc_ns", "changed_utc_ns"),
     Index("ix_landmarks_spacecraft_id_state", "spacecraft_id", "state"),
 )
 """Place at which detections recur that no catalogued crater explains.
@@ -992,9 +936,7 @@ BUILDS = Table(
     "builds",
     METADATA,
     key("digest", String(64)),
-    column("name", Text),
-    column("version", Text),
-    column("description", Text),
+    *columns(Text, "name", "version", "description"),
     column("kind", String(16)),
     column("files", JSON),
     optional("flight_code", String(64)),
@@ -1016,8 +958,7 @@ REGRESSION_ARCHIVES = Table(
     key("digest", String(64)),
     column("name", Text),
     column("manifest_sha256", String(64)),
-    column("frames", Integer),
-    column("frames_stored", Integer),
+    *columns(Integer, "frames", "frames_stored"),
     column("state", String(16)),
     column("reason", Text),
     optional("pass_id", Integer, index=True),
@@ -1037,13 +978,9 @@ REPLAYS = Table(
     column("build_digest", String(64), index=True),
     column("outcome", String(16)),
     column("detail", Text),
-    optional("downlink_sha256", String(64)),
-    optional("performance_sha256", String(64)),
-    column("wall_s", Double),
-    column("cpu_s", Double),
-    column("peak_rss_mib", Double),
-    column("isolation", Text),
-    column("machine", Text),
+    *optionals(String(64), "downlink_sha256", "performance_sha256"),
+    *columns(Double, "wall_s", "cpu_s", "peak_rss_mib"),
+    *columns(Text, "isolation", "machine"),
     column("created_utc_ns", BigInteger),
 )
 """Result of one build on one archive; `id` is the hash of both identities."""
@@ -1053,11 +990,9 @@ REGRESSIONS = Table(
     "regressions",
     METADATA,
     key("id", String(32)),
-    column("baseline_digest", String(64)),
-    column("candidate_digest", String(64)),
+    *columns(String(64), "baseline_digest", "candidate_digest"),
     column("verdict", String(16)),
-    column("result", JSON),
-    column("missions", JSON),
+    *columns(JSON, "result", "missions"),
     optional("html_sha256", String(64)),
     column("created_utc_ns", BigInteger),
 )
