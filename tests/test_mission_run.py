@@ -15,8 +15,11 @@ import pytest
 
 from ground_service.client.local import local_client
 from ground_service.ground import open_ground
+from ground_service.http.times import UtcTime
+from ground_service.planning.request_model import PlannedCandidate, RequestPlan
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
+from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.session.regions import observed_boxes
@@ -24,7 +27,7 @@ from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import compare_reports, largest_relative
-from studies.mission_run.figures import windows_asked
+from studies.mission_run.figures import Progress, missing_windows, note_plan, windows_asked
 from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
 from tests.scenarios import commanded_scenario
@@ -52,7 +55,7 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
     said: list[str] = []
     windows = figures["windows"]
     assert windows["requested"] == windows["flown"] == windows["processed"] == figures["reports"] == 1
-    assert windows["failed"] == 0 and figures["images_lost"] == 0
+    assert windows["failed"] == 0 and figures["images_lost"] == 0 and figures["missing_windows"] == []
     assert figures["packets_lost"] == 0 and figures["packets_received"] == figures["packets"] > 0
     (flown,) = figures["performance"]["passes"]
     assert 38 <= flown["frames"] <= 42  # 600 s / 15 s
@@ -124,6 +127,28 @@ def test_the_folder_of_another_version_is_refused_in_one_line(tmp_path: Path, te
 @pytest.mark.parametrize(("days", "asked"), [(0.1, 0), (0.5, 2), (1.0, 2), (1.2, 4), (30.0, 60)])
 def test_what_is_asked_for_is_counted_by_the_days_of_the_request(days: float, asked: int) -> None:
     assert windows_asked(days, 2, 4.0 / 24.0) == asked
+
+
+def test_each_missing_window_has_the_reason_of_the_plan_of_its_day() -> None:
+    start = parse_utc("2029-08-07T00:00:00Z")
+    at = [UtcTime(start + round(hours * 3.6e12)) for hours in (3.0, 5.0, 30.0, 50.0)]
+    night, contact = "Sun below the horizon", "no contact before it to send its telecommands"
+    candidates = [
+        PlannedCandidate(start=one, stop=one, outcome="rejected", window_id=None, reason=why)
+        for one, why in zip(at, (contact, night, contact, None), strict=True)
+    ]
+    plan = RequestPlan(
+        request_id=1, planned=at[1], until=at[3], reason=None, basis="", candidates=candidates, replaced=[]
+    )
+    progress = Progress()
+    note_plan(progress, plan, start)
+    note_plan(progress, plan.model_copy(update={"candidates": [], "reason": night}), start)
+    found = missing_windows([at[0].utc_ns, at[2].utc_ns, at[2].utc_ns], start, 2, 6, progress)
+    assert [(one["day"], one["missing"], one["reason"]) for one in found] == [
+        (0, 1, night),
+        (2, 2, "not known"),
+    ]
+    assert progress.not_entered["1"] == contact
 
 
 def test_what_a_person_does_after_the_posts_is_an_intervention(tmp_path: Path) -> None:

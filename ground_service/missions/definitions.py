@@ -7,6 +7,7 @@ import binascii
 import gzip
 import hashlib
 import json
+import re
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,10 @@ from tmtc.xtce.series import SeriesValue, packet_layouts
 
 EMBEDDED_AS_TEXT_OCTETS = 64 << 10
 """Longer XTCE files are embedded compressed, since a mission description has a limited length."""
+
+
+_COMPARISON = re.compile(r"<(?:\w+:)?Comparison\b[^>]*>")
+_OF_APID, _COMPARED = re.compile(r'parameterRef="[^"]*apid', re.IGNORECASE), re.compile(r'\bvalue="(\d+)"')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,6 +117,30 @@ def read_mission_file(path: Path) -> bytes:
     except UnicodeDecodeError:
         return octets
     return embed_documents(text, path.parent, str(path)).encode()
+
+
+def minimal_description(xtce: Path, spacecraft_id: int) -> str:
+    """Return a mission description of packets without checksum that an XTCE file defines.
+
+    Their APIDs are the numbers that its containers compare with a parameter whose name holds ``apid``.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read, or compares no APID.
+    """
+    try:
+        document = xtce.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput(str(xtce), "", "an XTCE file that can be read", str(error)) from None
+    tags = [one for one in _COMPARISON.findall(document) if _OF_APID.search(one)]
+    apids = sorted({int(one[1]) for one in map(_COMPARED.search, tags) if one is not None})
+    if not apids:
+        raise InvalidInput(
+            str(xtce), "Comparison", "a container that compares its APID with a number", "none"
+        )
+    packets = {"name": xtce.stem[:64], "apids": apids, "packet_checksum": "none", "xtce": [document]}
+    return format_toml({"name": xtce.stem, "spacecraft": {"id": spacecraft_id}, "packets": [packets]})
 
 
 def embed_documents(text: str, folder: Path, source: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -11,9 +11,17 @@ from sqlalchemy import Connection
 from ground_service.clock import mission_now_ns
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
-from ground_service.missions.timekeeping.core import utc_ns_of_ticks
+from ground_service.missions.timekeeping.core import TimeCorrelation, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations
-from ground_service.passes.model import LiveParameter, LiveValue, NewestPacket, SpacecraftInstance
+from ground_service.passes.model import (
+    LiveParameter,
+    LiveValue,
+    NewestPacket,
+    ParameterInfo,
+    SpacecraftInstance,
+)
+from ground_service.passes.parameters import DeclaredParameter, declared_reading
+from ground_service.store import parameters as declared_values
 from ground_service.store import telemetry
 from ground_service.store.vehicles import FLOWN, Vehicle, all_vehicles, find_vehicle, get_vehicle
 from tmtc.dictionary import DICTIONARY, STRUCTURES
@@ -26,6 +34,8 @@ LIVE_PACKETS = (
     "detections",
 )
 """Packets whose newest values are shown; the others report single occurrences."""
+
+Correlations = Sequence[TimeCorrelation]
 
 LIMIT_STATES: tuple[Literal["within", "warning", "alarm"], ...] = ("within", "warning", "alarm")
 
@@ -43,8 +53,18 @@ def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
 def live_parameters(ground: Ground, spacecraft_id: int, instance: str) -> list[LiveParameter]:
     """Return the newest value of every parameter."""
     with ground.database.reading() as connection:
-        newest = _newest(connection, find_vehicle(connection, spacecraft_id, instance))
-    return [_described(packet, value) for packet in newest for value in packet.values]
+        vehicle = find_vehicle(connection, spacecraft_id, instance)
+        newest, reading = _newest(connection, vehicle), declared_reading(connection, vehicle.id)
+    declared = (
+        {}
+        if reading is None
+        else {(one.container, one.name): one.info for one in reading.parameters.values()}
+    )
+    return [
+        _described(packet, value, declared.get((packet.packet, value.name)))
+        for packet in newest
+        for value in packet.values
+    ]
 
 
 def newest_packets(ground: Ground, vehicle_id: int) -> list[NewestPacket]:
@@ -55,25 +75,59 @@ def newest_packets(ground: Ground, vehicle_id: int) -> list[NewestPacket]:
 
 def _newest(connection: Connection, vehicle: Vehicle) -> list[NewestPacket]:
     correlations = load_correlations(connection, vehicle.id)
-    found = []
+    found = list(_newest_declared(connection, vehicle, correlations))
     for name in LIVE_PACKETS:
         octets = telemetry.newest_packet(connection, vehicle.id, DICTIONARY.packet(name).apid)
         if octets is None:
             continue
         packet = DICTIONARY.unpack_packet(octets)
-        utc_ns = int(utc_ns_of_ticks(np.array([packet.ticks]), correlations)[0][0])
-        age_s = (mission_now_ns() - utc_ns) / 1e9
-        found.append(
-            NewestPacket(
-                spacecraft_id=vehicle.ccsds_id,
-                instance=vehicle.instance,
-                packet=packet.name,
-                time=UtcTime(utc_ns),
-                age_s=age_s if age_s >= 0.0 else None,
-                values=tuple(_values(packet)),
-            )
-        )
+        found.append(_packet(vehicle, packet.name, packet.ticks, correlations, _values(packet)))
     return found
+
+
+def _newest_declared(
+    connection: Connection, vehicle: Vehicle, correlations: Correlations
+) -> Iterator[NewestPacket]:
+    """Yield the newest packets that the mission description defines, in the time of their clock."""
+    reading = declared_reading(connection, vehicle.id)
+    containers: dict[int, list[DeclaredParameter]] = {}
+    for one in () if reading is None else reading.parameters.values():
+        containers.setdefault(one.declared.numbers[one.container], []).append(one)
+    for number, parameters in containers.items():
+        assert reading is not None
+        definition = reading.decoding.definition_id
+        row = declared_values.newest_values(connection, vehicle.id, definition, number)
+        if row is not None:
+            ticks, numbers = row
+            first, clock = parameters[0], parameters[0].declared.source.time
+            lines = correlations if clock is None or clock.clock == "payload" else ()
+            values = (_declared_value(one.info, float(numbers[one.index])) for one in parameters)
+            yield _packet(vehicle, first.container, ticks, lines, values)
+
+
+def _declared_value(info: ParameterInfo, value: float) -> LiveValue:
+    state = "none" if info.warning is None and info.alarm is None else "within"
+    for name, limits in (("warning", info.warning), ("alarm", info.alarm)):
+        low, high = limits or (None, None)
+        if (low is not None and value < low) or (high is not None and value > high):
+            state = name
+    text = info.labels.get(f"{value:g}", f"{value:.6g}")
+    return LiveValue(name=info.name, value=value, text=text, limit_state=state)
+
+
+def _packet(
+    vehicle: Vehicle, name: str, ticks: int, correlations: Correlations, values: Iterable[LiveValue]
+) -> NewestPacket:
+    utc_ns = int(utc_ns_of_ticks(np.array([ticks]), correlations)[0][0])
+    age_s = (mission_now_ns() - utc_ns) / 1e9
+    return NewestPacket(
+        spacecraft_id=vehicle.ccsds_id,
+        instance=vehicle.instance,
+        packet=name,
+        time=UtcTime(utc_ns),
+        age_s=age_s if age_s >= 0.0 else None,
+        values=tuple(values),
+    )
 
 
 def _values(packet: DecodedPacket) -> Iterator[LiveValue]:
@@ -89,15 +143,15 @@ def _values(packet: DecodedPacket) -> Iterator[LiveValue]:
             )
 
 
-def _described(packet: NewestPacket, value: LiveValue) -> LiveParameter:
-    field = next(one for one in DICTIONARY.packet(packet.packet).fields if one.name == value.name)
+def _described(packet: NewestPacket, value: LiveValue, declared: ParameterInfo | None) -> LiveParameter:
+    field = declared or DICTIONARY.packet(packet.packet).field(value.name)
     limits = field.warning or field.alarm
     return LiveParameter(
         **dict(value),
         packet=packet.packet,
         description=field.description,
         unit=field.unit,
-        limits="" if limits is None else f"{limits[0]:g} to {limits[1]:g}",
+        limits="" if limits is None else " to ".join("…" if one is None else f"{one:g}" for one in limits),
         time=packet.time,
         age_s=packet.age_s,
     )

@@ -231,6 +231,19 @@ def read_values(
     return ticks, np.frombuffer(octets, VALUE).reshape(len(rows), len(indices)).astype(np.float64)
 
 
+def newest_values(
+    connection: Connection, vehicle: int, definition: int, container: int
+) -> tuple[int, FloatArray] | None:
+    """Return time and values of the newest packet of a container that has a time; None without any."""
+    query = (
+        select(_SAMPLES.c.ticks, _SAMPLES.c["values"])
+        .where(*_between(vehicle, definition, container, NO_TICKS + 1, 2**62))
+        .order_by(_SAMPLES.c.ticks.desc(), _SAMPLES.c.packet_id.desc())
+    )
+    row = connection.execute(query.limit(1)).first()
+    return None if row is None else (int(row[0]), np.frombuffer(bytes(row[1]), VALUE))
+
+
 def count_values(
     connection: Connection, vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int
 ) -> int:

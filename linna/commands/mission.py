@@ -15,7 +15,9 @@ from linna.parser import option
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     writing = actions.add_parser("write", help="write the mission description of a scenario")
-    option(writing, "scenario SCENARIO", str, "scenario file or name")
+    option(writing, "scenario SCENARIO", str, "scenario file or name", nargs="?")
+    option(writing, "--xtce FILE", Path, "instead of a scenario: packets of another mission")
+    option(writing, "--spacecraft-id N", int, "spacecraft of these packets", 0)
     option(writing, "--out FILE", Path, "", Path("mission.toml"))
     option(
         writing,
@@ -83,13 +85,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def write(arguments: argparse.Namespace) -> int:
+    from ground_service.missions.definitions import minimal_description
     from ground_service.missions.model import parse_mission
     from linna.data import data_folder
+    from linna.errors import UsageError
     from payload_emulator.session.mission import scenario_mission_text
     from payload_emulator.session.scenario import load_scenario
 
-    scenario = load_scenario(arguments.scenario)
-    if arguments.flight:
+    if (arguments.scenario is None) == (arguments.xtce is None):
+        raise UsageError("mission write: expected SCENARIO or --xtce FILE")
+    scenario = load_scenario(arguments.scenario) if arguments.scenario else None
+    if scenario is None:
+        text = minimal_description(arguments.xtce, arguments.spacecraft_id)
+    elif arguments.flight:
         from studies.mission_run.dynamics import write_flight
 
         window_s = 60.0 * arguments.window_min
@@ -156,6 +164,7 @@ def run_mission(arguments: argparse.Namespace) -> int:
     from payload_emulator.session.scenario import load_scenario
     from studies.mission_run import run
     from studies.mission_run.distributed import Servers
+    from studies.mission_run.figures import UNKNOWN
 
     try:
         rate = 0.0 if arguments.speed == "max" else float(arguments.speed)
@@ -193,16 +202,20 @@ def run_mission(arguments: argparse.Namespace) -> int:
     servers = Servers(arguments.database, arguments.broker)
     folder = arguments.folder or Path(f"run-{scenario.name}")
     figures = run.run_mission(scenario, data_folder(), folder, terms, log, servers)
-    windows = figures["windows"]
+    windows, missing = figures["windows"], figures["missing_windows"]
     text = (
         f"{figures['days']:g} days in {figures['wall_s']:.0f} s: {windows['requested']} windows requested, "
         f"{windows['flown']} flown, {windows['processed']} processed, {windows['failed']} failed; "
         f"{figures['packets_lost']} packets lost, {figures['reports']} reports, {figures['alerts']} alerts, "
         f"{figures['interventions']} interventions\n"
-        + "\n".join([*figures["monthly_reports"], str(folder / "report.json")])
+        + "\n".join(
+            [f"day {one['day']}: {one['missing']} windows missing: {one['reason']}" for one in missing]
+            + [*figures["monthly_reports"], str(folder / "report.json")]
+        )
     )
     emit(arguments, figures, text=text)
-    return 0 if windows["processed"] == windows["flown"] and not figures["packets_lost"] else 1
+    explained = all(one["reason"] != UNKNOWN for one in missing)
+    return 0 if explained and windows["processed"] == windows["flown"] and not figures["packets_lost"] else 1
 
 
 def compare(arguments: argparse.Namespace) -> int:

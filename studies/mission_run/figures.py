@@ -11,9 +11,15 @@ from typing import Any
 import numpy as np
 
 from ground_service.evaluation.performance.model import PassPerformance
+from ground_service.planning.request_model import RequestPlan
+from lunar.constants import NANOSECONDS_PER_SECOND
 from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.ground import MissionGround
 
+UNKNOWN = "not known"
+"""Reason of a missing window that no plan states."""
+
+DAY_NS = 86_400 * NANOSECONDS_PER_SECOND
 FLOWN = ("executing", "executed", "downlinked", "processed")
 
 
@@ -25,6 +31,8 @@ class Progress:
     ----------
     posts
         First and last number of the entries of the audit log for the posts of each start.
+    not_entered
+        Why the last plan of each day of the run, by its number, has no further windows.
     """
 
     wall_s: float = 0.0
@@ -40,6 +48,7 @@ class Progress:
     resets: int = 0
     reference_day: int = -1
     request_id: int | None = None
+    not_entered: dict[str, str] = field(default_factory=dict)
     finished: bool = False
     posts: list[tuple[int, int]] = field(default_factory=list)
 
@@ -49,9 +58,37 @@ def windows_asked(days: float, windows_per_day: int, last_days: float) -> int:
     return windows_per_day * max(math.ceil(days - last_days), 0)
 
 
-def closing_figures(ground: MissionGround, progress: Progress, asked: int) -> dict[str, Any]:
+def note_plan(progress: Progress, plan: RequestPlan, start_utc_ns: int) -> None:
+    """Record why a plan has no further windows, by the number of the day of the run."""
+    reasons: dict[int, Counter[str]] = {}
+    for one in plan.candidates:
+        if one.reason is not None:
+            day = (one.start.utc_ns - start_utc_ns) // DAY_NS
+            reasons.setdefault(day, Counter())[one.reason] += 1
+    if plan.reason is not None and plan.planned is not None:
+        reasons[(plan.planned.utc_ns - start_utc_ns) // DAY_NS] = Counter([plan.reason])
+    for day, counts in reasons.items():
+        progress.not_entered[str(day)] = counts.most_common(1)[0][0]
+
+
+def missing_windows(
+    starts_utc_ns: Iterable[int], start_utc_ns: int, per_day: int, asked: int, progress: Progress
+) -> list[dict[str, Any]]:
+    """Return the days of the run with fewer windows than asked for, with the reason; "not known" without one."""
+    entered = Counter((one - start_utc_ns) // DAY_NS for one in starts_utc_ns)
+    return [
+        {"day": day, "missing": per_day - entered[day], "reason": progress.not_entered.get(str(day), UNKNOWN)}
+        for day in range(asked // per_day)
+        if entered[day] < per_day
+    ]
+
+
+def closing_figures(
+    ground: MissionGround, progress: Progress, asked: int, per_day: int, start_utc_ns: int
+) -> dict[str, Any]:
     """Return the figures of the closing report; what is not known is None."""
     windows = ground.windows()
+    kept = [one.start.utc_ns for one in windows if one.state != "failed"]
     performance = ground.client.get_performance(SPACECRAFT_ID)
     passes = performance.passes
     alarms = [one.model_dump(mode="json") for one in ground.client.list_alarms()]
@@ -68,6 +105,7 @@ def closing_figures(ground: MissionGround, progress: Progress, asked: int) -> di
         "window_list": [
             {"start": str(one.start), "state": one.state, "reason": one.reason} for one in windows
         ],
+        "missing_windows": missing_windows(kept, start_utc_ns, per_day, asked, progress),
         "frames": progress.frames,
         "frames_received": sum(one.frames or 0 for one in passes),
         "images_lost": progress.images_lost,

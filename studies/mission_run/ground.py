@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ground_service.access.model import AuditEntry
 from ground_service.access.service import RESERVED_NAMES
@@ -34,6 +34,7 @@ from ground_service.worker.follow_up import CONSUMER, KINDS
 from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
 
+Answer = TypeVar("Answer")
 USER = "mission-run"
 FLIGHT_DYNAMICS = "flight-dynamics"
 SYSTEMS = (*RESERVED_NAMES, FLIGHT_DYNAMICS)
@@ -124,14 +125,18 @@ class MissionGround:
 
     def windows(self) -> list[Window]:
         """Return all windows, the earliest first."""
-        found: list[Window] = []
+        return sorted(self.read(lambda client: list(client.list_windows())), key=lambda one: one.start.utc_ns)
+
+    def read(self, ask: Callable[[Client], Answer]) -> Answer:
+        """Return an answer of the API, also while parts of the service start again."""
+        found: list[Answer] = []
 
         def is_read() -> bool:
-            found[:] = self.client.list_windows()
+            found.append(ask(self.client))
             return True
 
         self._wait(is_read, "answer of the API")
-        return sorted(found, key=lambda one: one.start.utc_ns)
+        return found[0]
 
     def packets_received(self) -> int:
         """Return the number of packets in the archive."""

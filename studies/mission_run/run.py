@@ -22,7 +22,7 @@ from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import REPORT
 from studies.mission_run.distributed import DistributedGround, Servers
 from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics
-from studies.mission_run.figures import Progress, closing_figures, months, windows_asked
+from studies.mission_run.figures import Progress, closing_figures, months, note_plan, windows_asked
 from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftKilled, SpacecraftProcess
 
@@ -306,6 +306,8 @@ class MissionRun:
     def _watch(self, ground: MissionGround, message: dict[str, Any]) -> None:
         progress = self._progress
         days = (parse_utc(message["utc"]) - self._scenario.epoch_utc_ns) / DAY_NS
+        plan = ground.read(lambda client: client.get_request_plan(progress.request_id or 0))
+        note_plan(progress, plan, self._scenario.epoch_utc_ns)
         self._save()
         counts = Counter(one.state for one in ground.windows())
         states = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
@@ -323,7 +325,9 @@ class MissionRun:
             "scenario": self._scenario.name,
             "days": terms.days,
             "form": "distributed" if terms.distributed else "embedded",
-            **closing_figures(ground, self._progress, asked),
+            **closing_figures(
+                ground, self._progress, asked, terms.windows_per_day, self._scenario.epoch_utc_ns
+            ),
             "monthly_reports": [],
         }
         for month in months(one["start"] for one in figures["performance"]["passes"]):

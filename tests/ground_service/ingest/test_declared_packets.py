@@ -19,12 +19,13 @@ from ground_service.http.model import Paging
 from ground_service.ingest import parameters as decoding
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import store as missions
-from ground_service.missions.definitions import read_mission_file
+from ground_service.missions.definitions import minimal_description, read_mission_file
 from ground_service.missions.model import mission_faults
 from ground_service.missions.service import add_mission, check_mission_file
 from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
 from ground_service.passes.archive_import import import_archive
+from ground_service.passes.live import live_parameters
 from ground_service.passes.parameters import export_packets, pass_parameters
 from ground_service.passes.service import define_pass, get_pass, parameter_series, trend_series
 from ground_service.settings import Settings
@@ -125,11 +126,16 @@ def test_packets_without_a_checksum_between_others_become_series(
     result = ingest_file(either, downlink(tmp_path, mixed))
     assert (result.packets, result.packets_new) == (len(mixed), len(mixed))
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
+    newest = {one.name: one for one in live_parameters(either, 76, "flight")}  # without a pass
     found = parameter_series(either, define(either), "VOLTAGE", 1000)
     housekeeping = [packet for packet in bus if packet[1] == foreign.APID_HOUSEKEEPING]
     expected = [packet["VOLTAGE"] for packet in interpreted(housekeeping, tmp_path)]
     assert found.unit == "V"
     assert found.buckets.mean.tolist() == expected
+    voltage = newest["VOLTAGE"]
+    assert (voltage.packet, voltage.value, voltage.unit) == ("Housekeeping", expected[-1], "V")
+    assert voltage.time.utc_ns == pytest.approx(START + 299 * NS, abs=15_259)
+    assert "temperature_c" in newest
     assert found.buckets.start_utc_ns.tolist() == pytest.approx(
         [START + k * NS for k in range(300)], abs=15_259
     )
@@ -145,6 +151,20 @@ def test_packets_without_a_checksum_between_others_become_series(
     assert listed.outcomes == {"100": {"decoded": 300}, "101": {"decoded": 75}}
 
 
+def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path) -> None:
+    (tmp_path / "bus.xml").write_text(foreign.BUS, encoding="utf-8")
+    text = minimal_description(tmp_path / "bus.xml", 76)
+    add_mission(ground, text.encode())
+    ingest_file(ground, downlink(tmp_path, bus_packets(8)))
+    with ground.database.reading() as connection:
+        vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
+        found = readable_decoding(connection, vehicle)
+    assert found is not None and found.counts["100"] == {"decoded": 8}
+    (tmp_path / "none.xml").write_text("<SpaceSystem/>", encoding="utf-8")
+    with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
+        minimal_description(tmp_path / "none.xml", 76)
+
+
 def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(
     ground: Ground, tmp_path: Path
 ) -> None:
@@ -158,6 +178,10 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(
     text = foreign.BUS[:end] + limits + foreign.BUS[end:]
     add_mission(ground, read_mission_file(mission(tmp_path / "m", document=text)))
     ingest_file(ground, downlink(tmp_path, bus_packets(4)))
+    newest = next(one for one in live_parameters(ground, 76, "flight") if one.name == "VOLTAGE")
+    assert newest.limits == "-1 to 1000.5" and newest.value is not None
+    broken = "alarm" if newest.value > 1020.0 else "warning" if newest.value > 1000.5 else "within"
+    assert newest.limit_state == broken
     listed = {one.name: one for one in pass_parameters(ground, define(ground)).parameters}
     assert (listed["VOLTAGE"].warning, listed["VOLTAGE"].alarm) == ((-1.0, 1000.5), (None, 1020.0))
     assert listed["MODE"].labels == {"0": "SAFE", "1": "NOMINAL", "7": "DETUMBLE"}
