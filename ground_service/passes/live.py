@@ -37,7 +37,8 @@ LIVE_PACKETS = (
 
 Correlations = Sequence[TimeCorrelation]
 
-LIMIT_STATES: tuple[Literal["within", "warning", "alarm"], ...] = ("within", "warning", "alarm")
+LimitState = Literal["none", "within", "warning", "alarm"]
+LIMIT_STATES: tuple[LimitState, ...] = ("within", "warning", "alarm")
 
 
 def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
@@ -106,8 +107,8 @@ def _newest_declared(
 
 
 def _declared_value(info: ParameterInfo, value: float) -> LiveValue:
-    state = "none" if info.warning is None and info.alarm is None else "within"
-    for name, limits in (("warning", info.warning), ("alarm", info.alarm)):
+    state: LimitState = "none" if info.warning is None and info.alarm is None else "within"
+    for name, limits in zip(LIMIT_STATES[1:], (info.warning, info.alarm), strict=True):
         low, high = limits or (None, None)
         if (low is not None and value < low) or (high is not None and value > high):
             state = name

@@ -17,6 +17,9 @@ from ground_service.planning.store import WINDOWS, records_where
 HOLDS_S = 300.0
 """A condition is an alarm when it has held for so long."""
 
+OVERDUE_NS = 24 * 3600 * 10**9
+"""A window without a report so long after its end is overdue."""
+
 
 @dataclass(slots=True)
 class Watch:
@@ -54,6 +57,8 @@ class Watch:
         with self.ground.database.reading() as connection:
             refused = records_where(connection, WINDOWS.c.state == "approved", WINDOWS.c.reason.is_not(None))
             yield from ((one.spacecraft_id, "window_not_released") for one in refused)
+            late = WINDOWS.c.state.in_(("executed", "downlinked")), WINDOWS.c.stop_utc_ns < now - OVERDUE_NS
+            yield from ((one.spacecraft_id, "report_overdue") for one in records_where(connection, *late))
             for key in request_store.active_requests(connection):
                 plan = request_store.get_plan(connection, key)
                 if plan.planned is not None and not plan.candidates:

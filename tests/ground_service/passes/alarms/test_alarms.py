@@ -30,6 +30,7 @@ from ground_service.planning.progress import note_reason
 from ground_service.planning.request_model import StandingRequestIn
 from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
+from ground_service.store import repository
 from ground_service.worker.watch import Watch
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -196,7 +197,8 @@ def test_the_end_and_the_return_of_a_condition_are_published(ground: Ground, tmp
     assert [one.state for one in found] == ["raised", "condition ended", "condition returned"]
 
 
-def test_events_of_low_severity_raise_no_alarm(ground: Ground, tmp_path: Path) -> None:
+def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path / "in", [event(k, "event_medium", 36) for k in range(4)])
     receive(
         ground, tmp_path / "in", [event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0)]
     )
@@ -253,6 +255,13 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
             watch.tick()
             [ended] = [one for one in alarms(ground) if not one.active]
             assert ended.name == "mission_time_stopped"
+            with ground.database.writing() as connection:
+                repository.change(connection, repository.WINDOWS, window, state="downlinked")
+            watch.tick()
+            assert not any(one.name == "report_overdue" for one in alarms(ground))
+            moment += 2 * 86_400 * 10**9
+            watch.tick()
+            assert any(one.name == "report_overdue" and one.active for one in alarms(ground))
             Watch(ground).tick()  # nothing has lasted for long
             assert not any(one.active for one in alarms(ground))
     finally:
