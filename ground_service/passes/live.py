@@ -83,7 +83,9 @@ def _newest(connection: Connection, vehicle: Vehicle) -> list[NewestPacket]:
             continue
         packet = DICTIONARY.unpack_packet(octets)
         found.append(_packet(vehicle, packet.name, packet.ticks, correlations, _values(packet)))
-    return found
+    # A clock behind the telemetry is not that of the mission, which is simulated at another time.
+    now = max([mission_now_ns(), *(one.time.utc_ns for one in found)])
+    return [one.model_copy(update={"age_s": (now - one.time.utc_ns) / 1e9}) for one in found]
 
 
 def _newest_declared(
@@ -120,13 +122,12 @@ def _packet(
     vehicle: Vehicle, name: str, ticks: int, correlations: Correlations, values: Iterable[LiveValue]
 ) -> NewestPacket:
     utc_ns = int(utc_ns_of_ticks(np.array([ticks]), correlations)[0][0])
-    age_s = (mission_now_ns() - utc_ns) / 1e9
     return NewestPacket(
         spacecraft_id=vehicle.ccsds_id,
         instance=vehicle.instance,
         packet=name,
         time=UtcTime(utc_ns),
-        age_s=age_s if age_s >= 0.0 else None,
+        age_s=0.0,
         values=tuple(values),
     )
 

@@ -276,9 +276,7 @@ class NewestPacket(Entity):
     instance: str
     packet: str
     time: UtcTime = Field(description="Spacecraft time of the packet")
-    age_s: float | None = Field(
-        description="Time since then; null: the packet is later than the clock of the service"
-    )
+    age_s: float = Field(description="Time since then by the clock of the service or the newest packet")
     values: tuple[LiveValue, ...]
 
 
@@ -290,8 +288,8 @@ class LiveParameter(LiveValue):
     unit: str = Field(examples=["degC"])
     limits: str = Field(description="Warning limits, else alarm limits; empty: none", examples=["-20 to 60"])
     time: UtcTime = Field(description="Spacecraft time of the packet")
-    age_s: float | None = Field(
-        description="Time since then; null: the packet is later than the clock of the service", examples=[4.2]
+    age_s: float = Field(
+        description="Time since then by the clock of the service or the newest packet", examples=[4.2]
     )
 
 

@@ -32,7 +32,6 @@ function spark(one) {
 }
 
 function age(one) {
-  if (one.age_s === null) return "unknown";
   const now = one.age_s + (Date.now() - one.received) / 1000;
   return element("span", { class: now > STALE_S ? "stale" : null }, now > STALE_S ? `${lengthText(now)}, stale` : lengthText(now));
 }
