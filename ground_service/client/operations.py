@@ -354,6 +354,10 @@ class Operations(Connection):
     def list_catalogues(self) -> Listing[missions.HeldCatalogue]:
         """List the crater catalogues that the ground holds, newest first."""
 
+    @operation("DELETE /catalogues/{sha256}")
+    def withdraw_catalogue(self, sha256: str) -> None:
+        """Withdraw a crater catalogue that no description in force names; its file and the audit entries are kept."""
+
     @operation("POST /catalogues")
     def add_catalogue(self, file: Path | bytes, *, name: str | None = None) -> missions.HeldCatalogue:
         """Add a crater catalogue, which a mission description names by its SHA-256 (catalogue.sha256)."""

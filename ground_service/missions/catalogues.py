@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput
+from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground
 from ground_service.missions import store
 from ground_service.missions.model import HeldCatalogue, Mission
@@ -34,8 +34,26 @@ def add_catalogue(ground: Ground, stored: StoredFile, name: str, *, actor: str =
         raise InvalidInput("catalogue", "", "a crater catalogue", reason) from None
     with ground.database.writing() as connection:
         register_file(connection, stored, store.CATALOGUE_KIND, name, utc_now_ns())
+        store.set_catalogue_kind(connection, stored.sha256, store.CATALOGUE_KIND)
         audit(connection, actor, "add catalogue", name, {"sha256": stored.sha256, "craters": craters})
         return store.get_catalogue(connection, stored.sha256)
+
+
+def withdraw_catalogue(ground: Ground, sha256: str, *, actor: str) -> None:
+    """Withdraw a held catalogue: no description can use it; the audit log and its file are kept.
+
+    Raises
+    ------
+    Conflict
+        A mission description in force names it.
+    """
+    with ground.database.writing() as connection:
+        held = store.get_catalogue(connection, sha256)
+        for spacecraft, mission in store.missions_in_force(connection).items():
+            if mission.catalogue.sha256 == sha256:
+                raise Conflict(f"catalogue {sha256[:16]}: is that of the mission of spacecraft {spacecraft}")
+        store.set_catalogue_kind(connection, sha256, store.WITHDRAWN_KIND)
+        audit(connection, actor, "withdraw catalogue", held.name, {"sha256": sha256})
 
 
 def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
@@ -49,7 +67,7 @@ def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
     stated = mission.catalogue
     if stated.sha256 is not None:
         path = ground.files.path(stated.sha256)
-        if not path.exists():
+        if not path.exists() or ground.read(store.is_withdrawn, stated.sha256):
             raise InvalidInput(
                 mission.name, "catalogue.sha256", "a catalogue that the ground holds", stated.sha256[:16]
             )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Body, Path, Query
+from fastapi import Body, Path, Query, Response
 
 from ground_service.access.security import Operator, UploadOf, Viewer, add_list
 from ground_service.http.common import API_PREFIX, GroundOf, Name, upload_body
-from ground_service.http.requests import operations
+from ground_service.http.requests import operations, problems
 from ground_service.missions import catalogues, service, store
 from ground_service.missions.model import HeldCatalogue, MissionDetail
 
@@ -47,6 +47,15 @@ def get_mission(ground: GroundOf, caller: Viewer, revision: Revision) -> Mission
 
 
 add_list(missions, "/catalogues", store.list_catalogues)
+
+
+@missions.delete("/catalogues/{sha256}", status_code=204, responses=problems(404, 409))
+def withdraw_catalogue(
+    ground: GroundOf, caller: Operator, sha256: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+) -> Response:
+    """Withdraw a crater catalogue that no description in force names; its file and the audit entries are kept."""
+    catalogues.withdraw_catalogue(ground, sha256, actor=caller.name)
+    return Response(status_code=204)
 
 
 @missions.post(

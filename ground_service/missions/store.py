@@ -22,7 +22,7 @@ from ground_service.missions.model import (
 from ground_service.store import repository
 
 MISSIONS = repository.MISSIONS
-CATALOGUE_KIND = "catalogue"
+CATALOGUE_KIND, WITHDRAWN_KIND = "catalogue", "withdrawn catalogue"
 ARCHIVE_ACTOR = "archive"
 """Actor of mission descriptions that are imported with pass archives."""
 
@@ -203,7 +203,20 @@ def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
 
 def get_catalogue(connection: Connection, sha256: str) -> HeldCatalogue:
     """Return a held crater catalogue."""
-    return HeldCatalogue.of(repository.get(connection, repository.FILES, sha256, "catalogue"))
+    row = repository.get(connection, repository.FILES, sha256, "catalogue")
+    if row["kind"] != CATALOGUE_KIND:
+        raise NotFound("catalogue", sha256)
+    return HeldCatalogue.of(row)
+
+
+def set_catalogue_kind(connection: Connection, sha256: str, kind: str) -> None:
+    """Have a file as a held or as a withdrawn catalogue."""
+    repository.change(connection, repository.FILES, sha256, kind=kind)
+
+
+def is_withdrawn(connection: Connection, sha256: str) -> bool:
+    """Return whether a catalogue was withdrawn."""
+    return repository.find(connection, repository.FILES, sha256=sha256, kind=WITHDRAWN_KIND) is not None
 
 
 def list_catalogues(connection: Connection, asked: Paging) -> PageOf[HeldCatalogue]:

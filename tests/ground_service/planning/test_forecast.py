@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.errors import InvalidInput
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
+from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.ground import Ground
-from ground_service.missions.catalogues import add_catalogue
+from ground_service.missions.catalogues import add_catalogue, withdraw_catalogue
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
@@ -167,6 +169,25 @@ def test_craters_are_counted_by_area_and_searched_for(planned: Ground, tmp_path:
     cell_km2 = 1737.4**2 * math.radians(10.0) * math.sin(math.radians(10.0))
     assert rows[9, 18] == pytest.approx(2 / cell_km2 * 1e4, abs=0.01)  # the crater of 60 km does not count
     assert rows[17, 17] > rows[9, 18] / 2  # one crater in a smaller cell
+
+
+def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground: Ground, tmp_path: Path) -> None:
+    octets = b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n1,2.0,3.0,6000.0,600.0\n"
+    stored = ground.files.put_octets(octets)
+    add_catalogue(ground, stored, "one.csv")
+    text = MISSION.format(catalogue=f'[catalogue]\nsha256 = "{stored.sha256}"\n')
+    add_mission(ground, text.encode(), actor="ann")
+    with pytest.raises(Conflict, match="is that of the mission of spacecraft 76"):
+        withdraw_catalogue(ground, stored.sha256, actor="ann")
+    add_mission(ground, MISSION.format(catalogue="").encode(), actor="ann")
+    withdraw_catalogue(ground, stored.sha256, actor="ann")
+    assert ground.read(list_audit, AuditFilter()).items[0].action == "withdraw catalogue"
+    with pytest.raises(NotFound):
+        withdraw_catalogue(ground, stored.sha256, actor="ann")
+    add_mission(ground, text.replace("small", "again").encode(), actor="ann")
+    assert "a catalogue that the ground holds" in (forecast.crater_density(ground, 76).reason or "")
+    add_catalogue(ground, stored, "one.csv")
+    assert forecast.crater_density(ground, 76).reason is None
 
 
 def test_a_density_without_a_catalogue_states_the_reason(planned: Ground) -> None:
