@@ -44,8 +44,14 @@ from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.schedule import Operator, timeline
 from payload_emulator.session.spacecraft import SPACECRAFT_ID, Moment, Spacecraft, Turn, fly, new_spacecraft
 from payload_emulator.session.state import load_state, save_state
-from payload_emulator.session.station_ports import KEPT_LIMIT_OCTETS, StationPorts, TelecommandBuffer
-from payload_emulator.session.uplink_journal import JournalEntry, add_to_journal, load_journal
+from payload_emulator.session.station_ports import (
+    KEPT_LIMIT_OCTETS,
+    JournalEntry,
+    StationPorts,
+    TelecommandBuffer,
+    add_to_journal,
+    load_journal,
+)
 from payload_emulator.session.viewing import rims_in_view, turn_message
 from payload_emulator.session.world import (
     CHUNK_S,

@@ -8,18 +8,34 @@ connection begins with the first record that is not acknowledged completely.
 Such a station also confirms telecommands: a transmission is its number (unsigned 64 bits), its number of octets
 (unsigned 32 bits) and the octets. The station answers with the number when it has taken the transmission, now or
 before, and with 0 when it cannot send it up now. A number is sent up once.
+
+With an exact state, it makes the inputs of a session complete: a session that was killed repeats them at their times.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from payload_emulator.errors import LinkError
+from payload_emulator.errors import LinkError, RecordError
 from payload_emulator.session.live_ports import Client, Server
 from payload_emulator.sim.board.link import Receiver
 from tmtc.uplink import CLTU_START, CLTU_TAIL
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """A transmission: simulated time at which a station took it, name of the station, number, octets."""
+
+    utc_ns: int
+    station: str
+    number: int
+    octets: bytes
+
 
 RECORD_HEADER = struct.Struct(">Q")
 _COUNT = struct.Struct(">Q")
@@ -215,3 +231,38 @@ class TelecommandBuffer:
     def _drop(self, count: int) -> None:
         self.dropped += count
         self._octets = self._octets[count:]
+
+
+def add_to_journal(path: Path, entry: JournalEntry) -> None:
+    """Append an entry; it survives the end of the process."""
+    line = json.dumps([entry.utc_ns, entry.station, entry.number, entry.octets.hex()])
+    with path.open("ab", buffering=0) as file:
+        file.write(line.encode() + b"\n")
+
+
+def load_journal(path: Path) -> list[JournalEntry]:
+    """Return the entries, and remove an incomplete last line, which was not confirmed.
+
+    Raises
+    ------
+    RecordError
+        A line is no entry.
+    """
+    try:
+        octets = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    whole = octets.rfind(b"\n") + 1
+    if whole < len(octets):
+        os.truncate(path, whole)
+    entries = []
+    for number, line in enumerate(octets[:whole].splitlines(), start=1):
+        try:
+            utc_ns, station, key, text = json.loads(line)
+            entries.append(JournalEntry(int(utc_ns), str(station), int(key), bytes.fromhex(text)))
+        except (ValueError, TypeError):
+            raise RecordError(
+                f"{path}, line {number}: expected time, station, number and octets of a transmission, "
+                f"found {line[:40]!r}"
+            ) from None
+    return entries

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from payload_emulator.training.data.augment import AugmentParameters, make_crop
+from payload_emulator.training.data.feeder import AugmentParameters, make_crop
 
 QUIET = AugmentParameters(noise=0.0, shade=0.0, unsharp=(0.0, 0.0))
 

@@ -16,10 +16,9 @@ from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.vision.detector import OnnxDetector, decode_classes
 from payload_emulator.flight.vision.preprocess import Preparation, gray_levels, prepare_image
 from payload_emulator.session.recipe import Recipe, Source, load_recipe
-from payload_emulator.training.data.augment import AugmentParameters, make_crop
 from payload_emulator.training.data.build import build
 from payload_emulator.training.data.dataset import Dataset
-from payload_emulator.training.data.feeder import TrainParameters
+from payload_emulator.training.data.feeder import AugmentParameters, TrainParameters, make_crop
 from payload_emulator.training.model.export import export
 from payload_emulator.training.model.train import train
 
