@@ -125,7 +125,6 @@ GROUPS = {
             for name in (
                 "navigation/filter",
                 "navigation/anchored",
-                "navigation/prediction",
                 "navigation/association",
                 "navigation/correction",
                 "navigation/recovery",
