@@ -14,7 +14,7 @@ from unittest.mock import MagicMock
 import pytest
 from sqlalchemy import select
 
-from ground_service.clock import mission_now_ns, set_mission_clock, utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.service import enter_command, get_command, release_command
 from ground_service.contacts.links import service, store
 from ground_service.contacts.links.runner import LinkRunner
@@ -27,7 +27,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
 from tests.ground_service.archive_hash import archive_hash
-from tests.ground_service.contacts.links.conftest import Station, declare, operated
+from tests.ground_service.contacts.links.conftest import MissionTime, Station, declare, operated
 from tests.serving import wait_for
 from tmtc.uplink import UplinkDecoder
 
@@ -79,6 +79,13 @@ def contact_events(ground: Ground) -> list[str]:
     return [one.kind for one in read_events(ground.database, 0, 10_000) if one.kind.startswith("contact")]
 
 
+def steps(runner: LinkRunner) -> None:
+    """Wait until the link has looked at what to send once more, from the beginning to the end."""
+    for _ in range(3):
+        before = runner._sent_s
+        wait_for(lambda s=before: runner._sent_s > s, "the next look")
+
+
 @pytest.mark.parametrize("cut", [1, 3, 4, CADU - 1, CADU, CADU + 1, 5 * CADU + 700, 9 * CADU + 2])
 def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
     ground: Ground, station: Station, stream: bytes, expected: str, cut: int
@@ -116,14 +123,16 @@ def test_parts_of_frames_are_ingested_as_they_arrive(
 
 
 def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(
-    ground: Ground, station: Station, stream: bytes, expected: str
+    ground: Ground, station: Station, stream: bytes, expected: str, mission_time: MissionTime
 ) -> None:
     declare(ground, station.link())
-    with operated(ground):
+    with operated(ground) as runner:
         connection = station.accept()
         start = 0
         for number, stop in enumerate((3 * CADU, 5 * CADU + 77, len(stream)), 1):
             connection.sendall(stream[start:stop])
+            wait_for(lambda n=stop: runner.octets_received == n, f"{stop} octets")
+            mission_time.advance(3600.0)
             wait_for(lambda n=number: contact_events(ground).count("contact ended") == n, f"contact {number}")
             start = stop
     assert hash_of(ground) == expected
@@ -167,23 +176,25 @@ def test_octets_are_acknowledged_when_they_are_on_disk(
 
 
 def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
-    either: Ground, station: Station, stream: bytes
+    either: Ground, station: Station, stream: bytes, mission_time: MissionTime
 ) -> None:
     declare(either, station.link())
     keys = released(either, 3)
     with operated(either) as runner:
         connection = station.accept()
         wait_for(lambda: service.get_link(either, "lab").state == "connected", "the connection")
-        time.sleep(0.5)
+        steps(runner)
         assert not station.telecommands and runner.commands_unsent == 3
         connection.sendall(stream)
         wait_for(
             lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
         )
         wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
+        wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
+        mission_time.advance(3600.0)
         wait_for(lambda: contact_events(either)[-1] == "contact ended", "the end of the contact")
         more = released(either)
-        time.sleep(0.5)
+        steps(runner)
         assert len(packets_of(bytes(station.telecommands))) == 3
         connection.sendall(stream[: 2 * CADU])
         wait_for(
@@ -199,17 +210,17 @@ def test_manual_links_send_on_request_only(ground: Ground, station: Station, str
     with pytest.raises(Conflict, match="expected a process that operates it"):
         service.request_send(ground, "lab", actor="ann")
     keys = released(ground)
-    with operated(ground):
+    with operated(ground) as runner:
         station.accept().sendall(stream[: 3 * CADU])
         wait_for(lambda: service.get_link(ground, "lab").state == "contact", "the contact")
-        time.sleep(0.5)
+        steps(runner)
         assert not station.telecommands
         assert service.request_send(ground, "lab", actor="ann").unsent == 1
         wait_for(
             lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, keys), "the telecommand"
         )
         later = released(ground)
-        time.sleep(0.5)
+        steps(runner)
         assert len(packets_of(bytes(station.telecommands))) == 1
         assert get_command(ground, later[0]).state == "released"
     with pytest.raises(NotFound):
@@ -229,12 +240,12 @@ def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
         either, declared, "dead"
     )
     assert service.get_link(either, "lab").unconfirmed == 1
-    with operated(either, "living"):
+    with operated(either, "living") as runner:
         station.accept().sendall(stream[: 3 * CADU])
         wait_for(
             lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
         )
-        time.sleep(0.5)
+        steps(runner)
         assert len(packets_of(bytes(station.telecommands))) == 2
     assert service.get_link(either, "lab").unconfirmed == 0
 
@@ -254,21 +265,28 @@ def test_a_process_without_the_lease_takes_no_telecommands(either: Ground, stati
 
 
 def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
-    ground: Ground, station: Station, stream: bytes
+    ground: Ground, station: Station, stream: bytes, mission_time: MissionTime
 ) -> None:
     declare(ground, station.link())
     keys = released(ground)
-    with operated(ground):
+    with operated(ground) as runner:
         connection = station.accept()
         for contact in range(service.REPEAT_ATTEMPTS + 1):
             rows = [stream[k * CADU : (k + 1) * CADU] for k in range(4 * contact, 4 * contact + 4)]
             connection.sendall(rows[0] + rows[1])
             wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
             wait_for(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
-            time.sleep(0.2)
-            connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
             wait_for(
-                lambda n=contact: contact_events(ground).count("contact ended") > n, "the end of the contact"
+                lambda: not service.pending_transmissions(ground, "lab"), "the record of the transmission"
+            )
+            mission_time.advance(0.1)
+            connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
+            received = 4 * (contact + 1) * CADU
+            wait_for(lambda n=received: runner.octets_received == n, "the telemetry")
+            mission_time.advance(3600.0)
+            wait_for(
+                lambda n=contact: contact_events(ground).count("contact ended") == n + 1,
+                "the end of the contact",
             )
         sent = packets_of(bytes(station.telecommands))
     assert sent == octets_of(ground, keys) * service.REPEAT_ATTEMPTS
@@ -293,13 +311,14 @@ class Socket:
         pass
 
 
-def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Station, stream: bytes) -> None:
+def test_octets_that_are_read_late_are_no_silence(
+    ground: Ground, station: Station, stream: bytes, mission_time: MissionTime
+) -> None:
     """A process that was held up finds octets of the whole time: their contact goes on, and no frame is cut."""
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
     assert service.acquire(ground, declared, "me", 3_600_000_000_000)
-    runner, line, now = LinkRunner(ground, declared, "me"), Socket(), [utc_now_ns()]
-    set_mission_clock(lambda: now[0])
+    runner, line = LinkRunner(ground, declared, "me"), Socket()
     ingesting = threading.Thread(target=runner._ingest_all, daemon=True)
     try:
         runner._open()
@@ -307,12 +326,12 @@ def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Stati
         runner._down = line
         line.blocks = [stream[: 2 * CADU + 100]]
         runner._receive()
-        now[0] += 3600 * 10**9
+        mission_time.advance(3600.0)
         line.blocks = [stream[2 * CADU + 100 : 4 * CADU]]
         runner._receive()
         runner._follow_contact()
         assert contact_events(ground) == ["contact started"]
-        now[0] += 3600 * 10**9
+        mission_time.advance(3600.0)
         runner._receive()  # finds nothing
 
         def ended() -> bool:
@@ -321,7 +340,6 @@ def test_octets_that_are_read_late_are_no_silence(ground: Ground, station: Stati
 
         wait_for(ended, "the end of the contact")
     finally:
-        set_mission_clock(None)
         runner._stopping.set()
         runner._cut_all.set()
         runner._work.set()
@@ -425,13 +443,19 @@ def test_the_file_is_not_read_again_by_the_next_process(
     with operated(ground) as runner:
         wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
     with operated(ground, "another") as runner:
-        time.sleep(1.5)
-        assert runner.octets_received == 0
+        (tmp_path / "in" / "next.cadu").write_bytes(stream[: 2 * CADU])
+        wait_for(lambda: runner.octets_received, "the next file")
+        assert runner.octets_received == 2 * CADU
 
 
 @pytest.mark.parametrize(("share", "missed"), [(1.0, 0), (0.3, 1)])
 def test_a_contact_in_which_another_station_received_is_not_missed(
-    ground: Ground, station: Station, synthetic_pass: Any, share: float, missed: int
+    ground: Ground,
+    station: Station,
+    synthetic_pass: Any,
+    mission_time: MissionTime,
+    share: float,
+    missed: int,
 ) -> None:
     from ground_service.missions.ephemerides.service import add_ephemeris
     from tests.ground_service.conftest import START
@@ -441,25 +465,21 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
     stored = ground.files.put_file(synthetic_pass.folder / "reference.oem")
     add_ephemeris(ground, stored, name="reference", precedence=0, actor="ann")
     lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
-    now = [START - 500 * 10**9]
-    set_mission_clock(lambda: now[0])
-    try:
-        (contact, _) = service.list_contacts(ground, now[0], START + 1000 * 10**9).contacts
-        assert contact.stop is not None
-        start, stop = contact.start.utc_ns, contact.stop.utc_ns
-        assert all(service.acquire(ground, one, "me", 15_000_000_000) for one in (lab, other))
-        now[0] = start
-        row = service.start_contact(ground, other, start)
-        assert row is not None
-        service.end_contact(ground, row.id, "other", start + round(share * (stop - start)))
-        now[0] = stop + service.MARGIN_NS + 2 * 10**9
-        assert service.note_missed(ground, lab, "me", now[0], "nothing was received") == missed
-    finally:
-        set_mission_clock(None)
+    mission_time.utc_ns = START - 500 * 10**9
+    (contact, _) = service.list_contacts(ground, mission_time.utc_ns, START + 1000 * 10**9).contacts
+    assert contact.stop is not None
+    start, stop = contact.start.utc_ns, contact.stop.utc_ns
+    assert all(service.acquire(ground, one, "me", 15_000_000_000) for one in (lab, other))
+    mission_time.utc_ns = start
+    row = service.start_contact(ground, other, start)
+    assert row is not None
+    service.end_contact(ground, row.id, "other", start + round(share * (stop - start)))
+    mission_time.utc_ns = stop + service.MARGIN_NS + 2 * 10**9
+    assert service.note_missed(ground, lab, "me", mission_time.utc_ns, "nothing was received") == missed
 
 
 def test_missed_contacts_are_recorded_once_with_the_reason(
-    either: Ground, station: Station, synthetic_pass: Any
+    either: Ground, station: Station, synthetic_pass: Any, mission_time: MissionTime
 ) -> None:
     from ground_service.missions.ephemerides.service import add_ephemeris
     from tests.ground_service.conftest import START
@@ -468,31 +488,25 @@ def test_missed_contacts_are_recorded_once_with_the_reason(
     stored = either.files.put_file(synthetic_pass.folder / "reference.oem")
     add_ephemeris(either, stored, name="reference", precedence=0, actor="ann")
     declared = service.declared_links(either)["lab"]
-    now = [START - 500 * 10**9]
-    set_mission_clock(lambda: now[0])
-    try:
-        found = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9)
-        assert found.unpredicted == {} and [one.state for one in found.contacts] == ["predicted"]
-        (contact,) = found.contacts
-        assert service.acquire(either, declared, "here", 15_000_000_000)
-        assert contact.stop is not None
-        assert (
-            service.note_missed(either, declared, "here", contact.start.utc_ns, "nothing was received") == 0
-        )
-        after = contact.stop.utc_ns + service.MARGIN_NS + 2 * 10**9
-        assert service.note_missed(either, declared, "other", after, "nothing was received") == 0
-        # looked at every half minute, as a link does, the whole contact counts
-        times = range(contact.start.utc_ns, after + 120 * 10**9, 30 * 10**9)
-        counts = [service.note_missed(either, declared, "here", t, "nothing was received") for t in times]
-        assert sum(counts) == 1 and counts[[t >= after for t in times].index(True)] == 1
-        (missed,) = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9).contacts
-        assert (missed.state, missed.reason) == ("missed", "nothing was received")
-        assert missed.predicted_start is not None and missed.predicted_stop is not None
-        assert missed.predicted_start.utc_ns <= contact.start.utc_ns
-        assert abs(missed.predicted_stop.utc_ns - contact.stop.utc_ns) <= 10**9
-        assert contact_events(either) == ["contact missed"]
-    finally:
-        set_mission_clock(None)
+    mission_time.utc_ns = START - 500 * 10**9
+    found = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9)
+    assert found.unpredicted == {} and [one.state for one in found.contacts] == ["predicted"]
+    (contact,) = found.contacts
+    assert service.acquire(either, declared, "here", 15_000_000_000)
+    assert contact.stop is not None
+    assert service.note_missed(either, declared, "here", contact.start.utc_ns, "nothing was received") == 0
+    after = contact.stop.utc_ns + service.MARGIN_NS + 2 * 10**9
+    assert service.note_missed(either, declared, "other", after, "nothing was received") == 0
+    # looked at every half minute, as a link does, the whole contact counts
+    times = range(contact.start.utc_ns, after + 120 * 10**9, 30 * 10**9)
+    counts = [service.note_missed(either, declared, "here", t, "nothing was received") for t in times]
+    assert sum(counts) == 1 and counts[[t >= after for t in times].index(True)] == 1
+    (missed,) = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9).contacts
+    assert (missed.state, missed.reason) == ("missed", "nothing was received")
+    assert missed.predicted_start is not None and missed.predicted_stop is not None
+    assert missed.predicted_start.utc_ns <= contact.start.utc_ns
+    assert abs(missed.predicted_stop.utc_ns - contact.stop.utc_ns) <= 10**9
+    assert contact_events(either) == ["contact missed"]
 
 
 PLACES = """[link.stations.here]
@@ -703,22 +717,17 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
 
 
 def test_the_next_owner_knows_when_a_contact_was_heard_last(
-    either: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
+    either: Ground, station: Station, stream: bytes, mission_time: MissionTime
 ) -> None:
     """Mission time may stand still then: counted from the start of the process, the silence would never end."""
     declare(either, station.link())
-    now = [utc_now_ns()]
-    set_mission_clock(lambda: now[0])
-    try:
-        with operated(either) as runner:
-            station.accept().sendall(stream)
-            wait_for(lambda: runner.octets_received == len(stream), "all octets")
-        assert service.find_open_contact(either, "lab") is not None
-        now[0] += 2_000_000_000
-        assert service.silent_contacts(either) == ["lab"]
-        with operated(either, "next"):
-            station.accept()
-            wait_for(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
-        assert service.silent_contacts(either) == []
-    finally:
-        set_mission_clock()
+    with operated(either) as runner:
+        station.accept().sendall(stream)
+        wait_for(lambda: runner.octets_received == len(stream), "all octets")
+    assert service.find_open_contact(either, "lab") is not None
+    mission_time.advance(2.0)
+    assert service.silent_contacts(either) == ["lab"]
+    with operated(either, "next"):
+        station.accept()
+        wait_for(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
+    assert service.silent_contacts(either) == []
