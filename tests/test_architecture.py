@@ -1,6 +1,7 @@
 """The import contracts of pyproject.toml hold, and they refuse what they are there to refuse."""
 
 import ast
+import functools
 import re
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna", "kernels")
+LONGEST_FUNCTION = 80
 
 
 def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -80,18 +82,28 @@ def modules_of(root: Path) -> dict[str, Path]:
     return found
 
 
-def imported_names(name: str, file: Path) -> set[str]:
-    """Dotted names that a module imports anywhere: also in functions and for type checking."""
-    package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+@functools.cache
+def contents_of(name: str, text: str, is_package: bool) -> tuple[set[str], list[str]]:
+    """Dotted names that a module imports anywhere, also in functions and for type checking; its long functions."""
+    package = name if is_package else name.rpartition(".")[0]
+    imported, long = set[str](), list[str]()
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            imported |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
             origin = ".".join([*parts, *([node.module] if node.module else [])])
-            found |= {f"{origin}.{alias.name}" for alias in node.names}
-    return found
+            imported |= {f"{origin}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
+            lines = node.end_lineno - node.lineno + 1
+            if lines > LONGEST_FUNCTION:
+                long.append(f"{name}.{node.name}: {lines} lines")
+    return imported, long
+
+
+def imported_names(name: str, file: Path) -> set[str]:
+    """Dotted names that a module imports."""
+    return contents_of(name, file.read_text(encoding="utf-8"), file.name == "__init__.py")[0]
 
 
 def import_cycles(root: Path) -> list[list[str]]:
@@ -250,18 +262,12 @@ def test_no_module_reads_data_that_can_name_code() -> None:
     assert UNSAFE.search("stored = torch.load(path, map_location=device)")
 
 
-LONGEST_FUNCTION = 80
-
-
 def long_functions(root: Path) -> list[str]:
     """Functions of the product with more lines than `LONGEST_FUNCTION`, docstring and arguments included."""
     return [
-        f"{name}.{node.name}: {node.end_lineno - node.lineno + 1} lines"
+        one
         for name, file in modules_of(root).items()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and node.end_lineno is not None
-        and node.end_lineno - node.lineno >= LONGEST_FUNCTION
+        for one in contents_of(name, file.read_text(encoding="utf-8"), file.name == "__init__.py")[1]
     ]
 
 

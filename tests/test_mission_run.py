@@ -208,6 +208,7 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     with pytest.raises(KeyboardInterrupt):
         run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, stop)
     assert (folder / "checkpoint" / "archive.db").exists()
+    monkeypatch.setattr("studies.mission_run.run.CHECKPOINT_S", 3600.0)
     again = run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, lines.append)
     assert any("continues from 2029-08-07T" in line for line in lines)
     assert again["starts"] == 2 and again["interventions"] == 0
