@@ -20,14 +20,15 @@ settings.load_profile("linna")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Browser tests run last, the largest file first, and tests of real data only if LINNA_DATA is set.
+    """Slow files run first, browser tests last, the largest file first; real data only if LINNA_DATA is set.
 
     A driven browser keeps an event loop in the thread of the tests, in which `asyncio.run` is then refused.
     With several processes this needs `--no-loadscope-reorder`.
     """
     driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     sizes = Counter(item.path for item in items if item.path in driven)
-    items.sort(key=lambda item: (item.path in driven, -sizes[item.path]))
+    slow = Counter(item.path for item in items if "slow" in item.keywords)
+    items.sort(key=lambda item: (item.path in driven, -slow[item.path], -sizes[item.path]))
     if os.environ.get("LINNA_DATA"):
         return
     skip = pytest.mark.skip(reason="LINNA_DATA is not set: no real data on this machine")
