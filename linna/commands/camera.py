@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
+from linna.commands._choices import CATALOGUE_HELP, open_catalogue
 from linna.output import emit, finish, log
 from linna.parser import option
 

@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
+from linna.commands._choices import CATALOGUE_HELP, open_catalogue, parse_region
 from linna.commands._ground import add_operator_options, ground_client
-from linna.commands._region import parse_region
 from linna.output import emit, finish
 from linna.parser import option
 

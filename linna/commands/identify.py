@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lunar.arrays import IntArray
     from payload_emulator.flight.vision.detector import OnnxDetector
     from payload_emulator.session.world import World
-    from studies.lost_in_space import HostileSearches, LostRow, SeenFrames, Share
+    from studies.lost_in_space import LostRow, SeenFrames, Share
 
 LEAST_CATALOGUED = 6
 
@@ -92,7 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
         + rows["all sets of four"].wrong
         + sum(one.fixes for one in hostile),
         "searches": len(single) + len(sets) + sum(one.searches for one in hostile),
-        "hostile": [_hostile_as_json(one) for one in hostile],
+        "hostile": [
+            asdict(one) | {"least_log10_false": least if math.isfinite(least) else None}
+            for one in hostile
+            for least in (one.least_log10_false,)
+        ],
         "scores": {name: _as_json(row) for name, row in rows.items()},
         "by_altitude": [
             {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}
@@ -182,11 +186,6 @@ def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Sha
 
 def _as_json(row: Share) -> dict[str, Any]:
     return asdict(row) | {"correct_share": row.correct_share if row.searches else None}
-
-
-def _hostile_as_json(one: HostileSearches) -> dict[str, Any]:
-    least = one.least_log10_false
-    return asdict(one) | {"least_log10_false": least if math.isfinite(least) else None}
 
 
 def _key(scenario: str, numbers: bytes, model_sha256: str) -> str:

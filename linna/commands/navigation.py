@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from linna.commands._region import parse_region
+from linna.commands._choices import parse_region
 from linna.output import emit, finish, log, progress
 from linna.parser import option
 

@@ -1,4 +1,4 @@
-"""Choice of the crater catalogue of a command: a file, a public catalogue or a synthetic one."""
+"""Choices of commands: the crater catalogue (a file, a public or a synthetic one), and the region."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from lunar.catalogue import CraterCatalogue
+    from payload_emulator.sim.terrain.curation import Region
 
 SYNTHETIC = ("paper-density", "paper-density-synthetic", "paper-density-uniform")
 CATALOGUE_HELP = (
@@ -33,3 +34,17 @@ def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
     if name is not None or found is None:
         return paper_density_catalogue(seed, uniform=name == SYNTHETIC[2])
     return load_catalogue(found)
+
+
+def parse_region(text: str) -> Region:
+    """Return the region of the option `--region`: W,E,S,N in degrees."""
+    from linna.errors import UsageError
+    from payload_emulator.sim.terrain.curation import Region
+
+    try:
+        west, east, south, north = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--region: expected four numbers W,E,S,N in degrees, found {text!r}") from None
+    if not (-90.0 <= south < north <= 90.0 and 0.0 < east - west <= 360.0):
+        raise UsageError(f"--region: expected west before east and south before north, found {text!r}")
+    return Region(west, east, south, north)
