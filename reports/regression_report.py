@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from reports.arrays import FloatArray
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
-from reports.figures.regression import draw_paired
-from reports.figures.theme import series_styles
-from reports.sections.common import role_of
+from reports.figures.regression import draw_changed_craters
 from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
-from reports.statistics import quantiles
 from reports.text import count_text, number_text, significant_text
-from reports.values import RegressionGate, RegressionPass, RegressionReport
+from reports.values import RegressionGate, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "not judged", "pass")
 _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "not judged": ""}
@@ -24,21 +16,13 @@ _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "n
 def regression_document(report: RegressionReport) -> Document:
     """The document of a regression."""
     counts = {outcome: sum(g.outcome == outcome for g in report.gates) for outcome in _ORDER}
-    blocks: list[Block] = [*judgement(report), Heading("Gates")]
+    blocks: list[Block] = [*judgement(report), Heading("Craters that changed"), *_changed(report)]
+    blocks += [Heading("Passes"), _passes(report), Heading("Gates")]
     if report.gates:
         blocks.append(_gates(report))
     else:
         blocks.append(absent(report, "gates", "Gates", "no gate was judged, so the verdict is inconclusive"))
     blocks += missing_and_remarks(report)
-    before, after = _paired(report)
-    if before:
-        blocks += [Heading("Candidate against baseline"), *_comparison(before, after)]
-    else:
-        blocks += [
-            Heading("Candidate against baseline"),
-            absent(report, "candidate_passes", "Passes", "no pass was run with both builds"),
-        ]
-    blocks += [Heading("Frames that changed most"), _changed(report)]
     blocks += provenance_and_data(report)
     facts = about(
         report,
@@ -48,7 +32,7 @@ def regression_document(report: RegressionReport) -> Document:
             "gates",
             f"{counts['fail']} failed, {counts['inconclusive']} inconclusive, {counts['pass']} passed",
         ),
-        ("passes", count_text(len(before))),
+        ("passes", count_text(len(report.passes))),
     )
     return Document("Regression report", report.title, report.regression_id, facts, tuple(blocks))
 
@@ -94,102 +78,82 @@ def _outcome_text(gate: RegressionGate) -> str:
     return f"{text}; waived: {gate.waived}" if gate.waived else text
 
 
-def _changed(report: RegressionReport) -> Block:
-    """Frames with both builds side by side, a pair to a row."""
-    if not report.changed_frames:
-        return absent(report, "changed_frames", "Frames", "no frame with an image changed")
-    sides = tuple(side for pair in report.changed_frames for side in (pair.baseline, pair.candidate))
-    return gallery_picture(
-        "changed",
-        sides,
-        2,
-        "Left the baseline, right the candidate, on the same image: the frames in which most craters were found by "
-        "one build and not by the other.",
-    )
-
-
-def _paired(report: RegressionReport) -> tuple[list[RegressionPass], list[RegressionPass]]:
-    """Passes run with both builds, in the same order."""
-    after = {p.pass_id: p for p in report.candidate_passes}
-    both = [p for p in sorted(report.baseline_passes, key=lambda p: p.start_utc_ns) if p.pass_id in after]
-    return both, [after[p.pass_id] for p in both]
-
-
-def _comparison(before: list[RegressionPass], after: list[RegressionPass]) -> list[Block]:
-    names = list(dict.fromkeys(name for one in (*before, *after) for name in one.navigation))
-    flown = sorted(names, key=lambda n: quantiles(_statistic(before, n, "median_3d_m"), (0.5,))[0])
-    pairs: list[tuple[str, FloatArray, FloatArray, bool]] = [
-        (
-            f"median error, {name}",
-            _statistic(before, name, "median_3d_m"),
-            _statistic(after, name, "median_3d_m"),
-            True,
-        )
-        for name in flown[:2]
-    ]
-    recall = [np.array([p.recall for p in passes], dtype=np.float64) for passes in (before, after)]
-    if np.isfinite(recall[0]).any() and np.isfinite(recall[1]).any():
-        pairs.append(("recall", recall[0], recall[1], False))
+def _changed(report: RegressionReport) -> list[Block]:
+    """Return the craters that changed: map, list, and both builds side by side, two pairs to a row."""
     blocks: list[Block] = []
-    if pairs:
-        worse = [
-            f"{title}: {int(np.sum((b > a) if lengths else (b < a)))} of {len(before)}"
-            for title, a, b, lengths in pairs
-        ]
+    craters = report.craters
+    if craters is not None and len(craters.change):
+        lost, gained = int((craters.change < 0).sum()), int((craters.change > 0).sum())
+        told = f"{lost} of {len(craters.change)} tracks of craters lost, {gained} gained"
         blocks.append(
             Picture(
-                "paired",
-                "Each pass with both builds. On the dashed line nothing has changed; blue: the candidate is "
-                "not worse; vermillion: worse. "
-                f"Passes that became worse: {'; '.join(worse)}.",
-                "Candidate against baseline for each pass. Worse: " + "; ".join(worse),
-                3.3,
-                lambda c: draw_paired(c, pairs),
+                "craters",
+                f"{told}. Vermillion: the candidate detects the crater in fewer frames; blue: in more; gray: in as "
+                f"many. Crosses: {len(craters.false_latitude_deg)} places where the candidate alone has a detection "
+                "without a crater.",
+                told,
+                3.6,
+                lambda c: draw_changed_craters(c, craters),
             )
         )
-    blocks.append(_solutions(before, names, "baseline"))
-    blocks.append(_solutions(after, names, "candidate"))
-    return blocks
-
-
-def _solutions(passes: Sequence[RegressionPass], names: Sequence[str], build: str) -> Table:
-    """Figures of every solution over the passes."""
-    styles = series_styles([(name, "estimate") for name in names])
-    rows: list[tuple[Cell | str, ...]] = []
-    for name in names:
-        median = _statistic(passes, name, "median_3d_m")
-        low, middle, high = quantiles(median, (0.0, 0.5, 1.0))
-        rows.append(
-            (
-                Cell(name, swatch=role_of(styles[name][0]), strong=True),
-                count_text(int(np.isfinite(median).sum())),
-                number_text(low, 0),
-                number_text(middle, 0),
-                number_text(high, 0),
-                number_text(quantiles(_statistic(passes, name, "p95_3d_m"), (0.5,))[0], 0),
-                number_text(quantiles(_statistic(passes, name, "max_3d_m"), (1.0,))[0], 0),
-                number_text(quantiles(_statistic(passes, name, "drift_percent"), (0.5,))[0], 3),
-            )
-        )
-    return Table(
-        f"3-D position error over the passes, {build}: each pass counts once.",
+    if not report.changed_tracks:
+        return [*blocks, absent(report, "changed_tracks", "Tracks", "no track of a crater changed")]
+    columns = (
+        Column("pass", numeric=False),
+        Column("latitude", unit="degrees"),
+        Column("longitude", unit="degrees"),
+        Column("diameter", unit="km"),
+        Column("frames"),
+        Column("lost"),
+        Column("gained"),
+    )
+    rows = tuple(
         (
-            Column("solution", numeric=False),
-            Column("passes"),
-            Column("best", group="median of a pass, m"),
-            Column("median", group="median of a pass, m"),
-            Column("worst", group="median of a pass, m"),
-            Column("median of 95 %", unit="m"),
-            Column("largest error", unit="m"),
-            Column("drift", unit="% of path"),
+            one.pass_id,
+            number_text(one.latitude_deg, 2),
+            number_text(one.longitude_deg, 2),
+            number_text(one.diameter_km, 1),
+            count_text(one.frames),
+            count_text(one.lost),
+            count_text(one.gained),
+        )
+        for one in report.changed_tracks
+    )
+    sides = tuple(side for one in report.changed_tracks for side in (one.baseline, one.candidate))
+    lead = "Left the baseline, right the candidate, around the same crater, in the order of the list."
+    return [
+        *blocks,
+        Table(
+            "Tracks that changed most: one crater in one visit. Frames in which one build alone detects it.",
+            columns,
+            rows,
         ),
-        tuple(rows),
-    )
+        gallery_picture("changed", sides, 4, lead),
+    ]
 
 
-def _statistic(passes: Sequence[RegressionPass], name: str, field: str) -> FloatArray:
-    """Return one statistic of one solution over the passes, NaN where a pass does not have it."""
-    return np.array(
-        [float(getattr(p.navigation[name], field)) if name in p.navigation else np.nan for p in passes],
-        dtype=np.float64,
+def _passes(report: RegressionReport) -> Block:
+    """Return the table of the passes with both builds."""
+    if not report.passes:
+        return absent(report, "passes", "Passes", "no pass was run with both builds")
+    names = ("recall", "precision", "median error")
+    rows = tuple(
+        (
+            one.pass_id,
+            count_text(one.frames),
+            "none" if one.first_difference is None else count_text(one.first_difference),
+            *(
+                number_text(value, digits)
+                for pair, digits in ((one.recall, 3), (one.precision, 3), (one.median_3d_m, 1))
+                for value in pair
+            ),
+        )
+        for one in report.passes
     )
+    figures = (
+        Column(side, group=name, unit="m" if name == "median error" else "")
+        for name in names
+        for side in ("baseline", "candidate")
+    )
+    columns = (Column("pass", numeric=False), Column("frames"), Column("first different frame"), *figures)
+    return Table("Passes with both builds; position errors of the anchored estimator.", columns, rows)

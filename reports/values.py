@@ -556,19 +556,17 @@ class PassReport(ReportCommon):
 
 @dataclass(frozen=True, slots=True)
 class RegressionPass:
-    """One pass with one build; statistics by name of the estimator."""
+    """One pass with both builds; pairs are of baseline and candidate.
+
+    `first_difference` is the first frame with different packets; None: there is none.
+    """
 
     pass_id: str
-    start_utc_ns: int
-    build: str = ""
-    light: str = ""
-    frames_expected: int | None = None
-    frames_processed: int | None = None
-    packets: int | None = None
-    precision: float = float("nan")
-    recall: float = float("nan")
-    localisation_px: float = float("nan")
-    navigation: Mapping[str, NavigationStatistics] = field(default_factory=dict)
+    frames: int
+    first_difference: int | None = None
+    recall: tuple[float, float] = (float("nan"), float("nan"))
+    precision: tuple[float, float] = (float("nan"), float("nan"))
+    median_3d_m: tuple[float, float] = (float("nan"), float("nan"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -688,12 +686,32 @@ class RegressionGate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ChangedFrame:
-    """One image with what the baseline and what the candidate found in it."""
+class ChangedTrack:
+    """One crater in one visit with what each build found, around the crater in the image of one frame.
+
+    `lost` and `gained` are numbers of frames of `frames` in which one build alone detected the crater.
+    """
 
     pass_id: str
+    latitude_deg: float
+    longitude_deg: float
+    diameter_km: float
+    frames: int
+    lost: int
+    gained: int
     baseline: GalleryFrame
     candidate: GalleryFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChangedCraters:
+    """Tracks of craters (n,) by place, with the frames gained less those lost; new false detections (m,) by place."""
+
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    change: FloatArray
+    false_latitude_deg: FloatArray
+    false_longitude_deg: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -704,9 +722,9 @@ class RegressionReport(ReportCommon):
     candidate: str = ""
     baseline: str = ""
     gates: tuple[RegressionGate, ...] = ()
-    candidate_passes: tuple[RegressionPass, ...] = ()
-    baseline_passes: tuple[RegressionPass, ...] = ()
-    changed_frames: tuple[ChangedFrame, ...] = ()
+    passes: tuple[RegressionPass, ...] = ()
+    craters: ChangedCraters | None = None
+    changed_tracks: tuple[ChangedTrack, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

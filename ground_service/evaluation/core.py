@@ -61,6 +61,7 @@ from lunar.timescales import format_utc
 from reports.text import count_text
 from reports.values import (
     AnchorRead,
+    ByteArray,
     CraterMap,
     DetectorScore,
     FrameAccounting,
@@ -647,7 +648,7 @@ def _detector(
             else "the crater catalogue has no complete crater of 5 to 30 km in view"
         )
     chosen, worst = _choose_frames(inputs, expected, matches)
-    frames = {frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
+    frames = {frame: _frame_shown(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
     return (
         score,
         tuple(frames[frame] for frame in chosen),
@@ -705,21 +706,23 @@ def _choose_frames(
     return [int(row) for row in spread], sorted(int(row) for row in worst)
 
 
-def _gallery_frame(inputs: PassInputs, expected: ExpectedCraters, matches: Matches, row: int) -> GalleryFrame:
-    detections = inputs.detections
+def _frame_shown(inputs: PassInputs, expected: ExpectedCraters, matches: Matches, row: int) -> GalleryFrame:
+    camera = inputs.viewing.camera
+    gray = np.full((camera.height_px, camera.width_px), _NO_IMAGE_GRAY, dtype=np.uint8)
+    image = inputs.images.get(int(inputs.detections.frame_number[row]), gray)
+    return gallery_frame(inputs.detections, expected, matches, row, image)
+
+
+def gallery_frame(
+    detections: DetectionSamples, expected: ExpectedCraters, matches: Matches, row: int, image: ByteArray
+) -> GalleryFrame:
+    """Return the image of a frame with its detections and its expected craters of 5 to 30 km."""
     d = slice(int(detections.offsets[row]), int(detections.offsets[row + 1]))
     c = np.arange(expected.offsets[row], expected.offsets[row + 1])
     c = c[np.isin(expected.size_class[c], (0, 1, 2))]
     found = matches.detection_of_crater[c] >= 0
-    number = int(detections.frame_number[row])
-    camera = inputs.viewing.camera
-    image = (
-        inputs.images[number]
-        if number in inputs.images
-        else np.full((camera.height_px, camera.width_px), _NO_IMAGE_GRAY, dtype=np.uint8)
-    )
     return GalleryFrame(
-        frame_number=number,
+        frame_number=int(detections.frame_number[row]),
         utc_ns=int(detections.utc_ns[row]),
         image=image,
         detection_u_px=detections.u_px[d],
@@ -732,8 +735,7 @@ def _gallery_frame(inputs: PassInputs, expected: ExpectedCraters, matches: Match
         catalogue_class=expected.size_class[c],
         detection_matched=matches.crater_of_detection[d] >= 0,
         catalogue_matched=found,
-        caption=f"{int(found.sum())} of {len(c)} craters of 5–30 km detected"
-        + ("" if number in inputs.images else ", no image"),
+        caption=f"{int(found.sum())} of {len(c)} craters of 5–30 km detected",
     )
 
 

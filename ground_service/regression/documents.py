@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import json
+import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
 
+from ground_service.evaluation.core import gallery_frame
 from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.inputs import read_image
 from ground_service.evaluation.navigation.alignment import reference_states
-from ground_service.evaluation.navigation.drift import navigation_statistics
 from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
 from ground_service.regression import store
 from ground_service.regression.archives import store_of
 from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, INFORMS, NOT_JUDGED, PASS, Gate
+from ground_service.regression.gates.faults import first_difference
 from ground_service.regression.gates.metrics import metrics_of
-from ground_service.regression.gates.samples import PassFrames
-from ground_service.regression.headline import headline
+from ground_service.regression.gates.samples import cell_places_deg
+from ground_service.regression.headline import NAMES, headline
 from ground_service.regression.model import Verdict
 from ground_service.regression.outcome import (
     JUDGED,
@@ -34,20 +36,24 @@ from ground_service.regression.outcome import (
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 from lunar.timescales import format_utc
 from reports.values import (
-    ChangedFrame,
+    ChangedCraters,
+    ChangedTrack,
     GalleryFrame,
     HeadlineFigure,
-    NavigationStatistics,
     RegressionGate,
     RegressionPass,
     RegressionReport,
 )
 
-PASS_METRICS = (("precision", "precision"), ("recall", "recall"), ("localisation_px", "localisation"))
-"""Fields of a pass in the report, and the metrics of the detector."""
+PASS_METRICS = ("detector.recall", "detector.precision", "navigation.anchored.p50")
+"""Metrics in the table of the passes."""
 
-CHANGED_FRAMES = 4
-"""Frames shown side by side: those that changed most."""
+CHANGED_TRACKS = 10
+CROP_PX = 160
+"""Tracks shown side by side, and the side of their images."""
+
+SCREEN_LINES = 18
+"""Greatest number of lines of facts in a terminal, before the counts and the remarks."""
 
 
 def verdict_document(outcome: RegressionOutcome) -> Verdict:
@@ -77,31 +83,35 @@ def verdict_document(outcome: RegressionOutcome) -> Verdict:
 
 def regression_text(verdict: Verdict) -> str:
     """Return one screen for a terminal: the headline, then a line for each fact."""
-    lines = [f"{verdict.headline}", f"  {verdict.candidate.title} against {verdict.baseline.title}"]
-    for one in verdict.passes:
-        if one.state != "judged":
-            lines.append(f"  {one.name}: {one.state}: {one.detail}")
+    lines = [verdict.headline, "{} against {}".format(*_names(verdict))]
+    lines += [f"{one.name}: {one.state}: {one.detail}" for one in verdict.passes if one.state != JUDGED]
     order = (FAIL, INCONCLUSIVE, NOT_JUDGED, PASS)
     deciding = [gate for gate in verdict.gates if gate.outcome in order]
+    whole = {gate.name for gate in deciding if gate.outcome == FAIL and not gate.pass_name}
     for gate in sorted(deciding, key=lambda gate: order.index(gate.outcome)):
         if gate.waived:
-            lines.append(f"  waived ({gate.outcome}): {gate.waived}: {gate.text}")
-        elif not gate.passed:
-            lines.append(f"  {gate.outcome}: {gate.text}")
-    lines += [
-        f"  informs: {gate.text}"
-        for gate in verdict.gates
-        if gate.outcome == INFORMS and (gate.reason or "").startswith(("worse", "better"))
-    ]
+            lines.append(f"waived ({gate.outcome}): {gate.waived}: {gate.text}")
+        elif not gate.passed and not (gate.pass_name and gate.name in whole):
+            # The headline names the passes on which a metric fails that fails over all of them.
+            lines.append(f"{gate.outcome}: {gate.text}")
+    told = ("worse", "better")
+    informing = [gate for gate in verdict.gates if gate.outcome == INFORMS]
+    lines += [f"informs: {gate.text}" for gate in informing if (gate.reason or "").startswith(told)]
+    if len(lines) > SCREEN_LINES:
+        lines[SCREEN_LINES:] = [f"and {len(lines) - SCREEN_LINES} further facts in the JSON document"]
     counts = {name: sum(gate.outcome == name for gate in deciding) for name in order}
     lines.append(
-        f"  {counts[PASS]} of {len(deciding)} gates passed, {counts[FAIL]} failed, "
-        f"{counts[INCONCLUSIVE]} inconclusive, {counts[NOT_JUDGED]} not judged, over "
-        f"{sum(one.state in JUDGED_STATES for one in verdict.passes)} of {len(verdict.passes)} passes "
-        f"({verdict.frames} frames)"
+        f"{counts[PASS]} of {len(deciding)} gates passed, {counts[FAIL]} failed, {counts[INCONCLUSIVE]} inconclusive, "
+        f"{counts[NOT_JUDGED]} not judged, over {sum(one.state in JUDGED_STATES for one in verdict.passes)} of "
+        f"{len(verdict.passes)} passes ({verdict.frames} frames)"
     )
-    lines += [f"  {remark}" for remark in verdict.remarks]
-    return "\n".join(lines)
+    return "\n  ".join([*lines, *verdict.remarks])
+
+
+def _names(one: Verdict | RegressionOutcome) -> tuple[str, str]:
+    """Return the names of candidate and baseline; only equal ones have the beginnings of the identities."""
+    candidate, baseline = (f"{b.name} {b.version}".rstrip() for b in (one.candidate, one.baseline))
+    return (candidate, baseline) if candidate != baseline else (one.candidate.title, one.baseline.title)
 
 
 def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
@@ -187,15 +197,14 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         {str(name) for one in judged if one.context for name in one.context.manifest.get("data_sources", ())}
     )
     return RegressionReport(
-        title=f"{outcome.candidate.name} {outcome.candidate.version}".strip()
-        + f" against {outcome.baseline.name} {outcome.baseline.version}".rstrip(),
+        title="{} against {}".format(*_names(outcome)),
         regression_id=identity,
-        candidate=outcome.candidate.title,
-        baseline=outcome.baseline.title,
+        candidate=_names(outcome)[0],
+        baseline=_names(outcome)[1],
         gates=tuple(_report_gate(gate) for gate in outcome.gates if gate.outcome != INFORMS),
-        candidate_passes=tuple(_regression_pass(one, "candidate") for one in judged),
-        baseline_passes=tuple(_regression_pass(one, "baseline") for one in judged),
-        changed_frames=tuple(changed_frames(ground, judged)),
+        passes=tuple(_regression_pass(one) for one in judged),
+        craters=changed_craters(judged),
+        changed_tracks=tuple(changed_tracks(ground, judged)),
         verdict=headline(outcome).capitalize() + ".",
         verdict_level=outcome.verdict,
         evidence_level=weakest_evidence([one.context.evidence for one in judged if one.context]),
@@ -219,95 +228,103 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
     )
 
 
-def changed_frames(ground: Ground, judged: list[PassVerdict]) -> list[ChangedFrame]:
-    """The frames that changed most between the builds: most craters found by one and not by the other."""
-    rows = []
+def changed_tracks(ground: Ground, judged: Sequence[PassVerdict]) -> list[ChangedTrack]:
+    """Return the tracks of craters that changed most: in the frames lost, then in those gained, then in the centres."""
+    rows: list[tuple[float, str, int, PassVerdict]] = []
     for one in judged:
         assert one.context and one.baseline_read and one.candidate_read
-        change, moved = (
-            np.abs(new - old)
-            for old, new in zip(
-                *(_seen(read.frames) for read in (one.baseline_read, one.candidate_read)), strict=True
-            )
-        )
-        rows += [
-            (float(change[i]), float(moved[i]), one, int(i))
-            for i in np.lexsort((-moved, -change))[:CHANGED_FRAMES]
-            if change[i] + moved[i] > 0.0 and one.context.frame_names[i]
-        ]
-    rows.sort(key=lambda row: (-row[0], -row[1], row[2].name, row[3]))
-    return [_changed_frame(ground, one, frame) for _, _, one, frame in rows[:CHANGED_FRAMES]]
+        old, new = one.baseline_read.frames.craters, one.candidate_read.frames.craters
+        moved_px = np.nan_to_num(np.hypot(new.du_px - old.du_px, new.dv_px - old.dv_px))
+        # A frame lost outweighs all frames gained of a track, and a frame gained all shifts of its centres.
+        change = 1e6 * (old.hit & ~new.hit) + 1e3 * (new.hit & ~old.hit) + moved_px
+        total = np.bincount(old.track, weights=change)
+        for track in np.argsort(-total, kind="stable")[:CHANGED_TRACKS].tolist():
+            row = int(np.argmax(np.where(old.track == track, change, -1.0)))
+            if total[track] > 0.0 and one.context.frame_names[old.frame[row]]:
+                rows.append((-float(total[track]), one.name, row, one))
+    rows.sort(key=lambda row: row[:3])
+    return [_changed_track(ground, one, row) for *_, row, one in rows[:CHANGED_TRACKS]]
 
 
-def _seen(frames: PassFrames) -> tuple[Any, Any]:
-    """Return the hits less the false detections, and the sum of the shifts of the centres, of each frame (n,)."""
-    craters, found, n = frames.craters, frames.detections, len(frames)
-    explained = np.bincount(found.frame, weights=np.where(found.true, 1.0, -1.0), minlength=n)
-    shift = np.bincount(craters.frame, weights=np.nan_to_num(craters.du_px + craters.dv_px), minlength=n)
-    return explained, shift
-
-
-def _changed_frame(ground: Ground, one: PassVerdict, frame: int) -> ChangedFrame:
+def _changed_track(ground: Ground, one: PassVerdict, row: int) -> ChangedTrack:
     assert one.context and one.baseline_read and one.candidate_read
-    context = one.context
+    context, old, new = one.context, one.baseline_read.frames.craters, one.candidate_read.frames.craters
     with ground.database.reading() as connection:
         archive = store.get_archive(connection, one.digest)
     files = store_of(ground)
     manifest = json.loads(files.get(archive.manifest_sha256))
+    frame, crater = int(old.frame[row]), int(old.crater[row])
     octets = files.get(manifest["files"][context.frame_names[frame]]["sha256"])
     image = read_image(octets, context.frame_names[frame])
-    sides = [
-        _side(context, read, frame, image, label)
+    baseline, candidate = (
+        _side(context, read, frame, crater, image, label)
         for read, label in ((one.baseline_read, "baseline"), (one.candidate_read, "candidate"))
-    ]
-    return ChangedFrame(one.name, sides[0], sides[1])
-
-
-def _side(context: PassContext, read: ReadDownlink, frame: int, image: Any, label: str) -> GalleryFrame:
-    detections = read.detections
-    at = int(np.searchsorted(detections.frame_number, frame))
-    present = at < len(detections) and detections.frame_number[at] == frame
-    d = slice(int(detections.offsets[at]), int(detections.offsets[at + 1])) if present else slice(0, 0)
-    utc = context.frame_utc_ns[frame : frame + 1]
-    track = reference_states(context.reference, context.orientation, utc)
-    rotations = context.viewing.camera_from_mcmf(utc, track.position_mcmf_m, track.mcmf_from_icrf)
-    expected = expected_craters(context.catalogue, context.camera, track.position_mcmf_m, rotations)
-    single = _one_frame(detections, d)
-    matches = match_detections(single, expected)
-    scored = np.isin(expected.size_class, (0, 1, 2))
-    found = matches.detection_of_crater[scored] >= 0
-    return GalleryFrame(
-        frame_number=frame,
-        utc_ns=int(utc[0]),
-        image=image,
-        detection_u_px=single.u_px,
-        detection_v_px=single.v_px,
-        detection_diameter_px=single.diameter_px,
-        detection_class=single.size_class,
-        catalogue_u_px=expected.u_px[scored],
-        catalogue_v_px=expected.v_px[scored],
-        catalogue_diameter_px=expected.diameter_px[scored],
-        catalogue_class=expected.size_class[scored],
-        detection_matched=matches.crater_of_detection >= 0,
-        catalogue_matched=found,
-        caption=f"{label}, {context.name}: {int(found.sum())} of {len(found)} craters of 5–30 km",
+    )
+    same = old.track == old.track[row]
+    return ChangedTrack(
+        one.name,
+        math.degrees(context.catalogue.latitude_rad[crater]),
+        math.degrees(context.catalogue.longitude_rad[crater]),
+        float(context.catalogue.diameter_m[crater]) / 1e3,
+        int(same.sum()),
+        int((same & old.hit & ~new.hit).sum()),
+        int((same & new.hit & ~old.hit).sum()),
+        baseline,
+        candidate,
     )
 
 
-def _one_frame(detections: Any, rows: slice) -> Any:
-    from ground_service.passes.samples import DetectionSamples
+def changed_craters(judged: Sequence[PassVerdict]) -> ChangedCraters:
+    """Return the tracks of all passes by place with their change, and the ground cells of new false detections."""
+    tracks, cells = [np.zeros((3, 0))], [np.zeros(0, np.int64)]
+    for one in judged:
+        assert one.context and one.baseline_read and one.candidate_read
+        old, new = one.baseline_read.frames, one.candidate_read.frames
+        rows, catalogue = old.craters, one.context.catalogue
+        crater = rows.crater[np.unique(rows.track, return_index=True)[1]]
+        places = np.degrees((catalogue.latitude_rad[crater], catalogue.longitude_rad[crater]))
+        change = np.bincount(rows.track, weights=1.0 * new.craters.hit - rows.hit)
+        tracks.append(np.vstack((places, change)))
+        here, before = (one.detections.cell[~one.detections.true] for one in (new, old))
+        cells.append(np.setdiff1d(here, before))
+    latitude, longitude, changes = np.concatenate(tracks, axis=1)
+    return ChangedCraters(latitude, longitude, changes, *cell_places_deg(np.concatenate(cells)))
 
-    return DetectionSamples(
-        np.zeros(1, dtype=np.int64),
-        np.zeros(1, dtype=np.int64),
-        np.ones(1, dtype=np.bool_),
-        (),
-        np.array([0, rows.stop - rows.start], dtype=np.int64),
-        detections.u_px[rows],
-        detections.v_px[rows],
-        detections.diameter_px[rows],
-        detections.score[rows],
-        detections.size_class[rows],
+
+def _side(
+    context: PassContext, read: ReadDownlink, frame: int, crater: int, image: Any, label: str
+) -> GalleryFrame:
+    """Return what a build found in a frame, cut out around a crater."""
+    all_frames, utc = read.detections, context.frame_utc_ns[frame : frame + 1]
+    chosen = np.flatnonzero(all_frames.frame_number == frame)
+    rows = slice(0, 0)
+    if len(chosen):
+        rows = slice(*all_frames.offsets[chosen[0] : chosen[0] + 2].tolist())
+    items = ("u_px", "v_px", "diameter_px", "score", "size_class")
+    detections = replace(
+        all_frames,
+        frame_number=np.array([frame]),
+        utc_ns=utc,
+        offsets=np.array([0, rows.stop - rows.start]),
+        **{name: getattr(all_frames, name)[rows] for name in items},
+    )
+    track = reference_states(context.reference, context.orientation, utc)
+    rotations = context.viewing.camera_from_mcmf(utc, track.position_mcmf_m, track.mcmf_from_icrf)
+    expected = expected_craters(context.catalogue, context.camera, track.position_mcmf_m, rotations)
+    matches = match_detections(detections, expected)
+    row = int(np.flatnonzero(expected.index == crater)[0])
+    top, left = (
+        int(np.clip(round(centre) - CROP_PX // 2, 0, max(size - CROP_PX, 0)))
+        for centre, size in zip((expected.v_px[row], expected.u_px[row]), image.shape[:2], strict=True)
+    )
+    shown = gallery_frame(detections, expected, matches, 0, image[top : top + CROP_PX, left : left + CROP_PX])
+    return replace(
+        shown,
+        detection_u_px=shown.detection_u_px - left,
+        detection_v_px=shown.detection_v_px - top,
+        catalogue_u_px=shown.catalogue_u_px - left,
+        catalogue_v_px=shown.catalogue_v_px - top,
+        caption=f"{label}: {'detected' if matches.detection_of_crater[row] >= 0 else 'not detected'}",
     )
 
 
@@ -339,20 +356,13 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
         "state": one.state,
         "detail": one.detail,
     }
+    costs = {"outcome", "detail", "cpu_s", "wall_s", "peak_rss_mib"}
     for label, replay, read in (
         ("baseline", one.baseline, one.baseline_read),
         ("candidate", one.candidate, one.candidate_read),
     ):
-        if replay is None:
-            continue
-        found[label] = {
-            "outcome": replay.outcome,
-            "detail": replay.detail,
-            "cpu_s": replay.cpu_s,
-            "wall_s": replay.wall_s,
-            "peak_rss_mib": replay.peak_rss_mib,
-            **(pass_figures(read.frames) if read is not None else {}),
-        }
+        if replay is not None:
+            found[label] = replay.model_dump(include=costs) | (pass_figures(read.frames) if read else {})
     if one.baseline_read is not None:
         found["frames"] = len(one.baseline_read.frames)
     return found
@@ -363,46 +373,24 @@ def _report_gate(gate: Gate) -> RegressionGate:
     return RegressionGate(pass_id=gate.pass_name, **{name: getattr(gate, name) for name in names})
 
 
-def _regression_pass(one: PassVerdict, side: str) -> RegressionPass:
-    assert one.context and one.baseline_read and one.candidate_read
-    frames = (one.candidate_read if side == "candidate" else one.baseline_read).frames
-    metrics = {metric.name: metric for metric in metrics_of([frames])}
-    return RegressionPass(
-        pass_id=one.name,
-        start_utc_ns=int(one.context.frame_utc_ns[0]),
-        build=side,
-        light=str(one.context.manifest.get("light", "")),
-        frames_expected=len(frames),
-        frames_processed=int(frames.answered.sum()),
-        packets=int(frames.packets.sum()),
-        **{field: metrics[f"detector.{name}"].value(frames) for field, name in PASS_METRICS},
-        navigation={name: _statistics(estimator) for name, estimator in frames.estimators.items()},
+def _regression_pass(one: PassVerdict) -> RegressionPass:
+    assert one.baseline_read and one.candidate_read
+    sides = (one.baseline_read.frames, one.candidate_read.frames)
+    figures = [{metric.name: metric.value(frames) for metric in metrics_of([frames])} for frames in sides]
+    recall, precision, median = (
+        (figures[0].get(name, math.nan), figures[1].get(name, math.nan)) for name in PASS_METRICS
     )
-
-
-def _statistics(estimator: Any) -> NavigationStatistics:
-    along = np.column_stack(
-        [estimator.error_m, np.zeros(len(estimator.error_m)), np.zeros(len(estimator.error_m))]
-    )
-    return navigation_statistics(
-        along, np.zeros(len(estimator.error_m)), np.zeros(len(estimator.error_m), dtype=np.bool_)
-    )
+    return RegressionPass(one.name, len(sides[0]), first_difference(*sides), recall, precision, median)
 
 
 def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
-    wanted = (
-        ("detector.recall", "Recall", 100.0, "%"),
-        ("detector.precision", "Precision", 100.0, "%"),
-        ("navigation.anchored.p50", "Median error, anchored", 1.0, "m"),
-        ("navigation.anchored.p95", "95 % error, anchored", 1.0, "m"),
+    return tuple(
+        HeadlineFigure(
+            NAMES[gate.name].capitalize(),
+            gate.candidate,
+            gate.unit,
+            f"baseline {gate.baseline:.3g} {gate.unit}",
+        )
+        for gate in outcome.gates
+        if gate.name in NAMES and not gate.pass_name
     )
-    by_name: Mapping[str, Gate] = {gate.name: gate for gate in outcome.gates if not gate.pass_name}
-    figures = []
-    for name, label, scale, unit in wanted:
-        gate = by_name.get(name)
-        if gate is None:
-            figures.append(HeadlineFigure(label, None, unit, "not measured"))
-        else:
-            told = f"baseline {scale * gate.baseline:.3g} {unit}"
-            figures.append(HeadlineFigure(label, scale * gate.candidate, unit, told))
-    return tuple(figures)

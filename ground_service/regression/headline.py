@@ -46,6 +46,7 @@ def _reason(outcome: RegressionOutcome) -> str:
         return "; ".join(gate.reason for gate in exact)
     if failed:
         whole = [gate for gate in failed if not gate.pass_name] or failed[:1]
+        failed.sort(key=lambda gate: -gate.change_low)
         places = list(dict.fromkeys(gate.pass_name for gate in failed if gate.pass_name))
         where = f", most on {', '.join(places[:3])}" if places else ""
         return f"{_changes(whole)}{where}, on {outcome.frames_judged} frames; {_navigation(outcome.gates)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
@@ -22,13 +21,6 @@ COMPLETE, TO_RENDER, TELEMETRY_ONLY = "complete", "to render", "telemetry only"
 
 REASONS_LIMIT = 5
 """Reasons in a list; the verdict has all."""
-
-
-def exit_status(verdict: str, states: Collection[str]) -> int:
-    """Return 0 for pass, 1 for fail, 2 if an archive or the baseline cannot be used, 3 for inconclusive."""
-    if verdict == "inconclusive" and set(states) & set(UNUSABLE_STATES):
-        return 2
-    return {"pass": 0, "fail": 1}.get(verdict, 3)
 
 
 class Build(Entity):
@@ -76,12 +68,12 @@ class KeptReplay(Entity):
 
     outcome: str
     detail: str
-    downlink_sha256: str | None
-    performance_sha256: str | None
-    wall_s: float
-    cpu_s: float
-    peak_rss_mib: float
-    isolation: str
+    downlink_sha256: str | None = None
+    performance_sha256: str | None = None
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_rss_mib: float = 0.0
+    isolation: str = ""
     machine: str
 
 
@@ -247,8 +239,10 @@ class Verdict(Entity):
 
     @property
     def exit_status(self) -> int:
-        """Exit status of a command with this verdict."""
-        return exit_status(self.verdict, [one.state for one in self.passes])
+        """Return 0 for pass, 1 for fail, 2 if an archive or the baseline cannot be used, 3 for inconclusive."""
+        if self.verdict == "inconclusive" and any(one.state in UNUSABLE_STATES for one in self.passes):
+            return 2
+        return {"pass": 0, "fail": 1}.get(self.verdict, 3)
 
     def document(self) -> dict[str, Any]:
         """Return the JSON document."""

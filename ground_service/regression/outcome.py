@@ -12,7 +12,7 @@ from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED,
 from ground_service.regression.gates.metrics import outcome_shares
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
-from ground_service.regression.model import KeptReplay, exit_status
+from ground_service.regression.model import KeptReplay
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 
 JUDGED, TELEMETRY_JUDGED = "judged", "telemetry judged"
@@ -68,11 +68,6 @@ class RegressionOutcome:
         if JUDGED not in states or states - {*JUDGED_STATES, NOT_JUDGED}:
             return INCONCLUSIVE
         return of_gates
-
-    @property
-    def exit_status(self) -> int:
-        """Exit status of a command with this verdict."""
-        return exit_status(self.verdict, [one.state for one in self.passes])
 
     @property
     def frames_judged(self) -> int:

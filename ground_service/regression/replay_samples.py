@@ -24,7 +24,7 @@ from ground_service.missions.ephemerides.attitudes import (
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import archived_mission
-from ground_service.passes.samples import DetectionSamples, NavigationSamples
+from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
 from ground_service.regression.gates.metrics import LATENCY_LEVEL
 from ground_service.regression.gates.samples import PassFrames, TimeTags, pass_frames
@@ -239,33 +239,12 @@ def _rows(table: Table, context: PassContext) -> tuple[IntArray, NDArray[np.bool
     return row, context.frame_ticks[row] == ticks
 
 
-def _firsts(*keys: IntArray) -> IntArray:
-    """Indices of the first of all rows with equal keys, in order."""
-    if len(keys[0]) == 0:
-        return np.zeros(0, dtype=np.int64)
-    _, index = np.unique(np.column_stack(keys), axis=0, return_index=True)
-    return np.asarray(np.sort(index), dtype=np.int64)
-
-
 def _detections(table: Table | None, context: PassContext) -> DetectionSamples:
     if table is None or len(table) == 0:
-        none, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
-        return DetectionSamples(
-            whole,
-            whole,
-            np.zeros(0, dtype=np.bool_),
-            (),
-            np.zeros(1, dtype=np.int64),
-            none,
-            none,
-            none,
-            none,
-            whole,
-        )
+        return no_detections()
     row, known = _rows(table, context)
     packets = np.flatnonzero(known)
-    packets = packets[_firsts(row[packets])]
-    packets = packets[np.argsort(row[packets], kind="stable")]
+    packets = packets[np.unique(row[packets], return_index=True)[1]]
     owners = table.item_owner
     items = np.concatenate([np.flatnonzero(owners == packet) for packet in packets] or [owners[:0]])
     counts = np.bincount(owners, minlength=len(table))[packets]
@@ -292,7 +271,7 @@ def _navigation(table: Table | None, context: PassContext) -> dict[str, Navigati
     samples = {}
     for code, name in names.items():
         chosen = np.flatnonzero(known & (estimator == code))
-        chosen = chosen[_firsts(row[chosen])]
+        chosen = chosen[np.unique(row[chosen], return_index=True)[1]]
         if len(chosen) == 0:
             continue
         columns = {key: values[chosen] for key, values in table.columns.items()}

@@ -8,7 +8,6 @@ goes on.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import os
 import platform
 import re
@@ -132,8 +131,12 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
             return known
         settle_archive(ground, digest)
         replay, manifest_sha256 = _replayed(ground, digest, build)
-        if _keep(ground, digest, build, replay, manifest_sha256):
-            return replay
+        with ground.database.writing() as connection:
+            # A successful replay is never replaced by a concurrent one of another worker.
+            if store.keep_replay(
+                connection, digest, build.digest, replay, utc_now_ns(), manifest_sha256=manifest_sha256
+            ):
+                return replay
         with ground.database.reading() as connection:
             if store.find_archive(connection, digest) is None:
                 return replay  # removed meanwhile, which the verdict reports
@@ -146,17 +149,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
         archive = check_out(ground, digest, folder / "archive")
         refusal = _other_camera(build, archive) or _unreplayable(archive, (build,))
         if refusal:
-            refused = KeptReplay(
-                outcome="refused",
-                detail=refusal,
-                downlink_sha256=None,
-                performance_sha256=None,
-                wall_s=0.0,
-                cpu_s=0.0,
-                peak_rss_mib=0.0,
-                isolation="",
-                machine=_machine(),
-            )
+            refused = KeptReplay(outcome="refused", detail=refusal, machine=_machine())
             return refused, archive.manifest_sha256
         run = run_build(build, archive.folder, folder / "out", runner=ground.runner, private=(ground.home,))
         outcome, detail = run.outcome, run.detail
@@ -366,18 +359,6 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
     return read_downlink(context, files.get(replay.downlink_sha256), performance, replay.peak_rss_mib)
 
 
-def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay, manifest_sha256: str) -> bool:
-    """Store a replay; return whether the archive still has this manifest.
-
-    A successful replay is never replaced by a concurrent one of another worker.
-    """
-    with ground.database.writing() as connection:
-        now = utc_now_ns()
-        return store.keep_replay(
-            connection, digest, build.digest, replay, now, manifest_sha256=manifest_sha256
-        )
-
-
 def _other_camera(build: Build, archive: PassArchive) -> str:
     """Why a build made for one camera cannot fly this archive; empty where it can."""
     given: Mapping[str, Any] = archive.manifest.get("camera") or {}
@@ -395,15 +376,6 @@ def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
     ]
 
 
-@functools.cache
 def _machine() -> str:
     """What a latency was measured on."""
-    model = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as stream:
-            model = next(
-                (line.split(":", 1)[1].strip() for line in stream if line.startswith("model name")), model
-            )
-    except OSError:
-        pass
-    return f"{platform.node()}, {model}"
+    return f"{platform.node()}, {platform.machine()}"

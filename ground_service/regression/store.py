@@ -12,6 +12,7 @@ from ground_service.errors import NotFound
 from ground_service.http.model import PageOf, Paging
 from ground_service.regression.model import (
     OK,
+    TELEMETRY_ONLY,
     ArchiveRecord,
     Build,
     KeptReplay,
@@ -152,9 +153,13 @@ def remove_unused(connection: Connection, used_before_utc_ns: int) -> list[Archi
 
 
 def remove_above(connection: Connection, limit_octets: int) -> list[ArchiveRecord]:
-    """Delete archives that are not pinned, the longest unused first, down to a total size; return them."""
+    """Delete archives that are not pinned down to a total size; return them.
+
+    Those without frames go first, because they say nothing about a detector; then the longest unused.
+    """
     columns = (ARCHIVES.c.digest, ARCHIVES.c.octets, ARCHIVES.c.pinned)
-    kept = connection.execute(select(*columns).order_by(ARCHIVES.c.used_utc_ns, ARCHIVES.c.digest)).all()
+    order = (ARCHIVES.c.state != TELEMETRY_ONLY, ARCHIVES.c.used_utc_ns, ARCHIVES.c.digest)
+    kept = connection.execute(select(*columns).order_by(*order)).all()
     excess = sum(octets for _, octets, _ in kept) - limit_octets
     chosen = []
     for digest, octets, pinned in kept:

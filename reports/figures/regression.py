@@ -1,37 +1,24 @@
-"""Passes of a candidate build against those of the baseline."""
+"""Map of the craters that a candidate build lost and gained."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from reports.arrays import FloatArray
-from reports.figures.canvas import Canvas, log_length_axis
+from reports.figures.canvas import Canvas
 from reports.figures.theme import color
+from reports.values import ChangedCraters
 
 
-def draw_paired(canvas: Canvas, pairs: Sequence[tuple[str, FloatArray, FloatArray, bool]]) -> None:
-    """Candidate against baseline, a dot for each pass, with the diagonal on which nothing changes."""
-    gap = 0.85
-    size = min((canvas.width_in - 0.8 - gap * (len(pairs) - 1)) / max(len(pairs), 1), canvas.height_in - 0.9)
-    for i, (title, before, after, lengths) in enumerate(pairs):
-        axes = canvas.axes(0.75 + i * (size + gap), 0.55, size, size)
-        good = np.isfinite(before) & np.isfinite(after)
-        if lengths:
-            log_length_axis(axes, "x", [before, after])
-            log_length_axis(axes, "y", [before, after])
-        else:
-            axes.set_xlim(0, 1)
-            axes.set_ylim(0, 1)
-        low, high = axes.get_xlim()
-        axes.plot(
-            [low, high], [low, high], color=color("muted"), linestyle=(0, (4, 3)), linewidth=canvas.pt(0.9)
-        )
-        better = (after <= before) if lengths else (after >= before)
-        for mask, role in ((good & better, "blue"), (good & ~better, "vermillion")):
-            axes.plot(before[mask], after[mask], "o", color=color(role), markersize=canvas.pt(4.5), alpha=0.8)
-        axes.grid(True, axis="both")
-        axes.set_title(title)
-        axes.set_xlabel("baseline")
-        axes.set_ylabel("candidate")
+def draw_changed_craters(canvas: Canvas, craters: ChangedCraters) -> None:
+    """Draw tracks of craters by longitude and latitude, coloured by their change, and new false detections."""
+    axes = canvas.axes(0.75, 0.55, canvas.width_in - 1.0, canvas.height_in - 0.75)
+    for chosen, role, size in (
+        (craters.change == 0, "muted", 2.0),
+        (craters.change > 0, "blue", 5.0),
+        (craters.change < 0, "vermillion", 5.0),
+    ):
+        x, y = craters.longitude_deg[chosen], craters.latitude_deg[chosen]
+        axes.plot(x, y, "o", color=color(role), markersize=canvas.pt(size), alpha=0.8)
+    x, y = craters.false_longitude_deg, craters.false_latitude_deg
+    axes.plot(x, y, "x", color=color("orange"), markersize=canvas.pt(4.0))
+    axes.grid(True, axis="both")
+    axes.set_xlabel("longitude, degrees east")
+    axes.set_ylabel("latitude, degrees")

@@ -16,6 +16,8 @@ from reports.values import (
     ApidAccounting,
     BinScore,
     CalibrationBin,
+    ChangedCraters,
+    ChangedTrack,
     ClassScore,
     CompletenessSeries,
     CraterMap,
@@ -597,35 +599,24 @@ def pass_report(
     )
 
 
-def _regression_pass(i: int, rng: np.random.Generator, build: str, gain: float = 1.0) -> RegressionPass:
-    drift = float(rng.normal(1.6, 0.25))
-    scale = gain * float(rng.lognormal(0.0, 0.18))
-    lost = int(rng.poisson(0.4)) * int(rng.integers(1, 14))
-    return RegressionPass(
-        pass_id=f"W-{i:04d}",
-        start_utc_ns=START_UTC_NS + i * 6_672_000_000_000,
-        build=build,
-        light="real" if i % 3 else "paper",
-        frames_expected=148,
-        frames_processed=148 - int(rng.poisson(0.3)),
-        packets=1_200 - lost,
-        precision=float(np.clip(rng.normal(0.84, 0.03), 0, 1)),
-        recall=float(np.clip(rng.normal(0.68, 0.05), 0, 1)),
-        localisation_px=float(rng.normal(1.4, 0.15)),
-        navigation={
-            "paper": NavigationStatistics(
-                27_000 * scale, 39_000 * scale, 54_000 * scale, 58_000 * scale, 60_000, drift
-            ),
-            "spherical": NavigationStatistics(300 * scale, 400 * scale, 900 * scale, 1_000, 1_100, 0.014),
-            "anchored": NavigationStatistics(41 * scale, 60 * scale, 130 * scale, 180, 240, 0.002),
-            "propagate only, degree 50": NavigationStatistics(45 * scale, 60, 90 * scale, 100, 110, 0.003),
-        },
+def _regression_pass(i: int, rng: np.random.Generator) -> RegressionPass:
+    recall, precision, median = (
+        rng.normal(0.68, 0.05, 2),
+        rng.normal(0.84, 0.03, 2),
+        rng.lognormal(3.7, 0.2, 2),
     )
+    pairs = ((float(pair[0]), float(pair[1])) for pair in (recall, precision, median))
+    return RegressionPass(f"W-{i:04d}", 148, i if i % 3 else None, *pairs)
+
+
+def _changed_track(i: int) -> ChangedTrack:
+    sides = (gallery_frame(i, i, 0), gallery_frame(i + 9, i, 0))
+    return ChangedTrack(f"W-{i:04d}", -12.5, 301.25, 7.5, 4, 3, 0, *sides)
 
 
 def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
     """A candidate that is better on the whole and worse in a few passes."""
-    old, new = np.random.default_rng(seed), np.random.default_rng(seed + 1)
+    rng = np.random.default_rng(seed)
     return RegressionReport(
         title="Build 0.2.0 against 0.1.0",
         regression_id="R-17",
@@ -636,8 +627,15 @@ def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
             RegressionGate("95 % error, anchored", 130.0, 121.0, 143.0, "pass", "m", "", 0.1, 0.09, 3_552),
             RegressionGate("recall, class 0", 0.71, 0.66, 0.69, "fail", "", "W-0007", 0.02, 0.015, 148),
         ),
-        candidate_passes=tuple(_regression_pass(i, new, "0.2.0", 0.85) for i in range(count)),
-        baseline_passes=tuple(_regression_pass(i, old, "0.1.0") for i in range(count)),
+        passes=tuple(_regression_pass(i, rng) for i in range(count)),
+        craters=ChangedCraters(
+            rng.uniform(-60, 60, 90),
+            rng.uniform(-30, 30, 90),
+            np.arange(90.0) % 4 - 2,
+            np.ones(2),
+            np.ones(2),
+        ),
+        changed_tracks=tuple(_changed_track(i) for i in range(3)),
         verdict="One gate failed: recall of the smallest class in W-0007 fell below its limit.",
         verdict_level="fail",
         evidence_level="3",

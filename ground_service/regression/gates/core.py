@@ -379,7 +379,7 @@ def _decided(
             return replace(gate, outcome=FAIL, reason="the candidate has no value")
         return replace(gate, reason="unknown: the baseline has no value")
     loss, by_pass = sign * change.estimate, metric.sums is None
-    error, freedom = change.error, change.freedom
+    error, freedom = change.error, change.units - 1.0
     if by_pass and change.units < FEWEST_PASSES:
         error, freedom = PASS_SPREAD / math.sqrt(change.units), math.inf
     if freedom < 1.0:
@@ -400,8 +400,9 @@ def _decided(
     if loss - reach * error > claim:
         return replace(gate, outcome=FAIL)
     if by_pass and change.units < FEWEST_PASSES:
-        size = f"{math.expm1(change.estimate):+.0%}" if metric.relative else f"{change.estimate:+.3g}"
-        told = f"{size} on {change.units} passes, which inform only; {FEWEST_PASSES} judge the position error"
+        told = (
+            f"{_size(change, metric)} on {change.units} passes, which inform only; {FEWEST_PASSES} judge it"
+        )
         return replace(gate, outcome=NOT_JUDGED, reason=told)
     if few:
         needed = math.ceil(frames * FEWEST_TRACKS / max(change.units, 1))
@@ -437,20 +438,14 @@ def _informing(
         change = mean_change(values[0], values[1], metric.relative)
         if math.isfinite(change.baseline) or math.isfinite(change.candidate):
             rows.append((metric, change, sum(len(before[name]) for name in chosen)))
-    signs = [-1.0 if metric.higher_is_better else 1.0 for metric, _, _ in rows]
     p_values = [_two_sided(change) for _, change, _ in rows]
     levels = holm_levels(p_values, INFORM_LEVEL)
     gates = []
-    for (metric, change, frames), sign, p, level in zip(rows, signs, p_values, levels, strict=True):
+    for (metric, change, frames), p, level in zip(rows, p_values, levels, strict=True):
         told = ""
         if p <= level:
-            loss = sign * change.estimate
-            size = (
-                f"{abs(math.expm1(change.estimate)):.0%}"
-                if metric.relative
-                else f"{abs(change.estimate):.3g}"
-            )
-            told = f"{'worse' if loss > 0.0 else 'better'} by {size} ({change.units} passes)"
+            better = metric.higher_is_better == (change.estimate > 0.0)
+            told = f"{'better' if better else 'worse'} ({_size(change, metric)}, {change.units} passes)"
         elif same:
             told = "" if metric.name.startswith("latency.") else IDENTICAL
         gates.append(
@@ -469,7 +464,11 @@ def _two_sided(change: Change) -> float:
         return 1.0
     if change.error == 0.0:
         return float(change.estimate == 0.0)
-    return 2.0 * student_upper_tail(abs(change.estimate) / change.error, change.freedom)
+    return 2.0 * student_upper_tail(abs(change.estimate) / change.error, change.units - 1.0)
+
+
+def _size(change: Change, metric: Metric) -> str:
+    return f"{math.expm1(change.estimate):+.0%}" if metric.relative else f"{change.estimate:+.3g}"
 
 
 def _stated(metric: Metric, change: float) -> float:

@@ -90,9 +90,7 @@ def _frames(before: PassFrames, after: PassFrames) -> Count:
     parts = [f"no detections in {np.count_nonzero(lost)}"] if lost.any() else []
     for name, estimator in before.estimators.items():
         other = after.estimators.get(name)
-        silent = np.isfinite(estimator.error_m)
-        if other is not None:
-            silent = silent & ~np.isfinite(other.error_m)
+        silent = estimator.stated if other is None else estimator.stated & ~other.stated
         if silent.any():
             parts.append(f"no state of the estimator {name} in {np.count_nonzero(silent)}")
         lost = lost | silent

@@ -153,7 +153,7 @@ def _mean(values: FloatArray) -> float:
 
 def _estimator(frames: PassFrames, name: str) -> EstimatorFrames:
     nothing = np.full(len(frames), np.nan)
-    silent = EstimatorFrames(nothing, nothing, nothing, ("",) * len(frames), nothing)
+    silent = EstimatorFrames(np.isfinite(nothing), nothing, nothing, nothing, ("",) * len(frames), nothing)
     return frames.estimators.get(name) or silent
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,6 +56,8 @@ class CraterRows:
 
     Attributes
     ----------
+    crater
+        Index into the catalogue.
     track
         Number of the track: one crater in one visit.
     kind
@@ -65,6 +67,7 @@ class CraterRows:
     """
 
     frame: IntArray
+    crater: IntArray
     track: IntArray
     kind: IntArray
     du_px: FloatArray
@@ -91,6 +94,8 @@ class EstimatorFrames:
 
     Attributes
     ----------
+    stated
+        Whether the estimator sent a position; the error is unknown also where the reference has none.
     error_m, sigma_m
         Length of the position error, and of the reported standard deviations.
     squared_normalised_error
@@ -99,9 +104,10 @@ class EstimatorFrames:
     outcome
         Outcome by name; empty without a report.
     wrong
-        1 for a wrong fix, 0 for another outcome.
+        1 for a wrong fix, 0 for another outcome, NaN where the error is unknown.
     """
 
+    stated: BoolArray
     error_m: FloatArray
     sigma_m: FloatArray
     squared_normalised_error: FloatArray
@@ -235,6 +241,7 @@ def pass_frames(
         estimators=_estimators(navigation, outcomes, track, n),
         craters=CraterRows(
             frame_of_crater[rows],
+            expected.index[rows],
             _tracks(expected.index[rows], frame_of_crater[rows]),
             terrain_kinds(catalogue, expected, rows),
             du,
@@ -263,7 +270,8 @@ def _estimators(
         sigma = np.full((n, 3), np.nan)
         sigma[at] = samples.sigma_rtn_m
         error = error_of_places_rtn_m(track, latitude, longitude, altitude)
-        estimators[name] = _estimator(error, sigma, outcomes.get(name, {}))
+        stated = np.isfinite(latitude + longitude + altitude)
+        estimators[name] = _estimator(stated, error, sigma, outcomes.get(name, {}))
     return estimators
 
 
@@ -306,28 +314,33 @@ def _cells(position_mcmf_m: FloatArray, line_mcmf: FloatArray) -> IntArray:
     return np.where(np.isfinite(square) & (square >= 0.0), cell, -1)
 
 
+def cell_places_deg(cell: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return latitude and longitude of the centres of ground cells (n,); those above the horizon are left out."""
+    row = np.rint(cell[cell != -1] / 100_000)
+    column = cell[cell != -1] - 100_000 * row
+    width = CELL_DEG / np.cos(np.radians(row * CELL_DEG))
+    return (row + 0.5) * CELL_DEG, (column + 0.5) * width
+
+
 def _sums(owner: IntArray, values: FloatArray, frames: int) -> FloatArray:
     """Sum of the values of each frame (frames,)."""
     return np.asarray(np.bincount(owner, weights=values, minlength=frames)[:frames], dtype=np.float64)
 
 
 def _estimator(
-    error_rtn_m: FloatArray, sigma_rtn_m: FloatArray, outcomes: Mapping[int, str]
+    stated: BoolArray, error_rtn_m: FloatArray, sigma_rtn_m: FloatArray, outcomes: Mapping[int, str]
 ) -> EstimatorFrames:
-    n = len(error_rtn_m)
-    length = np.linalg.norm(error_rtn_m, axis=1)
-    outcome = tuple(outcomes.get(i, "") for i in range(n))
-    fixed = np.array([name == "fixed" for name in outcome], dtype=np.bool_)
-    claimed = np.linalg.norm(sigma_rtn_m, axis=1)
+    length, claimed = (np.linalg.norm(vectors, axis=1) for vectors in (error_rtn_m, sigma_rtn_m))
     far = (length > WRONG_FIX_SIGMAS * claimed) & (length > WRONG_FIX_M)
-    known = np.array([bool(name) for name in outcome], dtype=np.bool_)
-    return EstimatorFrames(
+    found = EstimatorFrames(
+        stated=stated,
         error_m=length,
         sigma_m=claimed,
         squared_normalised_error=squared_normalised_errors(error_rtn_m, sigma_rtn_m),
-        outcome=outcome,
-        wrong=np.where(known, (fixed & far).astype(np.float64), np.nan),
+        outcome=tuple(outcomes.get(i, "") for i in range(len(length))),
+        wrong=np.where(np.isfinite(length), far, np.nan),
     )
+    return replace(found, wrong=found.share("fixed") * found.wrong)
 
 
 def _by_frame(detections: DetectionSamples, frames: int) -> DetectionSamples:

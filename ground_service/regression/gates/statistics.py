@@ -62,11 +62,6 @@ class Change:
     error: float
     units: int
 
-    @property
-    def freedom(self) -> float:
-        """Degrees of freedom of Student's t."""
-        return self.units - 1.0
-
 
 def unit_sums(unit: IntArray, stratum: IntArray, numerator: FloatArray, denominator: FloatArray) -> UnitSums:
     """Return the sums of rows (m,) by unit; the stratum is that of the first row of a unit."""

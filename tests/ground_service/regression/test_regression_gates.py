@@ -27,6 +27,7 @@ from ground_service.regression.gates.samples import (
     EstimatorFrames,
     PassFrames,
     TimeTags,
+    _estimator,
 )
 
 POLICY = load_policy().policy
@@ -70,10 +71,10 @@ def simulated(
         octets=900.0 * one,
         estimators={
             "anchored": EstimatorFrames(
-                length, nothing + 43.0, (length / 25.0) ** 2, tuple(map(str, fixed)), 0.0 * one
+                one > 0, length, nothing + 43.0, (length / 25.0) ** 2, tuple(map(str, fixed)), 0.0 * one
             )
         },
-        craters=CraterRows(frame, track, kind, np.where(hit, centre, np.nan), np.zeros(3 * tracks)),
+        craters=CraterRows(frame, track, track, kind, np.where(hit, centre, np.nan), np.zeros(3 * tracks)),
         detections=DetectionRows(np.zeros(len(cells), np.int64), cells, cells < 1000),
         **{"memory_mib": 250.0, "digests": (bytes([noise % 256]),), **more},
     )
@@ -177,7 +178,7 @@ def rows(before: list[list[int]], after: list[list[int]], copies: int = 30) -> t
     def made(hits: list[list[int]], digest: bytes) -> PassFrames:
         hit = np.array([value for one in hits for value in one] * copies, dtype=np.bool_)
         none = np.zeros_like(track)
-        craters = CraterRows(none, track, none, np.where(hit, 1.0, np.nan), 0.0 * none)
+        craters = CraterRows(none, track, track, none, np.where(hit, 1.0, np.nan), 0.0 * none)
         return replace(frames, craters=craters, digests=(digest,))
 
     return made(before, b"a"), made(after, b"b")
@@ -250,7 +251,7 @@ def test_position_errors_are_judged_by_passes_from_ten_on() -> None:
     fewer = judge(suite(0, FEWEST_PASSES - 1), suite(1, FEWEST_PASSES - 1, error=1.2), POLICY)
     gate = by_name(fewer)["navigation.anchored.p50"]
     assert gate.outcome == "not judged"
-    assert gate.reason.endswith("% on 9 passes, which inform only; 10 judge the position error")
+    assert gate.reason.endswith("% on 9 passes, which inform only; 10 judge it")
     assert PASS_SPREAD / 3.0 > 0.1 and verdict_of(fewer) == "pass"
 
 
@@ -306,13 +307,23 @@ def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name: str, fault: Any
     assert name not in failed(judge(after, after, POLICY))
 
 
+def test_a_position_without_a_reference_is_a_value() -> None:
+    before = suite(0, 1)
+    anchored = replace(before["pass 0"].estimators["anchored"], error_m=np.full(FRAMES, np.nan))
+    unknown = {"pass 0": replace(before["pass 0"], estimators={"anchored": anchored})}
+    assert "telemetry.frames_without_value" not in failed(judge(before, unknown, POLICY))
+    silent = replace(anchored, stated=np.arange(FRAMES) > 3)
+    after = {"pass 0": replace(before["pass 0"], estimators={"anchored": silent})}
+    assert "telemetry.frames_without_value" in failed(judge(unknown, after, POLICY))
+
+
 def test_wrong_fixes_are_not_judged_without_a_reference() -> None:
-    """NaN: nobody knows whether a fix is wrong."""
     before = suite(1, passes=1)
-    anchored = before["pass 0"].estimators["anchored"]
-    unknown = {"anchored": replace(anchored, wrong=np.full(FRAMES, np.nan))}
-    gates = judge(before, {"pass 0": replace(before["pass 0"], estimators=unknown)}, POLICY)
-    assert by_name(gates)["navigation.wrong_fixes"].outcome == "not judged"
+    unknown = _estimator(
+        np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"}
+    )
+    after = {"pass 0": replace(before["pass 0"], estimators={"anchored": unknown})}
+    assert by_name(judge(before, after, POLICY))["navigation.wrong_fixes"].outcome == "not judged"
 
 
 def test_exact_gates_tolerate_what_the_policy_says() -> None:
@@ -352,7 +363,7 @@ def test_other_metrics_inform_and_never_decide() -> None:
     }
     gates = judge(before, after, POLICY)
     latency = by_name(gates)["latency.network"]
-    assert (latency.outcome, latency.reason) == ("informs", "worse by 55% (12 passes)")
+    assert (latency.outcome, latency.reason) == ("informs", "worse (+55%, 12 passes)")
     assert verdict_of(gates) == "pass"
     few = judge(suite(0, 3), suite(1, 3), POLICY)
     assert {gate.reason for gate in few if gate.outcome == "informs"} == {""}
