@@ -149,7 +149,9 @@ def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> N
     steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["gates"]["steps"]]
     script = [step for step in steps if "linna regress" in step]
     assert [step.count("linna regress") for step in script] == [1, 1, 1]
-    (tmp_path / "build.toml").write_text('name = "same"\n')
+    contract = (DOCS / "build-contract.md").read_text().split("### Template of a program")[1]
+    for name, kind in (("build.toml", "toml"), ("fly.py", "python")):
+        (tmp_path / name).write_text(re.findall(rf"```{kind}\n(.*?)```", contract, re.DOTALL)[0])
     text = "\n".join(["set -e", *script]).replace("--out passes", "--frames 6 --out passes")
     with (tmp_path / "log").open("w") as log:
         known = environment(tmp_path / "data")

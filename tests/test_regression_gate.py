@@ -58,26 +58,14 @@ def untrained(folder: Path) -> Path:
     return folder / "build.toml"
 
 
-def regress(
-    suite: Path, home: Path, build: str, capsys: pytest.CaptureFixture[str], *more: str
-) -> tuple[int, dict]:
-    status = cli.run(
-        ["regress", "run", "--archive", str(suite), "--build", build, "--home", str(home), "--json", *more]
-    )
+def regress(suite: Path, home: Path, build: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict]:
+    words = ["--archive", str(suite), "--build", build, "--home", str(home), "--json"]
+    status = cli.run(["regress", "run", *words])
     return status, json.loads(capsys.readouterr().out)
 
 
-def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, capsys, tmp_path: Path) -> None:
-    status, figures = regress(
-        suite,
-        home,
-        "current",
-        capsys,
-        "--junit",
-        str(tmp_path / "j.xml"),
-        "--report",
-        str(tmp_path / "r.html"),
-    )
+def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, capsys) -> None:
+    status, figures = regress(suite, home, "current", capsys)
     assert (status, figures["verdict"]) == (0, "pass"), figures
     gates = {gate["name"]: gate for gate in figures["gates"] if gate["pass"] is None}
     # Far below what it does on this Moon (recall 0.6, 35 m): a suite on which nothing is seen would gate nothing.
@@ -86,8 +74,6 @@ def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, ca
     assert gates["navigation.anchored.p50"]["baseline"] < 300.0
     assert gates["telemetry.undecodable"]["baseline"] == 0
     assert [one["frames"] for one in figures["passes"]] == [FRAMES, FRAMES]
-    assert (tmp_path / "j.xml").read_text().startswith("<?xml")
-    assert "Regression report" in (tmp_path / "r.html").read_text()
 
 
 def test_an_untrained_network_fails_for_what_it_takes_for_craters(
