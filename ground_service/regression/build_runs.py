@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ground_service.errors import InvalidInput
 from ground_service.regression.archives import write_flight_view
@@ -173,12 +171,7 @@ def read_performance(path: Path) -> dict[str, Any] | None:
                 stream.read(PERFORMANCE_LIMIT_OCTETS + 1), PERFORMANCE, PERFORMANCE_LIMIT_OCTETS
             )
         stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
-        yardstick = [float(value) for value in given.get("yardstick", [])]
-        every = np.array([*yardstick, *itertools.chain(*stages.values())])
-        return (
-            {"stages": stages, "yardstick": yardstick}
-            if (np.isfinite(every) & (every >= 0.0)).all()
-            else None
-        )
+        times = [one for values in stages.values() for one in values]
+        return {"stages": stages} if all(0.0 <= one < math.inf for one in times) else None
     except (InvalidInput, OSError, ArithmeticError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -196,11 +196,12 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
     sources = sorted(
         {str(name) for one in judged if one.context for name in one.context.manifest.get("data_sources", ())}
     )
+    candidate, baseline = _names(outcome)
     return RegressionReport(
-        title="{} against {}".format(*_names(outcome)),
+        title=f"{candidate} against {baseline}",
         regression_id=identity,
-        candidate=_names(outcome)[0],
-        baseline=_names(outcome)[1],
+        candidate=candidate,
+        baseline=baseline,
         gates=tuple(_report_gate(gate) for gate in outcome.gates if gate.outcome != INFORMS),
         passes=tuple(_regression_pass(one) for one in judged),
         craters=changed_craters(judged),

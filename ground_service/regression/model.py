@@ -19,6 +19,9 @@ COMPLETE, TO_RENDER, TELEMETRY_ONLY = "complete", "to render", "telemetry only"
 """States of a kept archive: all frames are stored; missing frames are rendered at the first use; no frames."""
 
 
+BESIDE = 0.5
+"""Share of the elapsed time of two replays during which both ran, from which their processor times are compared."""
+
 REASONS_LIMIT = 5
 """Reasons in a list; the verdict has all."""
 
@@ -75,6 +78,14 @@ class KeptReplay(Entity):
     peak_rss_mib: float = 0.0
     isolation: str = ""
     machine: str
+    created_utc_ns: int = 0
+
+    def beside(self, other: KeptReplay) -> bool:
+        """Return whether both ran on one machine at the same time, for most of the time of the longer one."""
+        if self.machine != other.machine:
+            return False
+        (first, short), (last, long) = sorted((one.created_utc_ns / 1e9, one.wall_s) for one in (self, other))
+        return first - max(first - short, last - long) > BESIDE * max(short, long)
 
 
 class ArchiveChange(Given):

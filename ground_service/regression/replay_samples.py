@@ -26,7 +26,6 @@ from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
-from ground_service.regression.gates.metrics import LATENCY_LEVEL
 from ground_service.regression.gates.samples import PassFrames, TimeTags, pass_frames
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
@@ -168,13 +167,11 @@ def read_downlink(
         context.orientation,
         context.viewing,
     )
-    latency, latency_ms = _latency(performance, len(context.frame_ticks))
     return ReadDownlink(
         detections,
         replace(
             frames,
-            latency=latency,
-            latency_ms=latency_ms,
+            latency_ms=_latency_ms(performance, len(context.frame_ticks)),
             undecodable=decoded.unknown
             + decoded.crc_errors
             + _meaningless(decoded, tables, context.dictionary),
@@ -332,20 +329,12 @@ def _meaningless(decoded: DownlinkDecode, tables: Mapping[str, Table], dictionar
     return int(np.count_nonzero(bad))
 
 
-def _latency(
-    performance: Mapping[str, Any] | None, frames: int
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
-    """CPU time of each stage in yardsticks and in milliseconds, of the stages reported for every frame."""
-    if performance is None:
-        return {}, {}
-    measured = {
-        # A stage that took no time did not run: a frame without an image says nothing about the network.
-        name: np.where(np.array(values) > 0.0, np.array(values, dtype=np.float64), np.nan)
-        for name, values in performance["stages"].items()
-        if len(values) == frames and all(math.isfinite(value) for value in values)
+def _latency_ms(performance: Mapping[str, Any] | None, frames: int) -> dict[str, NDArray[np.float64]]:
+    """Return the CPU time of each stage that is reported for every frame."""
+    stages = {} if performance is None else performance["stages"]
+    # A stage that took no time did not run: a frame without an image says nothing about the network.
+    return {
+        name: np.where(np.array(values) > 0.0, values, np.nan)
+        for name, values in stages.items()
+        if len(values) == frames
     }
-    yardstick = [value for value in performance["yardstick"] if value > 0.0]
-    if not yardstick:
-        return {}, measured
-    unit = float(np.quantile(yardstick, LATENCY_LEVEL))
-    return {name: values / unit for name, values in measured.items()}, measured

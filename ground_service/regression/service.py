@@ -108,8 +108,17 @@ def fly_shards(
     """Do replays, several at a time: every one is a process, the threads here only wait for them."""
     if not shards:
         return
-    with ThreadPoolExecutor(max_workers=workers or os.cpu_count() or 1, thread_name_prefix="replay") as pool:
-        futures = [pool.submit(do_replay, ground, digest, build) for digest, build in shards]
+    # Both builds of an archive run at the same time, so that other load changes their processor times alike.
+    together = {digest: [build for of, build in shards if of == digest] for digest, _ in shards}
+    threads = workers or os.cpu_count() or 1
+    size = min(threads, max(map(len, together.values())))
+
+    def replays(digest: str, builds: Sequence[Build]) -> None:
+        with ThreadPoolExecutor(size, "replay") as pair:
+            list(pair.map(lambda build: do_replay(ground, digest, build), builds))
+
+    with ThreadPoolExecutor(max(threads // size, 1), "replays") as pool:
+        futures = [pool.submit(replays, digest, builds) for digest, builds in together.items()]
         try:
             done = as_completed(futures)
             for future in progress(done, len(futures)) if progress else done:
@@ -216,17 +225,17 @@ def judge_regression(
     names = _unique_names(judged)
     before: dict[str, PassFrames] = {}
     after: dict[str, PassFrames] = {}
-    elsewhere = 0
+    apart = 0
     for name, one in zip(names, judged, strict=True):
         assert one.baseline_read and one.candidate_read and one.baseline and one.candidate
         old, new = one.baseline_read.frames, one.candidate_read.frames
-        if one.baseline.machine != one.candidate.machine:
-            elsewhere += 1
-            old, new = (dataclasses.replace(frames, latency={}) for frames in (old, new))
+        if not one.baseline.beside(one.candidate):
+            apart += baseline != candidate
+            old, new = (dataclasses.replace(frames, latency_ms={}) for frames in (old, new))
         before[name], after[name] = old, new
-    if elsewhere:
+    if apart:
         remarks.append(
-            f"{elsewhere} passes were flown on different machines by the two builds: their latencies are not compared"
+            f"{apart} passes were not replayed by both builds at the same time: no latency is compared"
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
     today = format_utc(utc_now_ns())[:10]

@@ -190,7 +190,7 @@ def keep_replay(
     found = {"manifest_sha256": manifest_sha256}
     if not change_if(connection, ARCHIVES, archive, found, used_utc_ns=now_utc_ns):
         return False
-    identity, values = replay_id(archive, build), replay.model_dump()
+    identity, values = replay_id(archive, build), replay.model_dump(exclude={"created_utc_ns"})
     added = repository.add_new(
         connection,
         REPLAYS,
@@ -203,7 +203,7 @@ def keep_replay(
     if not added:
         replaceable = [] if replay.outcome == OK else [REPLAYS.c.outcome != OK]
         query = update(REPLAYS).where(REPLAYS.c.id == identity, *replaceable)
-        connection.execute(query.values(**values))
+        connection.execute(query.values(**values, created_utc_ns=now_utc_ns))
     return True
 
 

@@ -31,14 +31,13 @@ import numpy as np
 
 from ground_service.regression.gates.faults import (
     FRAMES,
-    MEMORY,
     TIMES,
     UNDECODABLE,
     WRONG_FIXES,
     counts,
     identical,
 )
-from ground_service.regression.gates.metrics import PRECISION, RECALL, Metric, metrics_of
+from ground_service.regression.gates.metrics import LATENCY, MEMORY, PRECISION, RECALL, Metric, metrics_of
 from ground_service.regression.gates.samples import KINDS, PassFrames
 from ground_service.regression.gates.statistics import (
     Change,
@@ -56,7 +55,7 @@ from ground_service.regression.gates.statistics import (
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
 
-EXACT_METRICS = (UNDECODABLE, TIMES, FRAMES, WRONG_FIXES, MEMORY)
+EXACT_METRICS = (UNDECODABLE, TIMES, FRAMES, WRONG_FIXES, MEMORY, LATENCY)
 """Metrics that are compared without chance."""
 
 NEEDS_FRAMES = ("detector.", "latency.", MEMORY)
@@ -226,14 +225,16 @@ def judge(
     metrics = {one.name: one for one in metrics_of([*before.values(), *after.values()])}
     tests = _local_tests(before, after, pictured, policy, metrics)
     level = policy.fail_level / 2.0 if tests else policy.fail_level
-    gates = [_exact_gate(before, after, rule, pictured) for rule in policy.rules if rule.weight == 0.0]
+    gates = [
+        _exact_gate(before, after, rule, pictured, metrics) for rule in policy.rules if rule.weight == 0.0
+    ]
     for rule in policy.rules:
         if rule.weight > 0.0:
             chosen = pictured if rule.metric.startswith(NEEDS_FRAMES) else names
             gates.append(_primary(before, after, chosen, rule, metrics, level * rule.weight, same))
     local = [_decided(*test, level / len(tests), window=True) for test in tests]
     gates += [gate for gate in local if gate.outcome == FAIL]
-    gates += _informing(before, after, names, pictured, policy, metrics, same)
+    gates += _informing(before, after, names, pictured, policy, metrics)
     return [_with_waiver(gate, policy.waivers, today) for gate in gates]
 
 
@@ -247,12 +248,17 @@ def verdict_of(gates: Sequence[Gate]) -> str:
 
 
 def _exact_gate(
-    before: Mapping[str, PassFrames], after: Mapping[str, PassFrames], rule: GateRule, pictured: Sequence[str]
+    before: Mapping[str, PassFrames],
+    after: Mapping[str, PassFrames],
+    rule: GateRule,
+    pictured: Sequence[str],
+    metrics: Mapping[str, Metric],
 ) -> Gate:
     frames = sum(len(one) for one in before.values())
-    if rule.metric == MEMORY:
+    if rule.metric in (MEMORY, LATENCY):
+        metric = metrics[rule.metric]
         then, now = (
-            float(np.max([side[name].memory_mib for name in pictured], initial=-math.inf))
+            float(np.fmax.reduce([metric.value(side[name]) for name in pictured], initial=-math.inf))
             for side in (before, after)
         )
         known = math.isfinite(then) and math.isfinite(now)
@@ -260,8 +266,11 @@ def _exact_gate(
         outcome = NOT_JUDGED if not known else FAIL if now > limit else PASS
         told = "" if known else "it was not measured for both builds"
         if outcome == FAIL:
-            told = f"the candidate needs {now:.0f} MiB, the baseline {then:.0f} MiB"
-        return Gate(MEMORY, outcome, then, now, rule.margin, limit, "MiB", frames=frames, reason=told)
+            what = "peak memory" if rule.metric == MEMORY else "processor time of a frame"
+            told = f"{what} rises from {then:.4g} to {now:.4g} {metric.unit}"
+        return Gate(
+            metric.name, outcome, then, now, rule.margin, limit, metric.unit, frames=frames, reason=told
+        )
     found = {name: counts(before[name], after[name])[rule.metric] for name in before}
     found = {name: one for name, one in found.items() if math.isfinite(one.baseline + one.candidate)}
     then, now = sum(one.baseline for one in found.values()), sum(one.candidate for one in found.values())
@@ -425,7 +434,6 @@ def _informing(
     pictured: Sequence[str],
     policy: GatePolicy,
     metrics: Mapping[str, Metric],
-    same: bool,
 ) -> list[Gate]:
     """Return the metrics without a gate: values, and significance over the passes, which are the units."""
     decided = {rule.metric for rule in policy.rules}
@@ -446,8 +454,6 @@ def _informing(
         if p <= level:
             better = metric.higher_is_better == (change.estimate > 0.0)
             told = f"{'better' if better else 'worse'} ({_size(change, metric)}, {change.units} passes)"
-        elif same:
-            told = "" if metric.name.startswith("latency.") else IDENTICAL
         gates.append(
             Gate(
                 metric.name, INFORMS, change.baseline, change.candidate, math.nan, math.nan, metric.unit,

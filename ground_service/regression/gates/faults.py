@@ -11,7 +11,7 @@ import numpy as np
 from ground_service.regression.gates.samples import PassFrames, TimeTags
 
 UNDECODABLE, TIMES, FRAMES = "telemetry.undecodable", "telemetry.times", "telemetry.frames_without_value"
-WRONG_FIXES, MEMORY = "navigation.wrong_fixes", "memory"
+WRONG_FIXES = "navigation.wrong_fixes"
 
 DELAY_TOLERANCE_S = 1.0
 """Header times may lie this much outside the delays of the baseline: a step lasts less."""

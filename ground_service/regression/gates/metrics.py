@@ -18,6 +18,7 @@ BLOCK_FRAMES = 6
 """Successive frames share the state of the filter: a block of them is one unit."""
 
 RECALL, PRECISION = "detector.recall", "detector.precision"
+MEMORY, LATENCY = "memory", "latency.total"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,6 @@ class Metric:
 def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
     """Return every metric that these passes provide, for either build."""
     estimators = sorted({name for one in passes for name in one.estimators})
-    stages = sorted({name for one in passes for name in one.latency})
     found = [
         _ratio(RECALL, "", True, _recall, "tracks"),
         _ratio(PRECISION, "", True, _precision, "ground cells"),
@@ -66,7 +66,8 @@ def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
         Metric("detector.bias", "px", False, False, _bias),
         Metric("telemetry.packets_per_frame", "", False, True, lambda f: _mean(f.packets)),
         Metric("telemetry.octets_per_frame", "octets", False, True, lambda f: _mean(f.octets)),
-        Metric("memory", "MiB", False, True, lambda f: f.memory_mib),
+        Metric(MEMORY, "MiB", False, True, lambda f: f.memory_mib),
+        Metric(LATENCY, "ms", False, True, _frame_ms),
     ]
     for name in estimators:
         place = f"navigation.{name}"
@@ -95,7 +96,6 @@ def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
                     f"{place}.sigma_p95", "m", False, True, _of(name, lambda e: quantile(e.sigma_m, 0.95))
                 ),
             ]
-    found += [Metric(f"latency.{name}", "yardsticks", False, True, _latency(name)) for name in stages]
     return tuple(found)
 
 
@@ -161,5 +161,9 @@ def _of(estimator: str, value: Callable[[EstimatorFrames], float]) -> Callable[[
     return lambda frames: value(_estimator(frames, estimator))
 
 
-def _latency(stage: str) -> Callable[[PassFrames], float]:
-    return lambda frames: quantile(np.asarray(frames.latency.get(stage, ()), np.float64), LATENCY_LEVEL)
+def _frame_ms(frames: PassFrames) -> float:
+    """Return the processor time of all stages of a frame."""
+    if not frames.latency_ms:
+        return float("nan")
+    total = np.nansum(list(frames.latency_ms.values()), axis=0)
+    return quantile(total[total > 0.0], LATENCY_LEVEL)

@@ -151,10 +151,8 @@ class PassFrames:
         Whether a report on the image came down.
     packets, octets
         Telemetry that belongs to the frame.
-    latency
-        CPU time of each stage over that of the yardstick.
     latency_ms
-        The same in milliseconds as measured.
+        CPU time of each stage, and of all together.
     digests
         Hash of the packets since each frame, in the order received; the first one of packets before all frames.
     times
@@ -167,7 +165,6 @@ class PassFrames:
     estimators: Mapping[str, EstimatorFrames]
     craters: CraterRows
     detections: DetectionRows
-    latency: Mapping[str, FloatArray] = field(default_factory=dict)
     latency_ms: Mapping[str, FloatArray] = field(default_factory=dict)
     undecodable: int = 0
     memory_mib: float = float("nan")

@@ -44,30 +44,14 @@ def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path:
     assert not (tmp_path / "out" / ".run").exists()
 
 
-def test_a_program_that_crashes_is_told_by_its_last_line(fly) -> None:
-    run = fly("raise RuntimeError('no such crater')")
-    assert (run.outcome, run.detail) == ("crashed", "exit status 1: RuntimeError: no such crater")
-
-
 def test_a_program_that_kills_itself_is_told_by_its_signal(fly) -> None:
     run = fly("os.kill(os.getpid(), 11)")
     assert run.outcome == "crashed"
     assert "11" in run.detail
 
 
-def test_a_program_that_hangs_is_stopped_at_its_time_limit(fly) -> None:
-    run = fly("time.sleep(600)", LIMITS.replace("wall_s = 20", "wall_s = 1"))
-    assert run.outcome == "timeout"
-    assert run.downlink is None
-
-
 def test_a_program_that_uses_too_much_processor_time_is_stopped(fly) -> None:
     assert fly("while True: pass", LIMITS.replace("cpu_s = 10", "cpu_s = 1")).outcome == "cpu"
-
-
-def test_a_program_that_wants_too_much_memory_runs_out_of_it(fly) -> None:
-    run = fly("x = bytearray(1 << 30)")
-    assert run.outcome == "memory"
 
 
 def test_a_program_that_writes_a_huge_file_is_stopped(fly) -> None:
@@ -81,10 +65,6 @@ def test_a_program_that_fills_the_disk_with_small_files_is_stopped(fly) -> None:
         "for i in range(8): pathlib.Path(sys.argv[2], f'{i}.bin').write_bytes(bytes(2 << 20))\ntime.sleep(2)"
     )
     assert run.outcome == "disk"
-
-
-def test_a_program_that_writes_no_downlink_is_told_so(fly) -> None:
-    assert fly("").outcome == "nothing"
 
 
 def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(

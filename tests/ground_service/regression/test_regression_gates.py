@@ -287,7 +287,12 @@ EXACT: list[tuple[str, Callable[[PassFrames], PassFrames], str]] = [
         lambda f: wrong(f, 3),
         "3 fixes are wrong, against 0 of the baseline",
     ),
-    ("memory", lambda f: replace(f, memory_mib=320.0), "the candidate needs 320 MiB, the baseline 250 MiB"),
+    ("memory", lambda f: replace(f, memory_mib=320.0), "peak memory rises from 250 to 320 MiB"),
+    (
+        "latency.total",
+        lambda f: replace(f, latency_ms={"a": 30.0 + f.packets, "b": 10.0 + 0.0 * f.packets}),
+        "processor time of a frame rises from 40 to 48 ms",
+    ),
 ]
 
 
@@ -298,11 +303,11 @@ def wrong(frames: PassFrames, count: int) -> PassFrames:
 
 @pytest.mark.parametrize(("name", "fault", "told"), EXACT)
 def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name: str, fault: Any, told: str) -> None:
-    before = suite(0, 2)
+    before = suite(0, 2, latency_ms={"a": np.full(FRAMES, 40.0)})
     after = {**before, "pass 1": fault(before["pass 1"])}
     gates = judge(before, after, POLICY)
     assert name in failed(gates)
-    assert by_name(gates)[name].reason == (told if name == "memory" else f"pass 1: {told}")
+    assert by_name(gates)[name].reason == (told if name in ("memory", "latency.total") else f"pass 1: {told}")
     # It is one of both builds' if the baseline has it too.
     assert name not in failed(judge(after, after, POLICY))
 
@@ -355,15 +360,14 @@ def test_a_metric_that_neither_build_has_is_not_judged() -> None:
 
 
 def test_other_metrics_inform_and_never_decide() -> None:
-    before = suite(0, 12, latency={"network": np.full(FRAMES, 1.0)})
-    after = suite(1, 12, latency={"network": np.full(FRAMES, 1.5)})
+    before = suite(0, 12)
     after = {
-        name: replace(one, latency={"network": 1.5 + 0.01 * k + np.zeros(FRAMES)})
-        for k, (name, one) in enumerate(after.items())
+        name: replace(one, octets=one.octets * (1.5 + 0.01 * k))
+        for k, (name, one) in enumerate(suite(1, 12).items())
     }
     gates = judge(before, after, POLICY)
-    latency = by_name(gates)["latency.network"]
-    assert (latency.outcome, latency.reason) == ("informs", "worse (+55%, 12 passes)")
+    volume = by_name(gates)["telemetry.octets_per_frame"]
+    assert (volume.outcome, volume.reason) == ("informs", "worse (+55%, 12 passes)")
     assert verdict_of(gates) == "pass"
     few = judge(suite(0, 3), suite(1, 3), POLICY)
     assert {gate.reason for gate in few if gate.outcome == "informs"} == {""}

@@ -36,7 +36,7 @@ from ground_service.regression.documents import (
 )
 from ground_service.regression.gates.core import GatePolicy
 from ground_service.regression.gates.policy import load_policy
-from ground_service.regression.model import TELEMETRY_ONLY
+from ground_service.regression.model import TELEMETRY_ONLY, KeptReplay
 from ground_service.regression.outcome import RegressionOutcome
 from ground_service.regression.service import (
     find_replay,
@@ -161,11 +161,18 @@ def test_lost_detections_fail_as_recall(judge, packets: Packets) -> None:
     assert "detector.recall" in failed(judge(with_detections(packets, thinned)))
 
 
-def test_a_slower_detector_informs_and_never_decides(judge) -> None:
+def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) -> None:
     outcome = judge(network_ms=20.0)
-    assert outcome.verdict == "pass"
-    (latency,) = [gate for gate in outcome.gates if gate.name == "latency.network"]
-    assert (latency.outcome, latency.baseline, latency.candidate) == ("informs", 5.0, 10.0)
+    (latency,) = [gate for gate in outcome.gates if gate.name == "latency.total"]
+    assert (outcome.verdict, latency.outcome) == ("pass", "not judged")
+    assert (
+        "2 passes were not replayed by both builds at the same time: no latency is compared"
+        in outcome.remarks
+    )
+    one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
+    changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
+    beside = [one.beside(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
+    assert beside == [True, False, False]
 
 
 def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(judge, packets) -> None:
