@@ -76,7 +76,7 @@ def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated: bool) -> None
             for row in draws
         )
         change = ratio_change(before, after)
-        wrong += student_upper_tail(-change.estimate / change.error, change.freedom) < 0.05
+        wrong += student_upper_tail(-change.estimate / change.error, change.units - 1) < 0.05
     assert 0 < wrong <= stats.binom.isf(1e-4, 400, 0.05)
 
 
