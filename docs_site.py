@@ -148,6 +148,7 @@ def cli_page() -> str:
     """Return every command with its arguments and options."""
     from linna.cli import GROUPS
     from linna.completion import command_parser
+    from linna.help import example
     from linna.parser import all_commands
 
     lines = [
@@ -162,7 +163,16 @@ def cli_page() -> str:
             if name.split()[1] != group:
                 continue
             depth = "##" if name.count(" ") == 1 else "###"
-            lines += ["", f"{depth} {name}", "", _cell(parser.description or ""), "", *_options(parser)]
+            lines += [
+                "",
+                f"{depth} {name}",
+                "",
+                _cell(parser.description or ""),
+                "",
+                f"    {example(name)}",
+                "",
+            ]
+            lines += _options(parser)
     return "\n".join(lines) + "\n"
 
 

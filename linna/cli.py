@@ -18,55 +18,68 @@ from linna.parser import BadUsage, LinnaParser
 # Threads of numerical libraries that spin while they wait make two busy cores ten times slower: wait passively.
 _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SLP_VECTORIZE": "1"}
 
-# name -> (module, one line of help); the order is that of `linna --help`.
-GROUPS: dict[str, tuple[str, str]] = {
-    "demo": ("demo", "emulate one observation window, ingest its downlink and write the report"),
-    "emulate": ("emulate", "run the payload over a scenario and write a pass archive"),
-    "montecarlo": ("montecarlo", "Monte Carlo runs of anchored navigation: errors compared with covariances"),
-    "replay": ("replay", "replay an archived pass with a payload build"),
-    "regress": ("regress", "compare a payload build with a baseline over archived passes"),
-    "orbit": ("orbit", "propagate, compare and convert ephemerides"),
-    "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
-    "data": ("data", "list, fetch and verify the public data products"),
-    "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
-    "camera": ("camera", "probability of craters in the footprint over the field of view"),
-    "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
-    "identify": ("identify", "rates of crater identification and of wrong identifications"),
-    "render": ("render", "render one frame of a scenario"),
-    "dataset": ("dataset", "build and check detector data sets"),
-    "detector": ("detector", "train, export, evaluate and run the crater detector"),
-    "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
-    "link": ("link", "link settings of a recorded downlink; links to ground stations and their contacts"),
-    "mission": ("mission", "write, check, add, list and show mission descriptions"),
-    "ingest": ("ingest", "ingest downlink files or pass archives"),
-    "pass": ("pass_", "list and show passes"),
-    "report": ("report", "write the report of a pass"),
-    "performance": ("performance", "recall, drift and error over many passes, and monthly reports"),
-    "export": ("export", "write a pass in the formats of other tools: ephemerides, SPICE, maps, tables"),
-    "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
-    "plan": ("plan", "search, enter, approve and uplink observation windows"),
-    "trajectory": (
-        "trajectory",
-        "navigation solutions of a pass as TUM files, with absolute and relative errors",
-    ),
-    "alarm": ("alarm", "list, acknowledge and shelve alarms"),
-    "landmarks": (
-        "landmarks",
-        "craters learned from flight: candidates, decisions, new catalogue, labels, upload",
-    ),
-    "automation": ("automation", "list the rules and actions of the automation, approve or refuse actions"),
-    "command": ("command", "queue, release, uplink and verify telecommands"),
-    "serve": ("serve", "run the HTTP server of the ground service"),
-    "worker": ("worker", "run a job worker of the ground service"),
-    "scheduler": ("scheduler", "run the recurring work of a distributed ground service"),
-    "doctor": ("doctor", "check a deployment: processes, clocks, broker, files, provider"),
-    "runner": ("runner", "run payload builds for the ground service, in a separate container"),
-    "db": ("db", "schema, backup and restore of the database"),
-    "verify": ("verify", "check the integrity of the archive: files, packets, audit chain"),
-    "user": ("user", "manage the users of the ground service and their tokens"),
-    "completion": ("completion", "complete commands, options and scenario names in a shell"),
-    "audit": ("audit", "list the audit log, and show the head of its hash chain"),
+# task -> name -> (module, one line of help); the order is that of `linna --help`.
+TASKS: dict[str, dict[str, tuple[str, str]]] = {
+    "simulate": {
+        "demo": ("demo", "emulate one observation window, ingest its downlink and write the report"),
+        "emulate": ("emulate", "run the payload over a scenario and write a pass archive"),
+        "orbit": ("orbit", "propagate, compare and convert ephemerides"),
+        "render": ("render", "render one frame of a scenario"),
+    },
+    "operate": {
+        "mission": ("mission", "write, check, add, list and show mission descriptions"),
+        "link": ("link", "link settings of a recorded downlink; links to ground stations and their contacts"),
+        "ingest": ("ingest", "ingest downlink files or pass archives"),
+        "pass": ("pass_", "list and show passes"),
+        "report": ("report", "write the report of a pass"),
+        "performance": ("performance", "recall, drift and error over many passes, and monthly reports"),
+        "export": ("export", "write a pass in the formats of other tools: ephemerides, SPICE, maps, tables"),
+        "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
+        "plan": ("plan", "search, enter, approve and uplink observation windows"),
+        "alarm": ("alarm", "list, acknowledge and shelve alarms"),
+        "landmarks": (
+            "landmarks",
+            "craters learned from flight: candidates, decisions, new catalogue, labels, upload",
+        ),
+        "automation": (
+            "automation",
+            "list the rules and actions of the automation, approve or refuse actions",
+        ),
+        "command": ("command", "queue, release, uplink and verify telecommands"),
+    },
+    "build and gate": {
+        "replay": ("replay", "replay an archived pass with a payload build"),
+        "regress": ("regress", "compare a payload build with a baseline over archived passes"),
+        "dataset": ("dataset", "build and check detector data sets"),
+        "detector": ("detector", "train, export, evaluate and run the crater detector"),
+    },
+    "study": {
+        "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
+        "montecarlo": (
+            "montecarlo",
+            "Monte Carlo runs of anchored navigation: errors compared with covariances",
+        ),
+        "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
+        "identify": ("identify", "rates of crater identification and of wrong identifications"),
+        "camera": ("camera", "probability of craters in the footprint over the field of view"),
+        "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
+        "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
+        "data": ("data", "list, fetch and verify the public data products"),
+    },
+    "administer": {
+        "serve": ("serve", "run the HTTP server of the ground service"),
+        "worker": ("worker", "run a job worker of the ground service"),
+        "scheduler": ("scheduler", "run the recurring work of a distributed ground service"),
+        "runner": ("runner", "run payload builds for the ground service, in a separate container"),
+        "db": ("db", "schema, backup and restore of the database"),
+        "verify": ("verify", "check the integrity of the archive: files, packets, audit chain"),
+        "audit": ("audit", "list the audit log, and show the head of its hash chain"),
+        "user": ("user", "manage the users of the ground service and their tokens"),
+        "doctor": ("doctor", "check a deployment: processes, clocks, broker, files, provider"),
+        "completion": ("completion", "complete commands, options and scenario names in a shell"),
+    },
 }
+GROUPS = {name: group for groups in TASKS.values() for name, group in groups.items()}
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -128,13 +141,15 @@ def _guarded(
         where = f" ({error.filename})" if error.filename else ""
         return _refused(f"{error.strerror or error}{where}", arguments)
     except _known_errors() as error:
-        return _refused(str(error), arguments)
+        from linna.help import help_page
+
+        return _refused(str(error), arguments, page=help_page(error, arguments[0]))
 
 
-def _refused(message: str, arguments: Sequence[str], command: str = "linna") -> int:
+def _refused(message: str, arguments: Sequence[str], command: str = "linna", page: str = "") -> int:
     """Print an error as one line on stderr, with --json also as one JSON object on stdout; return the status 2."""
     line = " ".join(message.split())
-    print(f"{command}: error: {line}", file=sys.stderr)
+    print(f"{command}: error: {line}{f' (help: {page})' if page else ''}", file=sys.stderr)
     if "--json" in arguments:
         print(json.dumps({"error": line, "status": 2}))
     return 2
@@ -167,9 +182,8 @@ def _overview() -> str:
         "usage: linna COMMAND [options]",
         "",
         "LINNA: crater-based navigation for a lunar CubeSat, payload emulator and ground segment.",
-        "",
-        "commands:",
     ]
-    lines += [f"  {name:<{width}}  {help_line}" for name, (_, help_line) in GROUPS.items()]
+    for task, groups in TASKS.items():
+        lines += ["", f"{task}:", *(f"  {name:<{width}}  {line}" for name, (_, line) in groups.items())]
     lines += ["", "linna COMMAND --help describes a command; --version prints the version."]
     return "\n".join(lines)

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable
 from typing import Any, NoReturn
 
+from linna.help import example
+
 REQUIRED = "(required)"
 
 
@@ -59,7 +61,7 @@ class LinnaParser(argparse.ArgumentParser):
     def format_help(self) -> str:
         """Return the help text."""
         self.filled()
-        return super().format_help()
+        return f"{super().format_help()}\nexample: {example(self.prog)}\n"
 
     def error(self, message: str) -> NoReturn:
         raise BadUsage(self.prog, message, self.format_usage())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from linna.errors import UsageError
 from linna.parser import option
 
 
@@ -28,6 +29,8 @@ def model_octets(path: Path | None) -> bytes:
     name = DEFAULT_NETWORK if path is None else str(path)
     if name in NETWORKS:
         return load_shipped_model(name)
+    if not Path(name).is_file():
+        raise UsageError(f"--model: expected a file or {' or '.join(NETWORKS)}, found {name!r}")
     return Path(name).read_bytes()
 
 
@@ -41,7 +44,6 @@ def need_torch() -> None:
     """
     import importlib.util
 
-    from linna.errors import UsageError
     from payload_emulator.errors import install_hint
 
     if importlib.util.find_spec("torch") is None:

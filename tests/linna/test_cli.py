@@ -2,13 +2,15 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from linna import cli, completion
+from linna import cli
+from linna.completion import command_parser
 from linna.parser import REQUIRED, all_commands
 from payload_emulator.errors import install_hint
 from payload_emulator.session.recipe import load_recipe, procedural_recipe
@@ -21,11 +23,12 @@ def linna(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_help_names_every_group() -> None:
+def test_help_groups_the_commands_by_task() -> None:
     result = linna("--help")
     assert result.returncode == 0
-    for group in cli.GROUPS:
-        assert f"  {group}" in result.stdout
+    tasks = [block.splitlines() for block in result.stdout.split("\n\n")[2:-1]]
+    assert [task.rstrip(":") for task, *_ in tasks] == [*cli.TASKS]
+    assert [line.split()[0] for _, *lines in tasks for line in lines] == [*cli.GROUPS]
 
 
 def test_help_imports_no_numerical_library() -> None:
@@ -52,18 +55,43 @@ def test_a_missing_scenario_is_one_line_and_exit_2(capsys: pytest.CaptureFixture
     assert "no such scenario file" in lines[0]
 
 
-def test_every_command_has_a_description_and_states_required_options() -> None:
+def test_every_command_has_a_description_and_an_example_and_states_required_options() -> None:
     for group in cli.GROUPS:
-        top = completion.command_parser(cli.GROUPS, group)
+        top = command_parser(cli.GROUPS, group)
         for name, parser in all_commands(top):
             if name.split()[1] != group:
                 continue
             assert parser.description, name
             text = " ".join(parser.format_help().split())
+            if parser.get_default("handler"):
+                words = shlex.split(parser.format_help().rpartition("example: ")[2])
+                path = name.split()
+                assert words[: len(path)] == path
+                parser.parse_args(words[len(path) :])
             for action in parser._actions:
                 if action.required and action.option_strings:
                     assert f"{REQUIRED}" in text, f"{name} {action.option_strings[0]}"
                     assert (action.help or "").endswith(REQUIRED), f"{name} {action.option_strings[0]}"
+
+
+@pytest.mark.parametrize(
+    "words, page",
+    [
+        (("emulate", "no-such-scenario"), "tutorials/own-scenario"),
+        (("regress", "run", "--build", "none.toml", "--archive", "."), "tutorials/own-build"),
+        (("mission", "add", "{text}", "--home", "{home}"), "mission"),
+        (("ingest", "{text}", "--home", "{home}"), "tutorials/other-packets"),
+        (("orbit", "compare", "{text}", "{text}"), "exports"),
+    ],
+)
+def test_errors_of_common_mistakes_name_their_page(
+    words: tuple[str, ...], page: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text").write_text("nothing of use")
+    found = [word.format(text=tmp_path / "text", home=tmp_path / "home") for word in words]
+    assert cli.run(found) == 2
+    file = Path(capsys.readouterr().err.rpartition("(help: ")[2].removesuffix(")\n"))
+    assert file.is_file() and file.with_suffix("").as_posix().endswith(f"/{page}")
 
 
 def test_errors_are_a_json_object_with_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,11 +1,10 @@
-"""Trajectory errors and TUM text against the evaluators' definitions, written out here with 4 x 4 matrices."""
+"""TUM text against the evaluators' definitions, written out here with 4 x 4 matrices."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from ground_service.evaluation.navigation.trajectory import absolute_error, format_tum, relative_error
+from ground_service.evaluation.navigation.trajectory import format_tum
 
 COUNT = 60
 UTC_NS = 1_881_735_115_000_000_000 + np.arange(COUNT) * 15 * 10**9
@@ -33,27 +32,14 @@ def poses(text: str) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, 0], matrices
 
 
-def test_absolute_and_relative_errors_are_those_of_the_poses_in_the_files() -> None:
+def test_poses_in_the_files_are_as_far_apart_as_the_positions() -> None:
     times, flown = poses(format_tum(UTC_NS, estimate(), orbit()))
     _, true = poses(format_tum(UTC_NS, orbit(), orbit()))
     np.testing.assert_allclose(np.diff(times), 15.0, atol=1e-6)
     apart = np.array([np.linalg.inv(q) @ p for q, p in zip(true, flown, strict=True)])
     length = np.linalg.norm(apart[:, :3, 3], axis=1)
-    ate = absolute_error(estimate(), orbit())
     # Quaternions are written to 1e-12: over 1,768 km that is some micrometres.
-    assert ate.rmse_m == pytest.approx(np.sqrt(np.mean(length**2)), abs=1e-4)
-    assert ate.median_m == pytest.approx(np.median(length), abs=1e-4)
-    assert ate.max_m == pytest.approx(length.max(), abs=1e-4)
-    for frames in (1, 4):
-        pairs = [
-            np.linalg.inv(np.linalg.inv(true[i]) @ true[i + frames])
-            @ (np.linalg.inv(flown[i]) @ flown[i + frames])
-            for i in range(COUNT - frames)
-        ]
-        lengths = np.array([np.linalg.norm(pair[:3, 3]) for pair in pairs])
-        rpe = relative_error(estimate(), orbit(), frames)
-        assert rpe.rmse_m == pytest.approx(np.sqrt(np.mean(lengths**2)), abs=1e-3)
-        assert rpe.samples == COUNT - frames
+    np.testing.assert_allclose(length, np.linalg.norm(estimate() - orbit(), axis=1), atol=1e-4)
 
 
 def test_orientations_are_those_of_the_orbit() -> None:
@@ -67,8 +53,3 @@ def test_orientations_are_those_of_the_orbit() -> None:
 def test_times_keep_their_nanoseconds() -> None:
     line = format_tum(UTC_NS[:2] + 123_456_789, orbit()[:2], orbit()[:2]).splitlines()[1]
     assert line.split()[0] == "1881735115.123456789"
-
-
-def test_no_positions_have_no_error() -> None:
-    nothing = absolute_error(np.zeros((0, 3)), np.zeros((0, 3)))
-    assert nothing.samples == 0 and np.isnan(nothing.rmse_m)
