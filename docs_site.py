@@ -156,6 +156,14 @@ def cli_page() -> str:
         "",
         "Generated from the program. `--json` prints one JSON object on stdout; progress and logs go to stderr. "
         "Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or input, 3 inconclusive.",
+        "",
+        "A shell completes commands, options and names of shipped scenarios after this line in its start file:",
+        "",
+        "| shell | file | line |",
+        "|---|---|---|",
+        '| bash | `~/.bashrc` | `eval "$(linna completion bash)"` |',
+        '| zsh, after `compinit` | `~/.zshrc` | `eval "$(linna completion zsh)"` |',
+        "| fish | `~/.config/fish/config.fish` | `linna completion fish \\| source` |",
     ]
     for group in GROUPS:
         importlib.import_module(f"linna.commands.{GROUPS[group][0]}")

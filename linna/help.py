@@ -14,15 +14,14 @@ PAGES = {
     "DatabaseNotMigrated": "deployment",
     "EphemerisError": "exports",
     "MissingLibrary": "exports",
-    "orbit": "exports",
     "mission": "mission",
     "ingest": "tutorials/other-packets",
     "regress": "tutorials/own-build",
     "plan": "planning",
     "command": "commanding",
 }
-"""Page of an error by its class; for errors of files and fields, by the command."""
-_OF_COMMAND = {"InvalidInput", "InvalidRequest", "DataFileError", "JobFailed"}
+"""Page of an error by its class; for invalid input, by the command."""
+_OF_COMMAND = {"InvalidInput", "InvalidRequest", "JobFailed"}
 
 
 def example(command: str) -> str:

@@ -74,7 +74,7 @@ class Effort:
 
 QUICK = Effort(
     hours=3.0,
-    unseen_passes=3,
+    unseen_passes=1,
     sample_frames=40,
     method_frames=120,
     training_steps=60,

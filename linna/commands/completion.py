@@ -11,7 +11,7 @@ from linna.parser import option
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Print the text that makes a shell complete linna commands, options and names of shipped scenarios. "
-        'bash: eval "$(linna completion bash)"; fish: linna completion fish | source'
+        'bash, zsh: eval "$(linna completion bash)"; fish: linna completion fish | source'
     )
     option(parser, "shell", SHELLS, "shell that reads the text")
     parser.set_defaults(handler=run)

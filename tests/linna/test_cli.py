@@ -81,7 +81,6 @@ def test_every_command_has_a_description_and_an_example_and_states_required_opti
         (("regress", "run", "--build", "none.toml", "--archive", "."), "tutorials/own-build"),
         (("mission", "add", "{text}", "--home", "{home}"), "mission"),
         (("ingest", "{text}", "--home", "{home}"), "tutorials/other-packets"),
-        (("orbit", "compare", "{text}", "{text}"), "exports"),
     ],
 )
 def test_errors_of_common_mistakes_name_their_page(
