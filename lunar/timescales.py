@@ -41,15 +41,15 @@ ONBOARD_EPOCH_TAI_NS = 946_684_800 * NS
 """2000-01-01T00:00:00 TAI, counted since 1970-01-01T00:00:00 TAI."""
 
 # fmt: off
-_LEAP_DATES = [
+LEAP_DATES = [
     "1972-01-01", "1972-07-01", "1973-01-01", "1974-01-01", "1975-01-01", "1976-01-01", "1977-01-01",
     "1978-01-01", "1979-01-01", "1980-01-01", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01",
     "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01",
     "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01",
 ]
 # fmt: on
-_LEAP_UTC_NS: IntArray = np.array(_LEAP_DATES, dtype="datetime64[ns]").astype(np.int64)
-_TAI_MINUS_UTC_NS: IntArray = (10 + np.arange(len(_LEAP_DATES), dtype=np.int64)) * NS
+_LEAP_UTC_NS: IntArray = np.array(LEAP_DATES, dtype="datetime64[ns]").astype(np.int64)
+_TAI_MINUS_UTC_NS: IntArray = (10 + np.arange(len(LEAP_DATES), dtype=np.int64)) * NS
 _LEAP_TAI_NS: IntArray = _LEAP_UTC_NS + _TAI_MINUS_UTC_NS
 
 # Kaplan 2005, equation 2.6: amplitude in s, rate in rad per Julian century, phase in rad.

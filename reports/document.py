@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -139,14 +140,7 @@ class Listing:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class NewPage:
-    """The next block starts a page where there are pages."""
-
-
-Block = (
-    Heading | Paragraph | Verdict | Headline | Table | Facts | Bullets | Picture | Absent | Listing | NewPage
-)
+Block = Heading | Paragraph | Verdict | Headline | Table | Facts | Bullets | Picture | Absent | Listing
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,20 +182,15 @@ def evidence_ladder() -> str:
 
 def evidence_number(level: str) -> int | None:
     """Return the number at the start of the text of an evidence level; None for other text."""
-    text = level.strip().lower().removeprefix("level").strip(" (:")
-    if not text[:1].isdigit() or text[1:2].isdigit():
-        return None
-    number = int(text[0])
-    return number if 1 <= number <= len(EVIDENCE_LEVELS) else None
+    found = re.match(r"\s*(?:level)?[ (:]*([1-5])(?!\d)", level, re.IGNORECASE)
+    return int(found[1]) if found else None
 
 
 def evidence_label(level: str) -> str:
     """Return the label of an evidence level, such as "3" or "3s"; empty if none is stated."""
     number = evidence_number(level)
-    if number is None:
-        return ""
-    text = level.strip().lower().removeprefix("level").strip(" (:")
-    return f"{number}{SEEN_MARK}" if text[1:2] == SEEN_MARK else str(number)
+    seen = level.lower().partition(str(number))[2].startswith(SEEN_MARK)
+    return "" if number is None else f"{number}{SEEN_MARK if seen else ''}"
 
 
 def evidence_text(level: str) -> str:

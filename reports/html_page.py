@@ -19,7 +19,6 @@ from reports.document import (
     Heading,
     Headline,
     Listing,
-    NewPage,
     Paragraph,
     Picture,
     Table,
@@ -68,15 +67,10 @@ def html_page(document: Document, drawings: Drawings | None = None) -> str:
 
 def _blocks(document: Document, drawings: Drawings) -> Iterator[str]:
     section = table = figure = 0
-    fresh_page = False
     for block in document.blocks:
-        if isinstance(block, NewPage):
-            fresh_page = True
-            continue
         if isinstance(block, Heading) and block.level == 2:
             section += 1
-            page = ' class="newpage"' if fresh_page else ""
-            yield f'\n<h2 id="s{section}"{page}><span class="n">{section}</span>{escape(block.text)}</h2>'
+            yield f'\n<h2 id="s{section}"><span class="n">{section}</span>{escape(block.text)}</h2>'
         elif isinstance(block, Table):
             table += 1
             yield _table(block, table)
@@ -85,7 +79,6 @@ def _blocks(document: Document, drawings: Drawings) -> Iterator[str]:
             yield _picture(block, figure, drawings)
         else:
             yield _plain(block)
-        fresh_page = False
 
 
 def _plain(block: Block) -> str:

@@ -11,7 +11,6 @@ from reports.document import (
     Column,
     Document,
     Heading,
-    NewPage,
     Paragraph,
     Picture,
     Table,
@@ -41,7 +40,7 @@ def monthly_document(report: MonthlyReportValue) -> Document:
     blocks += missing_and_remarks(report)
     blocks += [Heading("By condition"), *_groups(report)]
     blocks += provenance_and_data(report)
-    blocks += [NewPage(), Heading("All passes"), _passes(report)]
+    blocks += [Heading("All passes"), _passes(report)]
     facts = about(report, ("Passes", count_text(len(report.passes))), ("month", report.month))
     return Document("Monthly report", report.title, report.month, facts, tuple(blocks))
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,13 +14,13 @@ from reports.document import Block, Cell, Column, Document, Heading, Paragraph, 
 from reports.figures import navigation, outcomes
 from reports.figures import paper as drawn
 from reports.figures.canvas import WIDTH_IN, TimeScale
-from reports.figures.theme import OUTCOMES, series_styles
-from reports.paper_values import PaperReport, PaperSession
+from reports.figures.theme import series_styles
+from reports.paper_values import PaperReport, PaperSession, PaperValue
 from reports.sections.detection import gallery_picture
+from reports.sections.matching import outcome_table
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.statistics import completed
-from reports.text import count_text, length_text, number_text, percent_text
-from reports.values import NavigationSeries
+from reports.text import count_text, length_text, significant_text
 
 FOV_THRESHOLD = 0.9
 _LEVEL_1 = "1 (unit geometry)"
@@ -39,7 +41,7 @@ def paper_document(report: PaperReport) -> Document:
         *_orbit(report),
         *_fov(report),
         Heading("Rendering of a place (Fig. 3)"),
-        *_image(report, "region", "Fig. 3", 4.2, 4.2),
+        *_image(report, "region", "Fig. 3", 4.2),
         Heading("Crater catalogue (Fig. 4)"),
         *_catalogue(report),
         Heading("Data set (Fig. 5)"),
@@ -76,11 +78,65 @@ def paper_index(report: PaperReport) -> dict[str, Any]:
             }
             for n, block in enumerate((b for b in blocks if isinstance(b, Table)), 1)
         ],
-        "differences": [
-            {"subject": d.subject, "paper": d.paper, "here": d.here, "reason": d.reason}
-            for d in report.differences
-        ],
+        "differences": [asdict(one) for one in report.differences],
+        "values": [one.row() for one in paper_values(report)],
     }
+
+
+def paper_figures(report: PaperReport) -> Iterator[Picture]:
+    """Yield the figures of the document."""
+    return (block for block in paper_document(report).blocks if isinstance(block, Picture))
+
+
+def paper_values(report: PaperReport) -> list[PaperValue]:
+    """Return the numbers of the document with those of the paper."""
+    rows: list[PaperValue] = []
+    if (orbit := report.orbit) is not None:
+        for word, ours in (("mean", orbit.mean_km), ("min", orbit.min_km), ("max", orbit.max_km)):
+            theirs = published.ALTITUDE_KM[word]
+            rows.append(PaperValue("Table I", f"altitude, {word}", "km", theirs, ours, _LEVEL_1))
+        name, frames = "images of 24 h at 15 s within 60° of latitude", orbit.frames_of_a_day
+        rows.append(PaperValue("Table I", name, "", published.SESSION_FRAMES, frames, _LEVEL_1))
+    if report.fov is not None:
+        chosen = report.fov.selected_fov_deg
+        rows.append(PaperValue("V-B", "smallest field of view", "°", 120.0, chosen, _LEVEL_1))
+    level = report.samples.level if report.samples else ""
+    if report.dataset is not None:
+        rows.append(PaperValue("Fig. 5", "images", "", published.FRAMES, report.dataset.frames, level))
+    for k, name in enumerate(drawn.CLASS_NAMES):
+        if report.catalogue is not None:
+            count = report.catalogue.counts[k]
+            rows.append(PaperValue("Fig. 4", name, "", published.CATALOGUE[k], count, _LEVEL_1))
+        if report.dataset is not None and (total := sum(report.dataset.instances)):
+            share = 100.0 * report.dataset.instances[k] / total
+            words = f"share of labels, {name}"
+            rows.append(PaperValue("Fig. 5", words, "%", published.LABEL_SHARES[k], share, level))
+    for one in report.detectors:
+        for k, score in published.TABLE_II.items():
+            for key, unit in (("precision", ""), ("recall", ""), ("localisation_px", "px")):
+                words = f"{one.name}, {score.label}, {key.partition('_')[0]}"
+                ours = getattr(one.per_class[k], key)
+                rows.append(PaperValue("Table II", words, unit, getattr(score, key), ours, one.level))
+    for session in report.sessions:
+        for series in (*session.series, *session.also):
+            figures = completed(series)
+            for key in ("median_3d_m", "p95_3d_m", "max_3d_m"):
+                words, ours = f"{session.key}, {series.name}, {key[:-5]} error", getattr(figures, key)
+                rows.append(PaperValue("Figs. 7 to 10", words, "m", None, ours, session.level))
+    return rows
+
+
+def _compared(report: PaperReport, place: str, caption: str, note: str = "") -> Table:
+    """Return the numbers of one place of the paper with their differences."""
+    rows = []
+    for one in paper_values(report):
+        if one.place == place and one.paper is not None:
+            numbers = (one.paper, one.here, one.difference)
+            rows.append(
+                (f"{one.quantity}{f', {one.unit}' if one.unit else ''}", *map(significant_text, numbers))
+            )
+    columns = (Column("", numeric=False), Column("paper"), Column("this system"), Column("difference"))
+    return Table(caption, columns, tuple(rows), note=note)
 
 
 def _level_in(caption: str) -> str:
@@ -95,12 +151,8 @@ def _evidence(level: str) -> str:
 def _differences(report: PaperReport) -> list[Block]:
     if not report.differences:
         return [absent(report, "differences", "Differences", "none was computed")]
-    columns = (
-        Column("subject", numeric=False),
-        Column("paper", numeric=False),
-        Column("this system", numeric=False),
-        Column("reason", numeric=False),
-    )
+    names = ("subject", "paper", "this system", "reason")
+    columns = tuple(Column(name, numeric=False) for name in names)
     rows = tuple((Cell(d.subject, strong=True), d.paper, d.here, d.reason) for d in report.differences)
     return [Table("Differences, each with its reason.", columns, rows)]
 
@@ -112,30 +164,15 @@ def _orbit(report: PaperReport) -> list[Block]:
     rows: list[tuple[Cell | str, ...]] = [
         (name, published.TABLE_I[name], value) for name, value in orbit.elements.items()
     ]
-    month = published.ALTITUDE_KM
-    rows += [
-        (f"Altitude, {word}", f"{theirs:.1f} km", f"{ours:.1f} km")
-        for word, theirs, ours in (
-            ("mean", month["mean"], orbit.mean_km),
-            ("minimum", month["min"], orbit.min_km),
-            ("maximum", month["max"], orbit.max_km),
-        )
-    ]
-    rows.append(
-        (
-            "Images of 24 h at 15 s within 60° of latitude",
-            count_text(published.SESSION_FRAMES),
-            count_text(orbit.frames_of_a_day),
-        )
-    )
+    text = (Column("parameter", numeric=False), Column("paper"), Column("this system"))
     return [
-        Table(
-            f"The paper's Table I: initial elements, and the altitudes that follow over {orbit.days:g} days with "
-            f"{orbit.maneuvers} manoeuvres. {_evidence(_LEVEL_1)}",
-            (Column("parameter", numeric=False), Column("paper"), Column("this system")),
-            tuple(rows),
-            note=f"Gravity field: {orbit.gravity}.",
-        )
+        Table(f"The paper's Table I: initial elements. {_evidence(_LEVEL_1)}", text, tuple(rows)),
+        _compared(
+            report,
+            "Table I",
+            f"Altitudes over {orbit.days:g} days with {orbit.maneuvers} manoeuvres, and images. {_evidence(_LEVEL_1)}",
+            f"Gravity field: {orbit.gravity}.",
+        ),
     ]
 
 
@@ -157,13 +194,14 @@ def _fov(report: PaperReport) -> list[Block]:
     ]  # fmt: skip
 
 
-def _image(report: PaperReport, field: str, name: str, width_in: float, height_in: float) -> list[Block]:
+def _image(report: PaperReport, field: str, name: str, width_in: float) -> list[Block]:
     picture = getattr(report, field)
     if picture is None:
         return [absent(report, field, f"Form of the paper's {name}", "it was not rendered")]
+    height, width = picture.image.shape[:2]
     return [
         Picture(
-            field, f"{picture.caption} {_evidence(picture.level)}", picture.caption, height_in,
+            field, f"{picture.caption} {_evidence(picture.level)}", picture.caption, width_in * height / width,
             lambda c: drawn.draw_image(c, picture.image), width_in=width_in,
         )
     ]  # fmt: skip
@@ -173,7 +211,6 @@ def _catalogue(report: PaperReport) -> list[Block]:
     classes = report.catalogue
     if classes is None:
         return [absent(report, "catalogue", "Fig. 4", "no catalogue was read")]
-    counts = [count_text(n) for n in classes.counts]
     return [
         Picture(
             "classes",
@@ -182,92 +219,32 @@ def _catalogue(report: PaperReport) -> list[Block]:
             3.0,
             lambda c: drawn.draw_class_histogram(c, classes.diameter_km),
         ),
-        Table(
-            "Craters by class.",
-            (Column("class", numeric=False), Column("paper"), Column("this system")),
-            tuple(
-                (name, count_text(theirs), ours)
-                for name, theirs, ours in zip(drawn.CLASS_NAMES, published.CATALOGUE, counts, strict=True)
-            ),
-        ),
+        _compared(report, "Fig. 4", "Craters by class."),
     ]
 
 
 def _dataset(report: PaperReport) -> list[Block]:
-    blocks: list[Block] = []
-    if report.samples is not None:
-        height, width = report.samples.image.shape[:2]
-        blocks += _image(report, "samples", "Fig. 5", WIDTH_IN, WIDTH_IN * height / width)
-    else:
-        blocks.append(absent(report, "samples", "Form of the paper's Fig. 5", "no data set was rendered"))
+    blocks = _image(report, "samples", "Fig. 5", WIDTH_IN)
     counts = report.dataset
     if counts is None:
         return blocks
-    total = max(sum(counts.instances), 1)
-    rows: list[tuple[Cell | str, ...]] = [
-        ("images", count_text(published.FRAMES), "", count_text(counts.frames), "")
-    ]
-    rows += [
-        (
-            name,
-            count_text(published.LABELS[k]),
-            f"{published.LABEL_SHARES[k]:.1f} %",
-            count_text(counts.instances[k]),
-            percent_text(counts.instances[k], total),
-        )
-        for k, name in enumerate(drawn.CLASS_NAMES)
-    ]
-    columns = (
-        Column("", numeric=False),
-        Column("count", group="paper"),
-        Column("share", group="paper"),
-        Column("count", group="this system"),
-        Column("share", group="this system"),
-    )
-    return [*blocks, Table(f"Images and labels; terrain here: {counts.terrain}.", columns, tuple(rows))]
+    return [*blocks, _compared(report, "Fig. 5", f"Images and labels; terrain here: {counts.terrain}.")]
 
 
 def _detection(report: PaperReport) -> list[Block]:
     if not report.detectors:
         return [absent(report, "detectors", "Table II", "no network was evaluated")]
-    columns = [Column("class", numeric=False)]
-    for name in ("paper", *(d.name for d in report.detectors)):
-        columns += [Column("P", group=name), Column("R", group=name), Column("loc", group=name, unit="px")]
-    rows: list[tuple[Cell | str, ...]] = []
-    for k, theirs in published.TABLE_II.items():
-        cells: list[Cell | str] = [
-            theirs.label,
-            *_score(theirs.precision, theirs.recall, theirs.localisation_px),
-        ]
-        for one in report.detectors:
-            mine = one.per_class[k]
-            cells += _score(mine.precision, mine.recall, mine.localisation_px)
-        rows.append(tuple(cells))
-    cells = ["All", "", "", ""]
-    for one in report.detectors:
-        cells += _score(one.micro.precision, one.micro.recall, one.micro.localisation_px)
-    rows.append(tuple(cells))
     levels = " ".join(
         f"{d.name}: {d.description}, {count_text(d.frames)} test images. {_evidence(d.level)}"
         for d in report.detectors
     )
-    blocks: list[Block] = [
-        Table(
-            "The paper's Table II: precision, recall and mean localisation error.",
-            tuple(columns),
-            tuple(rows),
-            note=levels,
-        )
-    ]
+    caption = "The paper's Table II: precision, recall and mean localisation error."
+    blocks: list[Block] = [_compared(report, "Table II", caption, levels)]
     for number, one in enumerate(report.detectors):
         if one.gallery:
             lead = f"Form of the paper's Fig. 6, {one.name}. {_evidence(one.level)}"
             blocks.append(gallery_picture(f"detections-{number}", one.gallery[:6], 3, lead))
     return blocks
-
-
-def _score(precision: float, recall: float, localisation_px: float) -> tuple[str, str, str]:
-    return number_text(precision, 3), number_text(recall, 3), number_text(localisation_px, 2)
 
 
 def _session(session: PaperSession) -> list[Block]:
@@ -279,7 +256,7 @@ def _session(session: PaperSession) -> list[Block]:
     blocks: list[Block] = [
         Paragraph(session.description),
         _outcomes(session),
-        _outcome_table(series),
+        outcome_table([one for one in series if any(one.outcome)]),
         _statistics(session),
     ]
     blocks.append(
@@ -312,7 +289,23 @@ def _session(session: PaperSession) -> list[Block]:
         ("altitude-hour", hour, "over one hour"),
     ):
         if span is not None:
-            blocks.append(_altitude(session, styles, span, key, words))
+            blocks.append(
+                Picture(
+                    f"{session.key}-{key}",
+                    f"Form of the paper's Fig. 10: altitude {words}, estimates over the reference. "
+                    f"{_evidence(session.level)}",
+                    "Altitude over time.",
+                    3.7,
+                    partial(
+                        navigation.draw_altitude,
+                        series=series,
+                        track=session.track,
+                        styles=styles,
+                        time=span,
+                        arcs=session.arcs,
+                    ),
+                )
+            )
     return blocks
 
 
@@ -328,63 +321,21 @@ def _outcomes(session: PaperSession) -> Picture:
     )
 
 
-def _outcome_table(series: Sequence[NavigationSeries]) -> Table:
-    shown = [one for one in series if any(one.outcome)]
-    counts = outcomes.outcome_table(shown)
-    totals = [sum(row[i] for row in counts.values()) for i in range(len(shown))]
-    columns = [Column("outcome", numeric=False)]
-    for one in shown:
-        columns += [Column("images", group=one.name), Column("share", group=one.name)]
-    rows = []
-    for outcome, row in counts.items():
-        label, role = OUTCOMES.get(outcome, (outcome, "gray3"))
-        cells: list[Cell | str] = [Cell(label, swatch=role)]
-        for i, n in enumerate(row):
-            cells += [count_text(n), percent_text(n, totals[i])]
-        rows.append(tuple(cells))
-    return Table("Outcomes by estimator.", tuple(columns), tuple(rows))
-
-
 def _statistics(session: PaperSession) -> Table:
-    columns = (
-        Column("estimator", numeric=False),
-        Column("median"),
-        Column("95 %"),
-        Column("largest"),
-        Column("altitude, median"),
-        Column("anchor reads"),
-    )
+    names = ("estimator", "median", "95 %", "largest", "altitude, median", "anchor reads")
+    columns = tuple(Column(name, numeric=name != "estimator") for name in names)
     rows = []
     for one in (*session.series, *session.also):
         figures = completed(one)
         vertical = np.abs(one.error_rtn_m[:, 0])
         vertical = vertical[np.isfinite(vertical)]
-        rows.append(
-            (
-                one.name,
-                length_text(figures.median_3d_m),
-                length_text(figures.p95_3d_m),
-                length_text(figures.max_3d_m),
-                length_text(float(np.median(vertical)) if len(vertical) else float("nan")),
-                count_text(one.anchor_reads),
-            )
-        )
+        median = float(np.median(vertical)) if len(vertical) else float("nan")
+        lengths = (figures.median_3d_m, figures.p95_3d_m, figures.max_3d_m, median)
+        rows.append((one.name, *map(length_text, lengths), count_text(one.anchor_reads)))
     return Table(
         "Position error of each estimator against the reference, and reads of the anchor ephemeris (the ground truth "
         f"in the paper): at resets, and for the altitude that scales each image; {_NO_NUMBER}. "
         f"{_evidence(session.level)}",
         columns,
         tuple(rows),
-    )
-
-
-def _altitude(
-    session: PaperSession, styles: navigation.Styles, span: TimeScale, key: str, words: str
-) -> Picture:
-    return Picture(
-        f"{session.key}-{key}",
-        f"Form of the paper's Fig. 10: altitude {words}, estimates over the reference. {_evidence(session.level)}",
-        "Altitude over time.",
-        3.7,
-        lambda c: navigation.draw_altitude(c, session.series, session.track, styles, span, session.arcs),
     )

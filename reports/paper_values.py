@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from reports.arrays import FloatArray
 from reports.values import (
@@ -101,6 +101,27 @@ class PaperSession:
     arcs: tuple[TimeSpan, ...]
     also: tuple[NavigationSeries, ...] = ()
     view: GalleryFrame | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PaperValue:
+    """A number at a place of the paper; `paper` is None where the paper gives none."""
+
+    place: str
+    quantity: str
+    unit: str
+    paper: float | None
+    here: float
+    level: str
+
+    @property
+    def difference(self) -> float | None:
+        """This system minus paper."""
+        return None if self.paper is None else self.here - self.paper
+
+    def row(self) -> dict[str, str | float | None]:
+        """Return the number with its difference as plain data."""
+        return asdict(self) | {"difference": self.difference}
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -20,16 +21,11 @@ from typing import Any
 
 from reports.document import (
     VERDICT_ROLES,
-    Absent,
     Block,
-    Bullets,
     Document,
-    Facts,
     Heading,
     Headline,
     Listing,
-    NewPage,
-    Paragraph,
     Picture,
     Table,
     Verdict,
@@ -37,6 +33,7 @@ from reports.document import (
     evidence_label,
 )
 from reports.drawings import Drawings
+from reports.figures.canvas import WIDTH_IN
 from reports.figures.theme import LIGHT, color
 from reports.text import NOT_A_VALUE, headline_text
 
@@ -126,12 +123,8 @@ def _printable(value: Any) -> Any:
 
 def _blocks(document: Document, drawings: Drawings, root: Path) -> Iterator[dict[str, Any]]:
     section = table = figure = 0
-    new_page = False
     for block in document.blocks:
         match block:
-            case NewPage():
-                new_page = True
-                continue
             case Heading(text, 2):
                 section += 1
                 made = {"kind": "section", "number": str(section), "text": text}
@@ -143,34 +136,23 @@ def _blocks(document: Document, drawings: Drawings, root: Path) -> Iterator[dict
                 made = _picture(block, figure, drawings, root)
             case _:
                 made = _plain(block)
-        yield {"new_page": new_page, **made}
-        new_page = False
+        yield made
 
 
 def _plain(block: Block) -> dict[str, Any]:
     match block:
-        case Heading(text):
-            return {"kind": "heading", "text": text}
-        case Paragraph(text, small):
-            return {"kind": "paragraph", "text": text, "small": small}
         case Verdict(text, level) as verdict:
             role = VERDICT_ROLES.get(level, "gray2")
             return {"kind": "verdict", "word": verdict.word, "text": text, "color": color(role)}
         case Headline():
             return _headline(block)
-        case Facts(pairs):
-            return {"kind": "facts", "pairs": [[name, value] for name, value in pairs]}
-        case Bullets(items):
-            return {"kind": "bullets", "items": list(items)}
-        case Absent(what, why):
-            return {"kind": "absent", "what": what, "why": why}
         case Listing(title, text):
             lines = text.split("\n")
             rest = len(lines) - _MOST_LISTING_LINES
             shown = lines[:_MOST_LISTING_LINES] + ([f"… {rest} further lines"] if rest > 0 else [])
             return {"kind": "listing", "title": title, "lines": shown}
         case _:
-            raise AssertionError(f"no PDF for {type(block).__name__}")
+            return {"kind": type(block).__name__.lower(), **asdict(block)}
 
 
 def _headline(block: Headline) -> dict[str, Any]:
@@ -179,16 +161,8 @@ def _headline(block: Headline) -> dict[str, Any]:
         value = headline_text(figure.value)
         value = "not available" if value == NOT_A_VALUE else value
         label = evidence_label(figure.evidence_level or block.evidence_level)
-        figures.append(
-            {
-                "label": figure.label,
-                "value": value,
-                "words": len(value) > 9,
-                "unit": figure.unit,
-                "note": figure.note,
-                "level": f"level {label}" if label else "level not stated",
-            }
-        )
+        level = f"level {label}" if label else "level not stated"
+        figures.append(asdict(figure) | {"value": value, "words": len(value) > 9, "level": level})
     return {"kind": "headline", "figures": figures, "ladder": block.ladder}
 
 
@@ -197,20 +171,9 @@ def _table(block: Table, number: int) -> dict[str, Any]:
         "kind": "table",
         "number": str(number),
         "caption": block.caption,
-        "columns": [
-            {"label": column.label, "numeric": column.numeric, "group": column.group, "unit": column.unit}
-            for column in block.columns
-        ],
+        "columns": [asdict(column) for column in block.columns],
         "rows": [
-            [
-                {
-                    "text": cell.text,
-                    "swatch": color(cell.swatch) if cell.swatch else "",
-                    "share": None if cell.share is None else min(max(cell.share, 0.0), 1.0),
-                    "strong": cell.strong,
-                }
-                for cell in cells(row)
-            ]
+            [asdict(cell) | {"swatch": color(cell.swatch) if cell.swatch else ""} for cell in cells(row)]
             for row in block.rows
         ],
         "note": block.note,
@@ -222,7 +185,8 @@ def _picture(block: Picture, number: int, drawings: Drawings, root: Path) -> dic
     name = f"figure-{number}.svg"
     (root / name).write_text(svg.replace("<svg", _SVG, 1), encoding="utf-8")
     width_in, height_in = _PAGE_IN
-    scale = min(width_in / block.width_in, (height_in - _CAPTION_IN) / block.height_in)
+    # One scale for all figures, unless a page is too small.
+    scale = min(width_in / max(block.width_in, WIDTH_IN), (height_in - _CAPTION_IN) / block.height_in)
     return {
         "kind": "picture",
         "number": str(number),

@@ -121,7 +121,6 @@ pre{margin:.6rem 0;padding:.9rem 1rem;overflow:auto;background:var(--panel);font
  figure,.tablewrap.short,.absent,.headline,.verdict,tr,.pairs dt,.pairs dd{break-inside:avoid}
  figure{margin:.9rem 0 1.2rem}figure svg{max-height:235mm}
  .tablewrap{margin:.9rem 0 1.2rem;overflow:visible}thead{display:table-header-group}
- .newpage{break-before:page}h2.newpage{margin-top:0}
  .headline{grid-template-columns:repeat(5,minmax(0,1fr))}
  details>summary{list-style:none}details::details-content{content-visibility:visible;block-size:auto}
  body{background:#fff}

@@ -38,7 +38,7 @@ _METHODS = {
 _LABELS = ("5–10 km", "10–15 km", "15–30 km")
 
 
-def make_paper(shop: Workshop, *, quick: bool, created_utc: str = "") -> PaperReport:
+def make_paper(shop: Workshop, *, quick: bool) -> PaperReport:
     """Run every step that is not done yet and return the document's content.
 
     Parameters
@@ -66,7 +66,7 @@ def make_paper(shop: Workshop, *, quick: bool, created_utc: str = "") -> PaperRe
         orbit["maneuvers"], orbit["frames_of_a_day"], orbit["gravity"],
     )  # fmt: skip
     return PaperReport(
-        title="The figures of the LINNA paper, produced by this system",
+        title=f"The figures of the LINNA paper, produced by this system{': quick run, not a result' if quick else ''}",
         identity="AI-Based Navigation for Lunar Satellites in VLLO",
         quick=quick,
         orbit=month,
@@ -86,9 +86,8 @@ def make_paper(shop: Workshop, *, quick: bool, created_utc: str = "") -> PaperRe
         sessions=sessions,
         differences=differences(month, classes, _fov(curves), samples["frames"], detectors, sessions, shop),
         verdict=_verdict(sessions),
-        created_utc=created_utc,
         evidence_level=sessions[0].level,
-        headline=_headline(month, detectors, sessions),
+        headline=_headline(month, () if quick else detectors, sessions),
         provenance=_provenance(shop, network),
         data_sources=tuple(shop.data.names()) or ("procedural Moon, low-degree gravity and IAU orientation",),
         remarks=_remarks(quick, shop),
@@ -290,8 +289,9 @@ def _headline(
     figures = [
         HeadlineFigure("Mean altitude", orbit.mean_km, "km", "paper: 30.8", "1 (unit geometry)"),
         HeadlineFigure("Images", sessions[0].frames, "", "paper: 5,196"),
-        HeadlineFigure(
-            "Recall, 15–30 km", detectors[0].per_class[2].recall, "", "paper: .47", detectors[0].level
+        *(
+            HeadlineFigure("Recall, 15–30 km", one.per_class[2].recall, "", "paper: .47", one.level)
+            for one in detectors[:1]
         ),
     ]
     for session in sessions[:2]:

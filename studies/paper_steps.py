@@ -78,7 +78,6 @@ QUICK = Effort(
     sample_frames=40,
     method_frames=120,
     training_steps=60,
-    days=30.0,
     fov_step_s=300.0,
 )
 

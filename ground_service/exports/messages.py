@@ -26,11 +26,12 @@ from lunar.messages.spice import (
     spacecraft_id,
     spk_octets,
 )
-from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
+from lunar.timescales import LEAP_DATES, TICKS_PER_SECOND, utc_ns_from_ticks
 
 FILTER = "anchored"
 """Estimator whose states are downlinked with velocities and covariances."""
 
+KERNELS = ("sclk", "fk", "ik", "spk", "ck")
 DAY_TICKS = 86_400 * TICKS_PER_SECOND
 GAP_STEPS = 1.5
 """Attitudes further apart than so many usual steps are not interpolated in a CK."""
@@ -143,3 +144,28 @@ def text_kernel(inputs: PassInputs, craft: Craft, kind: str) -> str:
         return format_ik(inputs.viewing.camera, number, craft.name)
     ticks = [ticks_of_utc_ns(one, craft.correlations) for one in (inputs.start_utc_ns, inputs.stop_utc_ns)]
     return format_sclk(clock_lines(craft.correlations, np.array(ticks, dtype=np.int64)), number)
+
+
+def leap_seconds() -> str:
+    """Return a leap-second kernel; the formula of TDB is that of NAIF (TIME Required Reading)."""
+    steps = "\n".join(f"    {10 + number}, @{date}" for number, date in enumerate(LEAP_DATES))
+    return f"""KPL/LSK
+
+\\begindata
+
+DELTET/DELTA_T_A = 32.184
+DELTET/K = 1.657D-3
+DELTET/EB = 1.671D-2
+DELTET/M = ( 6.239996D0 1.99096871D-7 )
+DELTET/DELTA_AT = (
+{steps}
+)
+
+\\begintext
+"""
+
+
+def meta_kernel(names: Sequence[str]) -> str:
+    """Return a kernel that loads others of the working folder."""
+    listed = "\n".join(f"    '{name}'" for name in names)
+    return f"KPL/MK\n\n\\begindata\n\nKERNELS_TO_LOAD = (\n{listed}\n)\n\n\\begintext\n"

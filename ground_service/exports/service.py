@@ -136,6 +136,13 @@ def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[t
             found = store.frame_files(connection, request.pass_id)
         images = ((f"{number:06d}.png", ground.files.get(sha256)) for number, sha256 in found.items())
         yield from _some(images, request.pass_id, "archived images")
+    elif chosen.name == "spice":
+        stem = f"pass-{request.pass_id}"
+        names = [f"{stem}.tls", *(f"{stem}.{FORMATS[kind].ending}" for kind in messages.KERNELS)]
+        yield names[0], messages.leap_seconds().encode()
+        for name, kind in zip(names[1:], messages.KERNELS, strict=True):
+            yield name, _octets(ground, request.model_copy(update={"format": kind}))
+        yield f"{stem}.tm", messages.meta_kernel(names).encode()
     else:
         inputs = load_pass_inputs(ground, request.pass_id)
         if chosen.name == "csv":

@@ -79,13 +79,18 @@ def mark_resets(
 
 
 def draw_lines(
-    canvas: Canvas, axes: Axes, x: FloatArray, y: FloatArray, style: tuple[str, tuple[float, ...] | None]
+    canvas: Canvas,
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    style: tuple[str, tuple[float, ...] | None],
+    name: str = "",
 ) -> None:
     """One series; samples without a finite neighbour are drawn as dots."""
     tint, dashes = style
     x, y = thinned(x, y)
     width = (1.4 if dashes is None else 1.2) * (0.75 if len(y) > _DENSE else 1.0)
-    axes.plot(x, y, color=tint, linestyle=canvas.dashes(dashes), linewidth=canvas.pt(width))
+    axes.plot(x, y, color=tint, linestyle=canvas.dashes(dashes), linewidth=canvas.pt(width), label=name)
     finite = np.isfinite(y)
     known = np.zeros(len(y) + 2, dtype=np.bool_)
     known[1:-1] = finite
@@ -145,7 +150,7 @@ def draw_error_over_time(
     axes.set_title("3-D position error")
     entries = []
     for one, error, keep in sorted(lines, key=lambda item: item[0].kind != "baseline"):
-        draw_lines(canvas, axes, time.x(one.utc_ns[keep]), error[keep], styles[one.name])
+        draw_lines(canvas, axes, time.x(one.utc_ns[keep]), error[keep], styles[one.name], one.name)
         entries.append((one.name, _last_finite(error[keep])))
     mark_resets(canvas, axes, time, resets_of(series, time), named=True)
     _name_lines(canvas, axes, height, entries, styles)
@@ -249,7 +254,9 @@ def draw_ground_error(
         axes.set_title(f"{name} error, {'north' if i == 0 else 'east'} positive")
         entries = []
         for (one, _, keep), error in zip(errors, shown, strict=True):
-            draw_lines(canvas, axes, *broken(time.x(one.utc_ns[keep]), error / factor), styles[one.name])
+            draw_lines(
+                canvas, axes, *broken(time.x(one.utc_ns[keep]), error / factor), styles[one.name], one.name
+            )
             entries.append((one.name, _last_finite(error / factor)))
         mark_resets(canvas, axes, time, resets, named=i == 0)
         _name_lines(canvas, axes, height, entries, styles)
@@ -284,12 +291,13 @@ def draw_altitude(
         color=color(REFERENCE),
         linewidth=canvas.pt(5.0),
         alpha=0.3,
+        label="reference",
     )
     entries, errors = [("reference", _last_finite(track.altitude_m[keep] / 1e3))], []
     for one in series:
         kept = time.inside(one.utc_ns)
         x = time.x(one.utc_ns[kept])
-        draw_lines(canvas, axes, *broken(x, one.altitude_m[kept] / 1e3), styles[one.name])
+        draw_lines(canvas, axes, *broken(x, one.altitude_m[kept] / 1e3), styles[one.name], one.name)
         error = np.abs(one.altitude_m[kept] - reference_at(track, one.utc_ns[kept])[2])
         errors.append((one, x, _positive(error)))
         entries.append((one.name, _last_finite(one.altitude_m[kept] / 1e3)))
@@ -302,7 +310,7 @@ def draw_altitude(
     log_length_axis(below, "y", [error for _, _, error in errors])
     below.set_title("altitude error, magnitude")
     for one, x, error in errors:
-        draw_lines(canvas, below, *broken(x, error), styles[one.name])
+        draw_lines(canvas, below, *broken(x, error), styles[one.name], one.name)
 
 
 def draw_distribution(
@@ -329,7 +337,7 @@ def draw_distribution(
         for one, error, mask in zip(series, errors, masks, strict=True):
             value, share = cumulative(error[mask == lit])
             if len(value):
-                draw_lines(canvas, axes, value, share, styles[one.name])
+                draw_lines(canvas, axes, value, share, styles[one.name], one.name)
         if i == len(panels) - 1:
             _legend(canvas, axes, height, [one.name for one in series], styles)
 

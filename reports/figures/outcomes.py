@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,6 +55,8 @@ def draw_outcome_shares(canvas: Canvas, series: Sequence[NavigationSeries]) -> N
                 colors=[outcome_color(o) for o in counts],
                 wedgeprops={"width": 0.34, "edgecolor": color("paper"), "linewidth": canvas.pt(1.2)},
             )
+            for wedge, outcome in zip(axes.patches, counts, strict=True):
+                wedge.set_label(f"{one.name}, {outcome}")
             largest = max(counts, key=lambda o: counts[o])
             axes.text(
                 0, 0.09, percent_text(counts[largest], total), ha="center", va="center", fontsize="x-large",
@@ -133,11 +135,3 @@ def _shares_in_time(axes: Axes, one: NavigationSeries, time: TimeScale, edges: F
         boxes = np.stack([left, low, right, low, right, high, left, high], axis=-1).reshape(-1, 4, 2)
         axes.add_collection(PolyCollection(list(boxes), facecolors=outcome_color(outcome), linewidths=0))
         floor = floor + share
-
-
-def outcome_table(series: Sequence[NavigationSeries]) -> Mapping[str, list[int]]:
-    """Counts of every outcome that occurred, one column per estimator."""
-    every = [outcome_counts(one) for one in series]
-    order = [o for o in OUTCOMES if any(o in c for c in every)]
-    order += sorted({o for c in every for o in c if o not in OUTCOMES})
-    return {o: [c.get(o, 0) for c in every] for o in order}

@@ -97,7 +97,7 @@ def _ground_track(canvas: Canvas, axes: Axes, session: PaperSession, frame: Gall
     lit = inside(track.utc_ns, session.arcs) if session.arcs else np.ones(len(track.utc_ns), dtype=np.bool_)
     axes.plot(
         track.longitude_deg[lit] % 360.0, track.latitude_deg[lit], ".", color=color("vermillion"),
-        markersize=canvas.pt(1.2),
+        markersize=canvas.pt(1.2), label="ground track",
     )  # fmt: skip
     if frame.utc_ns is not None:
         latitude, longitude, _ = reference_at(track, np.array([frame.utc_ns]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from reports.document import Block, Cell, Column, Heading, Picture, Table
 from reports.figures import outcomes
 from reports.figures.canvas import WIDTH_IN
@@ -18,7 +20,6 @@ def matching(view: PassView) -> list[Block]:
         blocks.append(view.absent("outcomes", "Matcher outcomes"))
         return blocks
     shown = series[:4]
-    counts = outcomes.outcome_table(series)
     largest = []
     for one in shown:
         own = outcomes.outcome_counts(one)
@@ -37,22 +38,7 @@ def matching(view: PassView) -> list[Block]:
             lambda c: outcomes.draw_outcome_shares(c, shown),
         )
     )
-    totals = [sum(row[i] for row in counts.values()) for i in range(len(series))]
-    columns = [Column("outcome", numeric=False)]
-    for one in series:
-        columns += [Column("frames", group=one.name), Column("share", group=one.name)]
-    rows = []
-    for outcome, row in counts.items():
-        label, role = OUTCOMES.get(outcome, (outcome, "gray3"))
-        cells: list[Cell | str] = [Cell(label, swatch=role)]
-        for i, n in enumerate(row):
-            possible = outcome in FIX_OUTCOMES if _is_filter(series[i]) else outcome not in FIX_OUTCOMES
-            cells += [count_text(n), percent_text(n, totals[i])] if possible or n else ["", ""]
-        rows.append(tuple(cells))
-    rows.append(
-        (Cell("All", strong=True), *(c for n in totals for c in (Cell(count_text(n), strong=True), "")))
-    )
-    blocks.append(Table("Outcomes of all frames.", tuple(columns), tuple(rows), note=_fix_note(series)))
+    blocks.append(outcome_table(series))
     blocks.append(
         Picture(
             "course",
@@ -65,6 +51,28 @@ def matching(view: PassView) -> list[Block]:
         )
     )
     return blocks
+
+
+def outcome_table(series: Sequence[NavigationSeries]) -> Table:
+    """Return numbers and shares of frames by outcome."""
+    counts = [outcomes.outcome_counts(one) for one in series]
+    totals = [sum(one.values()) for one in counts]
+    columns = [Column("outcome", numeric=False)]
+    for one in series:
+        columns += [Column("frames", group=one.name), Column("share", group=one.name)]
+    rows = []
+    named = {outcome for one in counts for outcome in one}
+    for outcome in [*(name for name in OUTCOMES if name in named), *sorted(named - {*OUTCOMES})]:
+        label, role = OUTCOMES.get(outcome, (outcome, "gray3"))
+        cells: list[Cell | str] = [Cell(label, swatch=role)]
+        for i, n in enumerate(one.get(outcome, 0) for one in counts):
+            possible = outcome in FIX_OUTCOMES if _is_filter(series[i]) else outcome not in FIX_OUTCOMES
+            cells += [count_text(n), percent_text(n, totals[i])] if possible or n else ["", ""]
+        rows.append(tuple(cells))
+    rows.append(
+        (Cell("All", strong=True), *(c for n in totals for c in (Cell(count_text(n), strong=True), "")))
+    )
+    return Table("Outcomes of all frames.", tuple(columns), tuple(rows), note=_fix_note(series))
 
 
 def _course_words(series: tuple[NavigationSeries, ...], view: PassView) -> str:
@@ -81,6 +89,6 @@ def _is_filter(one: NavigationSeries) -> bool:
     return any(o in FIX_OUTCOMES for o in one.outcome)
 
 
-def _fix_note(series: tuple[NavigationSeries, ...]) -> str:
+def _fix_note(series: Sequence[NavigationSeries]) -> str:
     wrong = [f"{s.name}: {count_text(s.wrong_fixes)}" for s in series if s.wrong_fixes is not None]
     return f"Fixes found wrong against the reference: {'; '.join(wrong)}." if wrong else ""

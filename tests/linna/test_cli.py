@@ -48,13 +48,6 @@ def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys: pytest.Cap
     )
 
 
-def test_a_missing_scenario_is_one_line_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["emulate", "no-such-scenario", "--out", "nowhere"]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert "no such scenario file" in lines[0]
-
-
 def test_every_command_has_a_description_and_an_example_and_states_required_options() -> None:
     for group in cli.GROUPS:
         top = command_parser(cli.GROUPS, group)
@@ -79,7 +72,6 @@ def test_every_command_has_a_description_and_an_example_and_states_required_opti
     [
         (("emulate", "no-such-scenario"), "tutorials/own-scenario"),
         (("regress", "run", "--build", "none.toml", "--archive", "."), "tutorials/own-build"),
-        (("mission", "add", "{text}", "--home", "{home}"), "mission"),
         (("ingest", "{text}", "--home", "{home}"), "tutorials/other-packets"),
     ],
 )
@@ -101,7 +93,8 @@ def test_errors_are_a_json_object_with_json(capsys: pytest.CaptureFixture[str]) 
         "status": 2,
     }
     assert cli.run(["emulate", "no-such-scenario", "--out", "nowhere", "--json"]) == 2
-    assert "no such scenario file" in json.loads(capsys.readouterr().out)["error"]
+    captured = capsys.readouterr()
+    assert "no such scenario file" in json.loads(captured.out)["error"] and captured.err.count("\n") == 1
     assert cli.run(["plan", "add"]) == 2
     assert capsys.readouterr().out == ""
 

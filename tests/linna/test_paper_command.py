@@ -1,5 +1,6 @@
 """`linna paper` end to end in small: every step, a second run that repeats none, and reasons without torch."""
 
+import csv
 import importlib.util
 import json
 from pathlib import Path
@@ -46,6 +47,11 @@ def test_the_document_has_the_figures_tables_and_differences(
     document: tuple[Path, dict[str, Any], list[str]],
 ) -> None:
     out, index, _ = document
+    rows = list(csv.DictReader((out / "paper.csv").open()))
+    assert [row["quantity"] for row in rows] == [one["quantity"] for one in index["values"]]
+    assert {f"{figure['key']}.png" for figure in index["figures"]} <= {
+        one.name for one in (out / "figures").iterdir()
+    }
     assert (out / "paper.pdf").read_bytes().startswith(b"%PDF")
     assert {
         "fov",

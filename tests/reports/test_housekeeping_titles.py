@@ -12,9 +12,7 @@ from reports.values import HousekeepingParameter
     [
         ("bus_voltage_v", "V", "bus voltage, V"),
         ("temperature_c", "°C", "temperature, °C"),
-        ("memory_used_kib", "KiB", "memory used, KiB"),
         ("storage_used_permille", "‰", "storage used, ‰"),
-        ("queue_depth", "packets", "queue depth, packets"),
         ("vitamin_c", "", "vitamin c"),
         ("v", "V", "v, V"),
     ],

@@ -134,11 +134,6 @@ def test_awkward_text_is_printed_and_not_interpreted() -> None:
     assert "further lines" in text
 
 
-def test_a_pass_with_nothing_in_it_is_one_honest_document() -> None:
-    text = "".join(pages_of(render_pages(PassReport(title="Nothing", pass_id="p0"))[1]))
-    assert "not available" in text
-
-
 def test_the_process_of_a_report_does_not_keep_what_typesetting_computes() -> None:
     program = (
         "import sys; from reports.document import Document, Paragraph; from reports.pdf_pages import pdf_pages\n"

@@ -16,10 +16,6 @@ def orbit() -> np.ndarray:
     return np.asarray(flat)
 
 
-def estimate() -> np.ndarray:
-    return orbit() + np.cumsum(np.random.default_rng(2).normal(0.0, 30.0, (COUNT, 3)), axis=0)
-
-
 def poses(text: str) -> tuple[np.ndarray, np.ndarray]:
     """Return times (n,) and 4 x 4 poses (n, 4, 4) of TUM text, from the definition of a quaternion's rotation."""
     rows = np.array([[float(word) for word in line.split()] for line in text.splitlines() if line[0] != "#"])
@@ -30,16 +26,6 @@ def poses(text: str) -> tuple[np.ndarray, np.ndarray]:
     matrices[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1)
     matrices[:, :3, 3], matrices[:, 3, 3] = rows[:, 1:4], 1.0
     return rows[:, 0], matrices
-
-
-def test_poses_in_the_files_are_as_far_apart_as_the_positions() -> None:
-    times, flown = poses(format_tum(UTC_NS, estimate(), orbit()))
-    _, true = poses(format_tum(UTC_NS, orbit(), orbit()))
-    np.testing.assert_allclose(np.diff(times), 15.0, atol=1e-6)
-    apart = np.array([np.linalg.inv(q) @ p for q, p in zip(true, flown, strict=True)])
-    length = np.linalg.norm(apart[:, :3, 3], axis=1)
-    # Quaternions are written to 1e-12: over 1,768 km that is some micrometres.
-    np.testing.assert_allclose(length, np.linalg.norm(estimate() - orbit(), axis=1), atol=1e-4)
 
 
 def test_orientations_are_those_of_the_orbit() -> None:

@@ -14,6 +14,7 @@ import pandas
 import pyarrow.parquet
 import pyogrio
 import pytest
+import spiceypy
 import xarray
 from PIL import Image
 
@@ -32,10 +33,9 @@ from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import parse_oem
 from lunar.messages.oem_xml import parse_oem_xml
 from lunar.messages.spice import camera_id, et_from_utc_ns, spacecraft_id
-from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import SPACECRAFT, SPHERICAL_ERROR_RTN_M
 from tests.ground_service.exports.conftest import FILTER_OFFSET_M, FRAMES, RichPass
-from tests.lunar.spice_pool import kernels
 from tmtc.errors import MissingLibrary
 
 CRAFT = spacecraft_id(SPACECRAFT)
@@ -121,13 +121,17 @@ def test_aem_has_the_attitude_of_each_frame(rich_ground: Ground, rich_pass: Rich
 
 
 def test_spice_kernels_together_see_the_detected_crater_in_its_pixel(
-    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
+    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = ("spk", "ck", "sclk", "fk", "ik")
     reference = load_ephemeris(rich_pass.folder / "reference.oem")
-    with kernels(tmp_path, **{name: export(rich_ground, name) for name in names}) as spice:
+    for name, octets in unzipped(export(rich_ground, "spice")).items():
+        (tmp_path / name).write_bytes(octets)
+    monkeypatch.chdir(tmp_path)
+    with spiceypy.KernelPool("pass-1.tm"):
+        spice = spiceypy
         for k, utc_ns in enumerate(rich_pass.utc_ns):
             et = float(et_from_utc_ns(int(utc_ns)))
+            assert spice.str2et(format_utc(int(utc_ns)).rstrip("Z")) == pytest.approx(et, abs=1e-6)
             state, _ = spice.spkgeo(CRAFT, et, "J2000", 301)
             np.testing.assert_allclose(1e3 * state[:3], reference.at(utc_ns)[0], atol=1e-3)
             if 0 < k < FRAMES - 1:  # the ends of a CK are sharp, and the clock has ticks of 15 us
