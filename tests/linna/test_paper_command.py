@@ -47,7 +47,7 @@ def test_the_document_has_the_figures_tables_and_differences(
     document: tuple[Path, dict[str, Any], list[str]],
 ) -> None:
     out, index, _ = document
-    rows = list(csv.DictReader((out / "paper.csv").open()))
+    rows = list(csv.DictReader((out / "paper.csv").read_text().splitlines()))
     assert [row["quantity"] for row in rows] == [one["quantity"] for one in index["values"]]
     assert {f"{figure['key']}.png" for figure in index["figures"]} <= {
         one.name for one in (out / "figures").iterdir()

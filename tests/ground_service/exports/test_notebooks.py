@@ -1,6 +1,7 @@
 """`linna.open` on a home folder, a server and pass archives; and the notebooks of the documentation, executed."""
 
 import builtins
+import importlib.util
 import json
 import re
 import threading
@@ -56,6 +57,22 @@ def test_a_home_folder_is_opened(rich_ground: Ground) -> None:
     with linna.open(rich_ground.home) as archive:
         check(archive)
         assert "passes" in repr(archive)
+
+
+@pytest.mark.filterwarnings("ignore:ERFA function")  # leap seconds of 2029 are not announced
+def test_the_examples_of_other_tools_run_where_the_tool_is_installed(
+    rich_ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LINNA_HOME", str(rich_ground.home))
+    monkeypatch.chdir(tmp_path)
+    text, names = (ROOT / "docs" / "other-tools.md").read_text(), {"__name__": "example"}
+    examples = re.findall(r"<!-- tool: (\w+) -->\n```python\n(.*?)```", text, re.DOTALL)
+    for tool, source in examples:
+        program = compile(source, tool, "exec")
+        if importlib.util.find_spec(tool):
+            exec(program, names)
+    assert [tool for tool, _ in examples] == ["pandas", "polars", "xarray", "astropy", "spiceypy"]
+    assert capsys.readouterr().out.splitlines()[-1].endswith(" km")
 
 
 def test_an_archive_is_opened_as_folder_and_as_zip(rich_pass: RichPass) -> None:
