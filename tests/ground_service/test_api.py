@@ -361,6 +361,7 @@ MATRIX = [
     ("GET", "/parameters", "viewer"),
     ("GET", "/catalogues", "viewer"),
     ("POST", "/catalogues", "operator"),
+    ("DELETE", f"/catalogues/{'0' * 64}", "operator"),
     ("GET", "/landmarks", "viewer"),
     ("GET", "/landmarks/1", "viewer"),
     ("POST", "/landmarks/1/accept", "operator"),
