@@ -23,6 +23,7 @@ SEED   ?= 1
 
 # What is shipped: installed with hashes, audited, listed with licences.
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
+HASHED  := $(SHIPPED:requirements/%=requirements/hashed/%)
 
 .PHONY: demo test check openmct docs pictures page-table sbom licences package release bench bench-planning campaigns mutation up install install-dev clean
 
@@ -44,7 +45,7 @@ check: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(PYTHON) -m pip --python $(BIN)/python check
 	$(BIN)/python -m pytest -q tests/test_dependencies.py
-	$(BIN)/python deploy/audit.py $(SHIPPED)
+	$(BIN)/python deploy/materials.py audit $(SHIPPED)
 
 # The documentation site with executed notebooks; `linna serve` shows it at /help, wheel and image contain it.
 docs: $(VENV)/.dev
@@ -67,27 +68,27 @@ pictures: $(VENV)/.dev
 page-table: $(VENV)/.dev
 	LINNA_PAGE_TABLE=docs/reference/pages.md $(BIN)/python -m pytest -q -m campaign tests/ground_service/web/test_matrix.py
 
-# Software bill of materials of the runtime, CycloneDX.
+# Bill of materials of what is shipped (CycloneDX): hashes, licences, dependencies, telemetry displays. STATUS names a
+# copy of /var/lib/dpkg/status of the image, for its Debian packages.
 sbom: $(VENV)/.dev
 	mkdir -p dist
-	$(BIN)/python -m cyclonedx_py requirements requirements/runtime.txt --pyproject pyproject.toml --of JSON -o dist/linna.cdx.json
+	$(BIN)/python deploy/materials.py bom $(HASHED) $(if $(STATUS),--status $(STATUS)) > dist/linna.cdx.json
 
 # Licences of everything that is shipped; fails if one is GPL or AGPL.
 licences: $(VENV)/.dev
-	$(BIN)/python deploy/licences.py $(SHIPPED)
+	$(BIN)/python deploy/materials.py licences $(SHIPPED)
 
 # Wheel, source distribution, bill of materials, licences, checksums and their signature, in a new folder. LINNA_RELEASE_KEY
-# names the private key, outside of the repository; `python deploy/release.py key FILE` makes one.
+# names the private key, outside of the repository; `openssl genpkey -algorithm ed25519` makes one.
 release: docs
 	@test -n "$(LINNA_RELEASE_KEY)" || { echo "LINNA_RELEASE_KEY: expected the file of the private key, found none" >&2; exit 2; }
 	rm -rf dist/release
-	mkdir -p dist/release build
+	mkdir -p dist/release
 	SOURCE_DATE_EPOCH="$$(git log -1 --format=%ct)" $(BIN)/python -m build --outdir dist/release
 	SOURCE_DATE_EPOCH="$$(git log -1 --format=%ct)" sh deploy/reproducible.sh dist/release/*.tar.gz
-	cat $(SHIPPED) | grep -v '^#' | sort -u > build/shipped.txt
-	$(BIN)/python -m cyclonedx_py requirements build/shipped.txt --pyproject pyproject.toml --of JSON -o dist/release/linna.cdx.json
-	$(BIN)/python deploy/licences.py $(SHIPPED) > dist/release/licences.txt
-	$(BIN)/python deploy/release.py sign dist/release --key "$(LINNA_RELEASE_KEY)"
+	$(BIN)/python deploy/materials.py bom $(HASHED) --wheel dist/release/*.whl > dist/release/linna.cdx.json
+	$(BIN)/python deploy/materials.py licences $(SHIPPED) > dist/release/licences.txt
+	sh deploy/release.sh sign dist/release "$(LINNA_RELEASE_KEY)"
 
 # Wheel and source distribution, with the documentation.
 package: docs

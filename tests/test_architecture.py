@@ -245,8 +245,8 @@ def test_compiled_functions_use_no_linear_algebra_of_numba_which_asks_for_scipy(
 
 
 UNSAFE = re.compile(
-    r"\bimport (?:pickle|marshal|shelve|dill)\b|from (?:pickle|marshal|shelve) |weights_only=False|allow_pickle=True"
-    r"|yaml\.(?:unsafe_)?load\(|torch\.load\((?!.*weights_only=True)"
+    r"\bimport (?:pickle|marshal|shelve|dill)\b|from (?:pickle|marshal|shelve) (?!import UnpicklingError$)"
+    r"|weights_only=False|allow_pickle=True|yaml\.(?:unsafe_)?load\(|torch\.load\((?!.*weights_only=True)"
 )
 
 

@@ -27,7 +27,7 @@ def script(name: str) -> ModuleType:
     return module
 
 
-audit, licences = script("audit"), script("licences")
+materials = script("materials")
 NORMAL = re.compile(r"[-_.]+")
 
 
@@ -135,8 +135,8 @@ def test_every_declared_dependency_has_its_pin() -> None:
 def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
     found = metadata.distribution(name)
     assert version_of(RUNTIME[name]) == found.version
-    stated = licences.licences_of(name)
-    assert stated and not licences.is_copyleft(stated), f"{name}: {stated}"
+    stated = materials.licences_of(name)
+    assert stated and not materials.is_copyleft(stated), f"{name}: {stated}"
 
 
 HASHED = ("runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrain", "exports", "site")
@@ -171,9 +171,9 @@ def test_the_gpl_is_found_and_the_lgpl_permitted() -> None:
         "GNU General Public License v2 (GPLv2)",
         "GNU Affero General Public License",
     ):
-        assert licences.is_copyleft(["MIT", text]), text
+        assert materials.is_copyleft(["MIT", text]), text
     for text in ("LGPL-3.0", "GNU Lesser General Public License v3", "MIT", "BSD-3-Clause", "MPL-2.0"):
-        assert not licences.is_copyleft([text]), text
+        assert not materials.is_copyleft([text]), text
 
 
 def test_a_package_without_licence_or_not_installed_is_a_fault(
@@ -181,14 +181,14 @@ def test_a_package_without_licence_or_not_installed_is_a_fault(
 ) -> None:
     file = tmp_path / "a.txt"
     file.write_text("# packages\nnumpy==1.0\nabsent==1.0 ; python_version < '3'\n")
-    assert licences.main([str(file)]) == 0
+    assert materials.main(["licences", str(file)]) == 0
     assert "absent\tnot needed" in capsys.readouterr().out
     file.write_text("numpy==1.0\nabsent==1.0\n")
-    assert licences.main([str(file)]) == 1
+    assert materials.main(["licences", str(file)]) == 1
     assert "absent: expected the package, found it not installed" in capsys.readouterr().err
     file.write_text("numpy==1.0\n")
-    monkeypatch.setattr(licences, "licences_of", lambda _name: [])
-    assert licences.main([str(file)]) == 1
+    monkeypatch.setattr(materials, "licences_of", lambda _name: [])
+    assert materials.main(["licences", str(file)]) == 1
     assert "numpy: expected a licence" in capsys.readouterr().err
 
 
@@ -223,10 +223,10 @@ def test_the_audit_finds_a_known_vulnerability(
 ) -> None:
     file = tmp_path / "a.txt"
     file.write_text("# packages\nbad==1.1\ngood==1.0 \\\n    --hash=sha256:00\n")
-    assert audit.main([str(file), "--url", osv]) == 0
+    assert materials.main(["audit", str(file), "--url", osv]) == 0
     assert "2 packages, 0 with known" in capsys.readouterr().out
     file.write_text("bad==1.0\ngood==1.0\n")
-    assert audit.main([str(file), "--url", osv]) == 1
+    assert materials.main(["audit", str(file), "--url", osv]) == 1
     assert "bad 1.0: OSV-1" in capsys.readouterr().err
 
 
@@ -234,13 +234,13 @@ def test_the_audit_reports_a_database_that_cannot_be_reached(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a.txt").write_text("bad==1.0\n")
-    words = [str(tmp_path / "a.txt"), "--url", "http://127.0.0.1:1/"]
-    assert audit.main(words) == 0
+    words = ["audit", str(tmp_path / "a.txt"), "--url", "http://127.0.0.1:1/"]
+    assert materials.main(words) == 0
     assert "NOT CHECKED" in capsys.readouterr().err
-    assert audit.main([*words, "--strict"]) == 2
+    assert materials.main([*words, "--strict"]) == 2
 
 
 def test_the_audit_is_part_of_make_check() -> None:
     rules = (ROOT / "Makefile").read_text()
     check = rules[rules.index("check:") : rules.index("# The documentation site")]
-    assert "deploy/audit.py $(SHIPPED)" in check
+    assert "deploy/materials.py audit $(SHIPPED)" in check

@@ -1,5 +1,7 @@
 """Wheel and source distribution: complete, and usable from another folder without the checkout."""
 
+import base64
+import hashlib
 import importlib.metadata
 import os
 import re
@@ -228,18 +230,39 @@ def test_the_project_has_its_legal_and_citation_files() -> None:
 
 
 @pytest.mark.slow
-def test_the_bill_of_materials_names_every_runtime_package(tmp_path: Path) -> None:
-    out = tmp_path / "linna.cdx.json"
-    subprocess.run(
-        [
-            sys.executable, "-m", "cyclonedx_py", "requirements", str(ROOT / "requirements" / "runtime.txt"),
-            "--pyproject", str(ROOT / "pyproject.toml"), "--of", "JSON", "-o", str(out),
-        ],
-        check=True, capture_output=True,
-    )  # fmt: skip
+def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(
+    tmp_path: Path,
+) -> None:
     import json
 
-    document = json.loads(out.read_text())
-    names = {component["name"].lower() for component in document["components"]}
-    assert document["bomFormat"] == "CycloneDX" and document["metadata"]["component"]["name"] == "linna"
-    assert {"numpy", "fastapi", "sqlalchemy", "onnxruntime"} <= names
+    from cyclonedx.schema import SchemaVersion
+    from cyclonedx.validation.json import JsonStrictValidator
+
+    wheel, status = tmp_path / "a.whl", tmp_path / "status"
+    wheel.write_bytes(b"wheel")
+    gone = "Package: gone\nStatus: deinstall ok config-files\nVersion: 1\n"
+    status.write_text(f"Package: libc6\nStatus: install ok installed\nVersion: 2.36-9\n\n{gone}")
+    shipped = re.search(r"foreach name,([a-z ]+),", (ROOT / "Makefile").read_text())
+    assert shipped is not None
+    files = [str(ROOT / f"requirements/hashed/{name}.txt") for name in shipped[1].split()]
+    words = ["bom", *files, "--wheel", str(wheel), "--status", str(status)]
+    command = [sys.executable, "deploy/materials.py", *words]
+    text = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
+    assert JsonStrictValidator(SchemaVersion.V1_6).validate_str(text) is None
+    document = json.loads(text)
+    root, parts = document["metadata"]["component"], {one["name"]: one for one in document["components"]}
+    assert root["hashes"] == [{"alg": "SHA-256", "content": hashlib.sha256(b"wheel").hexdigest()}]
+    assert "gone" not in parts and parts.pop("libc6")["purl"] == "pkg:deb/debian/libc6@2.36-9"
+    assert {"numpy", "fastapi", "SQLAlchemy", "onnxruntime", "openmct", "pyogrio", "psycopg"} <= parts.keys()
+    assert "pytest" not in parts
+    assert [name for name, one in parts.items() if not one["hashes"] or not one["licenses"]] == []
+    lock = (ROOT / "deploy/openmct/package-lock.json").read_text()
+    sha512 = bytes.fromhex(parts["openmct"]["hashes"][0]["content"])
+    assert base64.b64encode(sha512).decode() in lock
+    needs = {one["ref"]: one["dependsOn"] for one in document["dependencies"]}
+    reached, waiting = set(), [root["bom-ref"]]
+    while waiting:
+        ref = waiting.pop()
+        waiting += set(needs.get(ref, ())) - reached
+        reached.add(ref)
+    assert {one["bom-ref"] for one in parts.values()} <= reached

@@ -228,6 +228,13 @@ def build_root(run: Json, uid: int) -> str:
     os.umask(0o022)
     options = f"mode=755,size={limits['folder_mib']}m,nr_inodes={INODES}"
     kernel.mount("tmpfs", "/new", "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, options)
+    for path in WRITABLE:
+        os.makedirs("/new" + path, exist_ok=True)
+        # Separate mounts stay writable when the root is not, share one limit, and may contain parts, such as Python.
+        kernel.mount("/new" + path, "/new" + path, "", kernel.MS_BIND)
+        if os.getuid() == 0:
+            os.chown("/new" + path, uid, uid)
+        os.chmod("/new" + path, 0o700)
     for entry in run["view"]:
         target = "/new" + entry["target"]
         os.makedirs(os.path.dirname(target), exist_ok=True)
@@ -241,13 +248,6 @@ def build_root(run: Json, uid: int) -> str:
             kernel.restrict_mount(
                 target, kernel.MOUNT_ATTR_RDONLY | kernel.MOUNT_ATTR_NOSUID | kernel.MOUNT_ATTR_NODEV
             )
-    for path in WRITABLE:
-        os.makedirs("/new" + path, exist_ok=True)
-        # A separate mount, so that it stays writable when the root is not; all of them share one limit.
-        kernel.mount("/new" + path, "/new" + path, "", kernel.MS_BIND)
-        if os.getuid() == 0:
-            os.chown("/new" + path, uid, uid)
-        os.chmod("/new" + path, 0o700)
     for name in DEVICES:
         bind(f"/old/dev/{name}", f"/new/dev/{name}")
     os.makedirs("/new/proc")

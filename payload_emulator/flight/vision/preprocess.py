@@ -63,9 +63,8 @@ def prepare_image(
     colours_ok = image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))
     if not colours_ok or image.size == 0 or image.dtype.kind not in "uf":
         return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
-    if preparation is Preparation.normalise_first and image.ndim == 3 and image.shape[2] >= 3:
-        return _prepare_channels(image)
-    if image.dtype == np.uint8:
+    by_channel = preparation is Preparation.normalise_first and image.ndim == 3 and image.shape[2] >= 3
+    if image.dtype == np.uint8 and not by_channel:
         return _prepare_bytes(image)
     gray = _square_root_gray(image)
     if gray is None:
@@ -73,7 +72,7 @@ def prepare_image(
     quality = _judge(gray)
     if quality is not ImageQuality.OK:
         return PreparedImage(np.zeros(gray.shape, np.float32), quality)
-    return PreparedImage(normalise(gray), ImageQuality.OK)
+    return PreparedImage(_mean_of_channels(image) if by_channel else normalise(gray), ImageQuality.OK)
 
 
 def normalise(square_root_gray: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -161,20 +160,14 @@ def _prepare_bytes(image: NDArray[np.generic]) -> PreparedImage:
     return PreparedImage(np.take(table, total), ImageQuality.OK)
 
 
-def _prepare_channels(image: NDArray[np.generic]) -> PreparedImage:
-    """Mean of the normalised channels; the verdict is that on the mean of the channels as they are."""
-    gray = _square_root_gray(image)
-    if gray is None:
-        return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
-    quality = _judge(gray)
-    if quality is not ImageQuality.OK:
-        return PreparedImage(np.zeros(gray.shape, np.float32), quality)
-    total = np.zeros(gray.shape, np.float32)
+def _mean_of_channels(image: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Mean of the normalised channels."""
+    total = np.zeros(image.shape[:2], np.float32)
     for k in range(3):
         plane = _square_root_gray(image[..., k])
         assert plane is not None  # finite, as the mean of the channels is
         total += normalise(plane)
-    return PreparedImage(total * np.float32(1.0 / 3.0), ImageQuality.OK)
+    return total * np.float32(1.0 / 3.0)
 
 
 def _square_root_gray(image: NDArray[np.generic]) -> NDArray[np.float32] | None:

@@ -40,11 +40,12 @@ OUTPUT_CONVENTION = (
 def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     """The averaged network of a checkpoint in evaluation mode, and the checkpoint's document."""
     from payload_emulator.training.model.model import CraterNet, ModelConfig
-    from payload_emulator.training.model.restore import read_checkpoint
+    from payload_emulator.training.model.restore import read_checkpoint, reading
 
     stored = read_checkpoint(path)
-    network = CraterNet(ModelConfig(**stored["config"]))
-    network.load_state_dict(stored["average"])
+    with reading(path):
+        network = CraterNet(ModelConfig(**stored["config"]))
+        network.load_state_dict(stored["average"])
     return network.eval(), stored
 
 

@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from pickle import UnpicklingError
+from struct import error as StructError
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from google.protobuf.message import DecodeError
 from torch import Tensor, nn
 
 from payload_emulator.errors import ModelError
@@ -25,17 +30,30 @@ if TYPE_CHECKING:
 
 _PREFIX = "network."
 _CROPS = 64
+_UNREADABLE = (
+    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, EOFError, AssertionError, MemoryError,
+    UnpicklingError, StructError, DecodeError,
+)  # fmt: skip
+"""What torch and onnx raise for octets and values that are not theirs."""
+
+
+@contextmanager
+def reading(path: Path, what: str = "a checkpoint of a training run") -> Iterator[None]:
+    """Turn errors of reading a foreign file into a `ModelError`."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise ModelError(f"{path}: expected {what}, found no file") from None
+    except _UNREADABLE as error:
+        raise ModelError(f"{path}: expected {what}, found: {str(error)[:120]}") from error
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
     """Return the document of a checkpoint, read as tensors and plain values only; `ModelError` where it is none."""
-    try:
-        stored: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
-        assert {"config", "network", "average", "progress"} <= stored.keys(), "other parts"
-    except Exception as error:  # torch raises whatever its unpickler meets
-        raise ModelError(
-            f"{path}: expected a checkpoint of a training run, found: {str(error)[:90]}"
-        ) from error
+    with reading(path):
+        stored = torch.load(path, map_location=device, weights_only=True)
+        if not isinstance(stored, dict) or not {"config", "network", "average", "progress"} <= stored.keys():
+            raise ValueError("other parts")
     return stored
 
 
@@ -50,7 +68,7 @@ def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
     import onnx
     from onnx import numpy_helper
 
-    try:
+    with reading(path, "an exported network"):
         model = onnx.load(str(path))
         metadata = {item.key: item.value for item in model.metadata_props}
         config = json.loads(metadata["model_config"])
@@ -63,14 +81,10 @@ def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
         heats = maps - (5 if config.get("depth") else 4)
         network = CraterNet(ModelConfig(**(config | {"paper_classes": heats == 4})))
         _fill(network, stored)
-    except FileNotFoundError:
-        raise ModelError(f"{path}: expected an exported network, found no file") from None
-    except Exception as error:  # onnx and torch raise whatever they meet
-        raise ModelError(f"{path}: expected an exported network, found: {str(error)[:120]}") from error
-    progress = {
-        "step": int(metadata.get("training_steps", 0)),
-        "seconds": 60.0 * float(metadata.get("training_minutes", 0.0)),
-    }
+        progress = {
+            "step": int(metadata.get("training_steps", 0)),
+            "seconds": 60.0 * float(metadata.get("training_minutes", 0.0)),
+        }
     return network.eval(), {"progress": progress, "config": config}
 
 

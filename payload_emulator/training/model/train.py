@@ -32,23 +32,6 @@ from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.data.landmarks import Landmarks, with_landmarks
 
-CURVE_COLUMNS = (
-    "step",
-    "minutes",
-    "total",
-    "heat",
-    "offset",
-    "diameter",
-    "sigma",
-    "depth",
-    "f1",
-    "precision",
-    "recall",
-    "loc_px",
-    "threshold",
-)
-
-
 if TYPE_CHECKING:
     from payload_emulator.training.model.model import ModelConfig
 
@@ -203,7 +186,7 @@ def _optimise(
         if now - last_validated > 60.0 * parameters.validate_every_minutes or _finished(state, parameters):
             last_validated = last_saved = now
             figures = validate()
-            append_curve(files.run, state.step, state.seconds / 60.0, shown.last, figures)
+            _append_curve(files.run, state.step, state.seconds / 60.0, shown.last, figures)
             report(
                 f"validation at {state.seconds / 60:.1f} min: F1 {figures['f1']:.3f} (P {figures['precision']:.3f} "
                 f"R {figures['recall']:.3f} loc {figures['loc_px']:.2f} px, threshold {figures['threshold']:.2f})"
@@ -238,13 +221,13 @@ class _RunFiles:
 
     def resume(self, device: str) -> _Progress:
         """Give networks and optimiser the state of the checkpoint; return its progress."""
-        from payload_emulator.training.model.restore import read_checkpoint
+        from payload_emulator.training.model.restore import read_checkpoint, reading
 
         stored = read_checkpoint(self.checkpoint, device)
-        self.network.load_state_dict(stored["network"])
-        self.average.load_state_dict(stored["average"])
-        self.optimiser.load_state_dict(stored["optimiser"])
-        return _Progress(**stored["progress"])
+        with reading(self.checkpoint):
+            for name in ("network", "average", "optimiser"):
+                getattr(self, name).load_state_dict(stored[name])
+            return _Progress(**stored["progress"])
 
     def save(self, state: _Progress, figures: dict[str, float]) -> None:
         """Write the checkpoint, from which a run can be resumed."""
@@ -278,7 +261,6 @@ class _Shown:
     """Running means of the loss terms since the last line."""
 
     def __init__(self) -> None:
-        self.names = ("total", "heat", "offset", "diameter", "sigma", "depth")
         self.sums = np.zeros(6)
         self.count = 0
         self.last = np.full(6, np.nan)
@@ -293,8 +275,24 @@ class _Shown:
         now = time.monotonic()
         speed = self.count * batch / max(now - self.clock, 1e-9)
         self.sums, self.count, self.clock = np.zeros(6), 0, now
-        parts = " ".join(f"{name} {value:.3f}" for name, value in zip(self.names, self.last, strict=True))
+        parts = " ".join(f"{name} {value:.3f}" for name, value in zip(_LOSSES, self.last, strict=True))
         return f"step {state.step} {state.seconds / 60:.1f} min {parts} rate {rate:.2e} {speed:.1f} images/s"
+
+
+_LOSSES = ("total", "heat", "offset", "diameter", "sigma", "depth")
+_SCORES = ("f1", "precision", "recall", "loc_px", "threshold")
+
+
+def _append_curve(
+    run: Path, step: int, minutes: float, losses: FloatArray, figures: dict[str, float]
+) -> None:
+    """Add a line to curves.csv: losses since the last one, figures of the validation."""
+    with (run / "curves.csv").open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        if stream.tell() == 0:
+            writer.writerow(["step", "minutes", *_LOSSES, *_SCORES])
+        values = [*losses, *(figures[key] for key in _SCORES)]
+        writer.writerow([step, f"{minutes:.3f}", *(f"{value:.5f}" for value in values)])
 
 
 class _Team:
@@ -502,15 +500,3 @@ def _write_run(
         "started_from": origin,
     }
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")
-
-
-def append_curve(run: Path, step: int, minutes: float, losses: FloatArray, figures: dict[str, float]) -> None:
-    """Add a line to curves.csv: losses since the last one, figures of the validation."""
-    path = run / "curves.csv"
-    fresh = not path.is_file()
-    with path.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        if fresh:
-            writer.writerow(CURVE_COLUMNS)
-        scores = [f"{figures[key]:.5f}" for key in CURVE_COLUMNS[8:]]
-        writer.writerow([step, f"{minutes:.3f}", *(f"{value:.5f}" for value in losses), *scores])

@@ -1,16 +1,20 @@
 """Training learns, stops early, resumes to the same weights, begins where another left off."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.training.data import feeder as feeding
@@ -18,6 +22,7 @@ from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.data.landmarks import Landmarks
 from payload_emulator.training.model import train as training
 from payload_emulator.training.model.export import load_network
+from payload_emulator.training.model.restore import read_checkpoint
 from payload_emulator.training.model.train import train
 
 SHORT = TrainParameters(
@@ -192,6 +197,27 @@ def test_a_damaged_checkpoint_is_refused_and_a_hostile_one_runs_nothing(blob_dat
     with pytest.raises(ModelError, match="expected a checkpoint"):
         train([blob_dataset], tmp_path, SHORT)
     assert not (tmp_path / "mark").exists()
+    parts = {"config": {}, "network": {}, "average": {}, "progress": {}}
+    for other in ([1], {}, parts, parts | {"config": [1]}, parts | {"config": {"none": 1}}):
+        torch.save(other, tmp_path / "checkpoint.pt")
+        with pytest.raises(ModelError, match="expected a checkpoint"):
+            load_network(tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol", "ignore:TypedStorage is deprecated")
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=4))
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_changed_octets_of_a_checkpoint_are_values_or_a_model_error(tmp_path, changes):
+    path, changed = tmp_path / "checkpoint.pt", tmp_path / "changed.pt"
+    torch.save({name: {"a": torch.ones(2)} for name in ("config", "network", "average", "progress")}, path)
+    with zipfile.ZipFile(path) as stored, zipfile.ZipFile(changed, "w") as written:
+        for name in stored.namelist():
+            octets = bytearray(stored.read(name))
+            for at, value in changes if name.endswith("data.pkl") else ():
+                octets[at % len(octets)] = value
+            written.writestr(name, bytes(octets))
+    with contextlib.suppress(ModelError):
+        assert isinstance(read_checkpoint(changed), dict)
 
 
 def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dataset, tmp_path):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import venv
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,16 @@ def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch: pytest.Monke
     monkeypatch.setattr(host, "execute", lambda run: {"exit_status": 1, "isolation": "namespaces"})
     assert host.protection().refusal == "Python does not run in the sandbox: no text, exit status 1"
     host.protection.cache_clear()
+
+
+def test_builds_run_where_python_is_installed_below_tmp() -> None:
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:
+        Path(name).chmod(0o755)
+        venv.create(name)
+        command = [f"{name}/bin/python", "-c", f"from {host.__name__} import *; print(protection().refusal)"]
+        environment = {"PYTHONPATH": str(host.package_root())}
+        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == host.protection().refusal
 
 
 def test_files_in_a_folder_without_permissions_are_removed(shared: Path) -> None:
