@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,6 +17,12 @@ from ground_service.errors import NotAuthorised
 from ground_service.ground import Ground, ground_from_settings
 from ground_service.server import bind
 from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient as TestClient
+    from starlette.testclient import WebSocketDenialResponse as WebSocketDenialResponse
 
 
 def wait_for(reached: Callable[[], Any], what: str, seconds: float = 60.0) -> None:

@@ -1,6 +1,5 @@
 """Wheel and source distribution: complete, and usable from another folder without the checkout."""
 
-import base64
 import hashlib
 import importlib.metadata
 import os
@@ -256,9 +255,6 @@ def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_s
     assert {"numpy", "fastapi", "SQLAlchemy", "onnxruntime", "openmct", "pyogrio", "psycopg"} <= parts.keys()
     assert "pytest" not in parts
     assert [name for name, one in parts.items() if not one["hashes"] or not one["licenses"]] == []
-    lock = (ROOT / "deploy/openmct/package-lock.json").read_text()
-    sha512 = bytes.fromhex(parts["openmct"]["hashes"][0]["content"])
-    assert base64.b64encode(sha512).decode() in lock
     needs = {one["ref"]: one["dependsOn"] for one in document["dependencies"]}
     reached, waiting = set(), [root["bom-ref"]]
     while waiting:

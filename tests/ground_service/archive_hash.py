@@ -8,9 +8,16 @@ from typing import Any
 
 from sqlalchemy import Connection, select
 
+from ground_service.ground import Ground
 from ground_service.store.repository import PACKETS, SAMPLES
+from ground_service.store.vehicles import vehicle_id
 
 _BOOKKEEPING = ("vehicle_id", "packet_id")
+
+
+def hash_of(ground: Ground) -> str:
+    """Return the hash of the archive of the spacecraft of the synthetic passes."""
+    return ground.read(lambda connection: archive_hash(connection, vehicle_id(connection, 76, "flight")))
 
 
 def archive_hash(connection: Connection, vehicle: int) -> str:

@@ -25,7 +25,9 @@ import numpy as np
 import pytest
 from sqlalchemy import create_engine, text
 
+from ground_service.app import create_app
 from ground_service.ground import Ground, open_ground
+from ground_service.settings import Settings
 from ground_service.store import database as databases
 from ground_service.store.database import Database, open_database, prepare_database, schema_revisions
 from ground_service.worker.follow_up import follow_in_process
@@ -36,7 +38,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from tests.serving import wait_for
+from tests.serving import TestClient, wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
@@ -59,6 +61,13 @@ def name_of_the_test_client() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
         yield
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    """An empty service without users that does its jobs in the requests."""
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,7 +4,6 @@ import asyncio
 import json
 import math
 import threading
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,9 @@ from ground_service.app import create_app
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc
-from tests.serving import wait_for
+from tests.serving import TestClient, wait_for
 from tmtc.downlink import DownlinkEncoder
 from tmtc.frames import Clcw, pack_clcw
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
 
 V1 = "/api/v1"
 

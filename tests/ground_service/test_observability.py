@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -33,10 +32,7 @@ from ground_service.worker.backup import backup
 from ground_service.worker.condition import newest_backup_utc_ns, read_condition
 from ground_service.worker.jobs import run_job
 from ground_service.worker.store import WorkCounts
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RULES = DEPLOY / "prometheus" / "linna.rules.yml"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from typing import Any
@@ -15,10 +14,7 @@ from ground_service.http.requests import ALWAYS
 from ground_service.http.times import UtcTime
 from ground_service.passes.service import define_pass
 from ground_service.settings import Settings
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 VERBS = {
     "accept", "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export",

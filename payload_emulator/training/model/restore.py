@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _PREFIX = "network."
 _CROPS = 64
 _UNREADABLE = (
-    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, EOFError, AssertionError, MemoryError,
+    OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, EOFError, AssertionError,
     UnpicklingError, StructError, DecodeError,
 )  # fmt: skip
 """What torch and onnx raise for octets and values that are not theirs."""

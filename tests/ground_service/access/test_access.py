@@ -1,6 +1,5 @@
 """Users, tokens and the audit log over HTTP."""
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,11 +8,7 @@ import pytest
 from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.settings import Settings
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 V1 = "/api/v1"
 

@@ -5,7 +5,6 @@ import hmac
 import json
 import re
 import time
-import warnings
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,12 +23,7 @@ from ground_service.errors import Conflict, SettingsError
 from ground_service.settings import Settings, load_settings
 from ground_service.worker.upkeep import tidy
 from tests.ground_service.access.openid import CLIENT, SECRET, OpenIdProvider, running_provider
-from tests.serving import token_valid
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient, token_valid
 
 OWN = {"Origin": "http://testserver"}
 ROLES = ("admin=linna-admins", "operator=linna-operators", "viewer=linna-viewers")

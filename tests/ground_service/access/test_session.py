@@ -1,7 +1,5 @@
 """Browser sessions: a cookie instead of a token, ended by sign-out, time and revocation of the token."""
 
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,20 +10,9 @@ from ground_service.access.security import SESSION_COOKIE
 from ground_service.app import create_app
 from ground_service.settings import Settings
 from ground_service.store import repository
-from tests.serving import token_valid
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient, token_valid
 
 OWN = {"Origin": "http://testserver"}
-
-
-@pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
-        yield opened
 
 
 @pytest.fixture

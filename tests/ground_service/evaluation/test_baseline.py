@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from ground_service.evaluation.navigation.baselines import BASELINE_DEGREE, StartState, propagated_positions
@@ -15,6 +14,7 @@ from lunar.errors import ImpactError
 from lunar.gravity import GravityField
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from tests.ground_service.evaluation.still import Still
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 MOON_M, GM, J2 = 1_738_000.0, 4.9028e12, 2.0e-4
@@ -22,18 +22,6 @@ RADIUS_M = 1_800_000.0
 SPEED_M_S = math.sqrt(GM / RADIUS_M)
 SECONDS = np.array([0.0, 600.0, 1800.0, 5400.0])
 TIMES = EPOCH + (SECONDS * 1e9).astype(np.int64)
-
-
-class Still:
-    """Mean-Earth and principal axes are those of ICRF."""
-
-    name = "still"
-
-    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
-        return np.broadcast_to(np.eye(3), (*np.shape(tdb_s), 3, 3)).copy()
-
-    def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
-        return self.mcmf_from_icrf(tdb_s)
 
 
 def oblate(degree: int = 2) -> GravityField:

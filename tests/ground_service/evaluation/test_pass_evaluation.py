@@ -54,6 +54,7 @@ from reports.values import (
     TerrainMap,
     TimeSpan,
 )
+from tests.ground_service.evaluation.still import Still
 
 SECOND = 1_000_000_000
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
@@ -71,18 +72,6 @@ FOCAL_PX = 256.0 / math.tan(math.radians(15.0))
 REFERENCE_SIGMA_M = (20.0, 10.0, 5.0)
 POINT = GravityField("point", RATE**2 * (RADIUS_M + 30.0) ** 3, MOON_M, np.ones((1, 1)), np.zeros((1, 1)))
 """A field in which a circle 30 m higher is flown in the same time."""
-
-
-class Still:
-    """A Moon that does not turn."""
-
-    name = "still"
-
-    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
-        return np.broadcast_to(np.eye(3), (*np.shape(tdb_s), 3, 3)).copy()
-
-    def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
-        return self.mcmf_from_icrf(tdb_s)
 
 
 def circle(seconds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,6 @@
 """Exports over HTTP, with the client, and on the command line."""
 
 import json
-import warnings
 import zipfile
 from pathlib import Path
 
@@ -17,11 +16,7 @@ from ground_service.settings import Settings
 from linna.cli import run
 from lunar.messages.oem import parse_oem
 from tests.ground_service.exports.conftest import FRAMES, RichPass
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 document, always a status that the description names."""
 
 import json
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -13,11 +12,7 @@ from ground_service.contacts.commanding.service import enter_command
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window
 from ground_service.settings import Settings
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 NS = 1_000_000_000
 TEXTS = (

@@ -1,6 +1,5 @@
 """Pages of other origins cannot read or change data through the browser of a user."""
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from ground_service.app import create_app
 from ground_service.settings import Settings
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 V1 = "/api/v1"
 BASE = "http://127.0.0.1:8042"

@@ -2,7 +2,6 @@
 
 import os
 import stat
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -19,12 +18,7 @@ from ground_service.missions.timekeeping.model import ReceptionIn, TimePointIn
 from ground_service.planning.model import WindowIn
 from ground_service.regression.routes import RegressionRequest
 from ground_service.settings import Settings
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
-    from starlette.testclient import WebSocketDenialResponse
+from tests.serving import TestClient, WebSocketDenialResponse
 
 V1 = "/api/v1"
 JSON = {"Content-Type": "application/json"}

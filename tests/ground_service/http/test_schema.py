@@ -3,7 +3,6 @@ answer is one that the schema tells of."""
 
 import json
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -25,11 +24,7 @@ from ground_service.ground import ground_from_settings
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
-
-with warnings.catch_warnings():
-    # The test client's next version wants another HTTP library.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 V1 = "/api/v1"
 CHECKS = [

@@ -4,36 +4,21 @@ import errno
 import importlib.util
 import os
 import tempfile
-import warnings
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ground_service.app import create_app
 from ground_service.errors import StorageFull
 from ground_service.http.model import Paging
 from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest
-from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker.jobs import run_job
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import wait_for
-
-with warnings.catch_warnings():
-    # The test client's next version wants another HTTP library.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 V1 = "/api/v1"
-
-
-@pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
-        yield opened
 
 
 def full(*_: Any, **__: Any) -> Any:

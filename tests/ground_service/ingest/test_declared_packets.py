@@ -34,13 +34,10 @@ from ground_service.store.parameters import readable_decoding
 from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc
+from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.crc import crc16
 from tmtc.downlink import decode, encode_cadus
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T00:00:00Z")

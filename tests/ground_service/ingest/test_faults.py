@@ -18,8 +18,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.redecode import redecode
 from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
-from ground_service.store.vehicles import vehicle_id
-from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.archive_hash import hash_of
 from tmtc.dictionary import DICTIONARY
 
 KILLS = 4
@@ -37,11 +36,6 @@ with open_ground(Path(sys.argv[1])) as ground:
     print("ready", flush=True)
     ingest_file(ground, Path(sys.argv[2]))
 """
-
-
-def hash_of(ground: Ground) -> str:
-    with ground.database.reading() as connection:
-        return archive_hash(connection, vehicle_id(connection, 76, "flight"))
 
 
 def rows_of(ground: Ground, version: int) -> dict[str, int]:

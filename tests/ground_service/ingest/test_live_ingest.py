@@ -12,13 +12,7 @@ from ground_service.errors import InvalidInput, StorageFull
 from ground_service.ground import Ground
 from ground_service.ingest.live import Spool, WatchedFolder
 from ground_service.ingest.service import Place, ingest_file
-from ground_service.store.vehicles import vehicle_id
-from tests.ground_service.archive_hash import archive_hash
-
-
-def hash_of(ground: Ground) -> str:
-    with ground.database.reading() as connection:
-        return archive_hash(connection, vehicle_id(connection, 76, "flight"))
+from tests.ground_service.archive_hash import hash_of
 
 
 @pytest.fixture

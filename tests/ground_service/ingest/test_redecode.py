@@ -1,6 +1,5 @@
 """An archive that an older dictionary decoded: never empty, decoded again by itself, whatever happens meanwhile."""
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,13 +21,9 @@ from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import archive_hash
+from tests.serving import TestClient
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
-
-with warnings.catch_warnings():
-    # The test client's next version wants another HTTP library.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
 
 NS = 1_000_000_000
 OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)

@@ -1,7 +1,6 @@
 """Mission descriptions: refused values, values that are not stated, revisions, and references of passes."""
 
 import json
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -43,11 +42,7 @@ from ground_service.passes.store import get_pass as stored_pass
 from ground_service.settings import Settings
 from linna import cli
 from tests.ground_service.conftest import write_manifest
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient
 
 TEXT = """
 schema_version = 1

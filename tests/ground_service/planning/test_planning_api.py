@@ -1,6 +1,5 @@
 """Windows over the interface: searched, entered, decided on, uplinked, followed by telemetry, exchanged."""
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,11 @@ from ground_service.app import create_app
 from ground_service.passes.span import Observation, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
+from tests.serving import TestClient
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
 from tmtc.uplink import UplinkDecoder
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
 
 V1 = "/api/v1"
 NS = 1_000_000_000

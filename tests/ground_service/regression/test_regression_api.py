@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,26 +12,13 @@ from typing import Any
 import pytest
 
 from ground_service.access.service import add_user
-from ground_service.app import create_app
 from ground_service.client.local import local_client
 from ground_service.ground import open_ground
 from ground_service.regression.archives import pack_archive
-from ground_service.settings import Settings
 from linna.cli import run
-from tests.serving import wait_for
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient, wait_for
 
 V1 = "/api/v1"
-
-
-@pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
-        yield opened
 
 
 def is_done(client: TestClient, job_id: str) -> bool:

@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,14 +17,9 @@ from ground_service.store import wakeups
 from ground_service.web import sockets
 from tests.ground_service.contacts.links.conftest import HEAD, Station
 from tests.ground_service.web.test_displays import ask as fetch
-from tests.serving import wait_for
+from tests.serving import TestClient, wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
 
 NEVER_S = 3600.0
 LIVE = "/api/v1/live?values=true"

@@ -1,7 +1,6 @@
 """WebSockets: closed after loss of authorisation, limited in number, and served from one feed."""
 
 import asyncio
-import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,15 +15,9 @@ from ground_service.ingest.service import ingest_file
 from ground_service.settings import Settings
 from ground_service.store.events import publish
 from ground_service.web import sockets
-from tests.serving import wait_for
+from tests.serving import TestClient, WebSocketDenialResponse, wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
-    from starlette.testclient import WebSocketDenialResponse
 
 LIVE = "/api/v1/live"
 TICKS = 900_000_000 * 65_536

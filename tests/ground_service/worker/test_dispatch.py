@@ -15,11 +15,11 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest import reception
 from ground_service.ingest import store as ingest_store
 from ground_service.ingest.service import enter_ingest, ingest_file
-from ground_service.store import files, repository
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store import files
 from ground_service.worker import dispatch
 from ground_service.worker.dispatch import ThreadDispatcher
-from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.archive_hash import hash_of
+from tests.ground_service.worker.test_jobs import row_of
 
 
 @pytest.fixture(scope="module")
@@ -32,16 +32,6 @@ def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stream is stored in about ten transactions."""
     monkeypatch.setattr(files, "BLOCK_OCTETS", 4_000)
     monkeypatch.setattr(reception, "WINDOW_OCTETS", 4_000)
-
-
-def hash_of(ground: Ground) -> str:
-    with ground.database.reading() as connection:
-        return archive_hash(connection, vehicle_id(connection, 76, "flight"))
-
-
-def job_of(ground: Ground, job: str) -> dict[str, Any]:
-    with ground.database.reading() as connection:
-        return repository.get(connection, repository.JOBS, job, "job")
 
 
 def enter(ground: Ground, downlink: Path) -> str:
@@ -76,18 +66,18 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
             dispatcher.start(job)
             dispatcher.start(behind)
             assert middle.wait(60.0)
-            assert 0.0 < job_of(ground, job)["progress"] < 1.0
+            assert 0.0 < row_of(ground, job)["progress"] < 1.0
             ground.stopping.set()  # as closing the dispatcher does, which waits
             go_on.set()
             dispatcher.close()
             assert len(stored) == 3
-            assert [job_of(ground, one)["state"] for one in (job, behind)] == ["queued", "queued"]
-            assert job_of(ground, job)["attempts"] == 0
+            assert [row_of(ground, one)["state"] for one in (job, behind)] == ["queued", "queued"]
+            assert row_of(ground, job)["attempts"] == 0
     with open_ground(tmp_path / "stopped") as ground:
         dispatcher = ThreadDispatcher(ground)
         dispatcher.resume()
         dispatcher._pool.shutdown(wait=True)
-        assert [job_of(ground, one)["state"] for one in (job, behind)] == ["done", "done"]
+        assert [row_of(ground, one)["state"] for one in (job, behind)] == ["done", "done"]
         assert hash_of(ground) == expected
 
 
@@ -114,11 +104,11 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
         waits = [later - earlier for earlier, later in itertools.pairwise(tried)]
         assert waits == [15.0, 30.0, 45.0, 90.0, 165.0, 300.0, 300.0]
         # However long the disk was full, the job is not given up.
-        assert job_of(ground, job)["attempts"] == 0
+        assert row_of(ground, job)["attempts"] == 0
         clock[0] += 300.0
         dispatcher.resume()
         dispatcher.close()
-        assert job_of(ground, job)["state"] in ("done", "queued")
+        assert row_of(ground, job)["state"] in ("done", "queued")
 
 
 def test_a_job_is_done_once_the_disk_has_space(
@@ -133,9 +123,9 @@ def test_a_job_is_done_once_the_disk_has_space(
             )
             dispatcher.resume()
             dispatcher._pool.submit(int).result()
-        assert job_of(ground, job)["state"] == "queued"
+        assert row_of(ground, job)["state"] == "queued"
         monkeypatch.setattr(dispatch.time, "monotonic", lambda: 1e12)
         dispatcher.resume()
         dispatcher._pool.submit(int).result()
-        assert job_of(ground, job)["state"] == "done"
+        assert row_of(ground, job)["state"] == "done"
         dispatcher.close()

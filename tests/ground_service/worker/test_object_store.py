@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import uuid
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,12 +31,7 @@ from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
 from ground_service.worker.jobs import run_job
 from tests.ground_service.object_server import ObjectServer, running_objects
-from tests.serving import wait_for
-
-with warnings.catch_warnings():
-    # It recommends another HTTP library than the installed one; both serve it.
-    warnings.simplefilter("ignore")
-    from fastapi.testclient import TestClient
+from tests.serving import TestClient, wait_for
 
 OWN = {"Origin": "http://testserver"}
 
