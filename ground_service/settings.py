@@ -146,10 +146,10 @@ class Settings(BaseSettings):
     backups: Path | None = Field(
         default=None, description="Folder of backups, whose age the metrics and the status state"
     )
-    audit_heads: Path | None = Field(
+    audit_heads: str | None = Field(
         default=None,
-        description="Folder of another machine in which the nightly job writes the head of the audit chain, signed "
-        "with the key in secrets/audit under LINNA_HOME",
+        description="Folder of another machine, or channel:NAME of a mission description, to which the nightly job "
+        "writes the head of the audit chain, signed with the key in secrets/audit under LINNA_HOME",
     )
     log_format: Literal["text", "json"] = Field(default="text", description="Form of the log on stderr")
     allowed_hosts: Words = Field(
@@ -252,7 +252,7 @@ class Settings(BaseSettings):
             "retention_days": self.retention_days,
             "archive_days": self.archive_days,
             "archive_limit_mib": self.archive_limit_mib,
-            "audit_heads": None if self.audit_heads is None else str(self.audit_heads),
+            "audit_heads": self.audit_heads,
         }
 
     def resolved_database_url(self) -> str:

@@ -238,9 +238,3 @@ def test_the_audit_reports_a_database_that_cannot_be_reached(
     assert materials.main(words) == 0
     assert "NOT CHECKED" in capsys.readouterr().err
     assert materials.main([*words, "--strict"]) == 2
-
-
-def test_the_audit_is_part_of_make_check() -> None:
-    rules = (ROOT / "Makefile").read_text()
-    check = rules[rules.index("check:") : rules.index("# The documentation site")]
-    assert "deploy/materials.py audit $(SHIPPED)" in check

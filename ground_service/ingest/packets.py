@@ -161,14 +161,7 @@ def _frame_columns(table: Table, place: IntArray) -> Columns:
 
 
 def _detections(table: Table, place: IntArray) -> Columns:
-    counts = table.columns["count"]
-    return {
-        **_frame_columns(table, place),
-        "image_quality": table.columns["image_quality"],
-        "count": counts,
-        "items": table.items,
-        "offsets": np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-    }
+    return {**_identifications(table, place), "image_quality": table.columns["image_quality"]}
 
 
 def _navigation(table: Table, place: IntArray) -> Columns:

@@ -19,6 +19,7 @@ from ground_service.missions.model import (
     MissionRevision,
     parse_mission,
 )
+from ground_service.missions.rules import Channel
 from ground_service.store import repository
 
 MISSIONS = repository.MISSIONS
@@ -144,6 +145,20 @@ def _archived(connection: Connection, instance: str) -> dict[int, int]:
 
 def missions_in_force(connection: Connection, ccsds_id: int | None = None) -> dict[int, Mission]:
     """Return the descriptions in force of a spacecraft, or of all, by spacecraft."""
+    found = keys_in_force(connection, ccsds_id)
+    return {spacecraft: get_mission(connection, key) for spacecraft, key in found.items()}
+
+
+def channels_in_force(connection: Connection) -> list[tuple[int, str, Channel]]:
+    """Return spacecraft, name and channel of notifications of all descriptions in force."""
+    missions = missions_in_force(connection).items()
+    return [
+        (one, *found) for one, mission in missions for found in (mission.automation.channels or {}).items()
+    ]
+
+
+def keys_in_force(connection: Connection, ccsds_id: int | None = None) -> dict[int, int]:
+    """Return the ids of the descriptions in force of a spacecraft, or of all, by spacecraft."""
     query = select(MISSIONS.c.ccsds_id).where(MISSIONS.c.ccsds_id.is_not(None)).distinct()
     if ccsds_id is not None:
         query = query.where(MISSIONS.c.ccsds_id == ccsds_id)
@@ -151,7 +166,7 @@ def missions_in_force(connection: Connection, ccsds_id: int | None = None) -> di
     for spacecraft in sorted(int(one) for one in connection.execute(query).scalars()):
         key = newest_of_spacecraft(connection, spacecraft)
         if key is not None:
-            found[spacecraft] = get_mission(connection, key)
+            found[spacecraft] = key
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from pydantic import Field
 
@@ -12,11 +12,11 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
 from ground_service.http.model import Entity
+from ground_service.missions.store import channels_in_force
 from ground_service.settings import Settings
 from ground_service.store import leases
 from ground_service.store.database import schema_revisions
 from ground_service.store.stored_files import file_names
-from ground_service.worker.automation.store import missions_in_force
 from ground_service.worker.condition import broker_answers
 from ground_service.worker.outgoing import permitted_address
 from ground_service.worker.presence import (
@@ -147,24 +147,13 @@ def _provider(_ground: Ground, settings: Settings) -> Result:
 
 
 def _channels(ground: Ground, _settings: Settings) -> Result:
-    faults, count = [], 0
-    for name, host, port in _receivers(ground):
-        count += 1
+    faults, channels = [], ground.read(channels_in_force)
+    for spacecraft, name, channel in channels:
         try:
-            permitted_address(host, port, ground.networks)
+            permitted_address(*channel.server, networks=ground.networks)
         except GroundError as error:
-            faults.append(f"{name}: {error}")
-    return faults, f"{count} permitted" if count else ""
-
-
-def _receivers(ground: Ground) -> Iterator[tuple[str, str, int]]:
-    """Yield name, host and port of every channel of the descriptions in force."""
-    with ground.database.reading() as connection:
-        missions = missions_in_force(connection)
-    for spacecraft, _, mission in missions:
-        channels = mission.automation.channels if mission.automation is not None else None
-        for name, channel in (channels or {}).items():
-            yield f"channel {name} of spacecraft {spacecraft}", *channel.server
+            faults.append(f"channel {name} of spacecraft {spacecraft}: {error}")
+    return faults, f"{len(channels)} permitted" if channels else ""
 
 
 CHECKS: dict[str, Callable[[Ground, Settings], Result]] = {

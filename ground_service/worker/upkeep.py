@@ -9,11 +9,12 @@ settings say so; the audit log has a record of each.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ground_service.access.audit_log import audit_head, parse_head
+from ground_service.access.audit_log import audit_head
 from ground_service.access.store import delete_answers, delete_ended_sessions
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
@@ -21,16 +22,20 @@ from ground_service.evaluation.performance.service import make_due_reports
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
+from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends
 from ground_service.regression.archives import let_go, remove_unfinished
 from ground_service.store import audit, events
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
-from ground_service.worker.notifications import key_of, signature
+from ground_service.worker.notifications import key_of, send, signature
 from lunar.timescales import format_utc
 
 RETENTION_DAYS = 90
 DAY_NS = 86_400_000_000_000
+CHANNEL = "channel:"
+_HEAD = re.compile(r"\b([0-9]+):([0-9a-f]{64})\b(?:\W+(?:signature\W+)?([0-9a-f]{64})\b)?")
+"""Number, hash and signature in a line of a file, a JSON document or an e-mail."""
 
 
 def nightly_job_id(utc_ns: int) -> str:
@@ -52,8 +57,6 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     removed["archives"] = remove_archives(
         ground, int(arguments.get("archive_days", 0)), int(arguments.get("archive_limit_mib", 0))
     )
-    if arguments.get("audit_heads"):
-        keep_head(ground, Path(arguments["audit_heads"]))
     with ground.database.reading() as connection:
         vehicles = all_vehicles(connection)
     found: list[dict[str, Any]] = []
@@ -72,6 +75,8 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
         with ground.database.writing() as connection:
             publish(connection, LimitsBroken(broken=broken))
     monthly, failed = make_due_reports(ground)
+    if arguments.get("audit_heads"):
+        keep_head(ground, arguments["audit_heads"])
     return {
         "spacecraft": found,
         "limits_broken": broken,
@@ -124,27 +129,42 @@ def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
     return removed
 
 
-def keep_head(ground: Ground, folder: Path) -> None:
-    """Write the signed head of the audit chain into a file of today; later ones of the day are further lines."""
+def keep_head(ground: Ground, target: str) -> None:
+    """Write the signed head of the audit chain into a file of today in a folder, or send it to `channel:NAME`."""
     head = audit_head(ground)
     line = f"{head.number}:{head.sha256}"
-    with (folder / f"{format_utc(utc_now_ns())[:10]}.head").open("a") as stream:
-        stream.write(f"{line} {signature(key_of(ground.home, 'audit'), line.encode())}\n")
+    signed = signature(key_of(ground.home, "audit"), line.encode())
+    if not target.startswith(CHANNEL):
+        with (Path(target) / f"{format_utc(utc_now_ns())[:10]}.head").open("a") as stream:
+            stream.write(f"{line} {signed}\n")
+        return
+    name = target.removeprefix(CHANNEL)
+    for _, found, channel in ground.read(channels_in_force):
+        if found == name:
+            identity, content = f"audit-{head.number}-{signed[:16]}", {"head": line, "signature": signed}
+            send(ground.home, channel, identity, "LINNA: audit head", content, networks=ground.networks)
+            return
+    raise InvalidInput("LINNA_AUDIT_HEADS", "", "a channel of a mission description in force", name)
 
 
 def kept_heads(ground: Ground, given: str) -> list[audit.Head]:
-    """Return the head that is given as NUMBER:SHA256, or the heads in a folder of `keep_head`.
+    """Return the head that is given as NUMBER:SHA256, or those of `keep_head` in a file or the files of a folder.
 
     Raises
     ------
     InvalidInput
         There is none, or one was not signed with the key of this service.
     """
-    folder = Path(given)
-    if not folder.is_dir():
-        return [parse_head(given)]
+    place = Path(given)
+    if not place.exists():
+        match = _HEAD.fullmatch(given.strip())
+        if match is None or match[3]:
+            expected = "NUMBER:SHA256 as 'linna audit head' prints it, or a file or folder of signed heads"
+            raise InvalidInput("audit head", "", expected, repr(given)[:100])
+        return [audit.Head(int(match[1]), match[2])]
+    files = sorted(place.iterdir()) if place.is_dir() else [place]
+    found = [one for path in files for one in _HEAD.findall(path.read_text(errors="replace"))]
     key = key_of(ground.home, "audit")
-    lines = [line.split() for path in folder.glob("*.head") for line in path.read_text().splitlines()]
-    if not lines or any([signature(key, head.encode())] != signed for head, *signed in lines):
+    if not found or any(signature(key, f"{n}:{sha256}".encode()) != signed for n, sha256, signed in found):
         raise InvalidInput(given, "", "heads signed with the key of this service", "others or none")
-    return [parse_head(head) for head, _ in lines]
+    return [audit.Head(int(number), sha256) for number, sha256, _ in found]

@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--head HEAD",
         str,
-        "stored head of the audit chain, NUMBER:SHA256 ('linna audit head'), or a folder LINNA_AUDIT_HEADS",
+        "stored head of the audit chain, NUMBER:SHA256 ('linna audit head'), or a file or folder of signed heads",
     )
     add_service_options(parser)
     finish(parser, run)

@@ -11,7 +11,7 @@ from ground_service.events import AutomationChanged, publish
 from ground_service.http.model import PageOf
 from ground_service.missions.model import Mission
 from ground_service.missions.rules import Channel, Rule
-from ground_service.missions.store import ARCHIVE_ACTOR, get_mission, newest_of_spacecraft
+from ground_service.missions.store import get_mission, keys_in_force, newest_of_spacecraft
 from ground_service.planning import store as planning
 from ground_service.planning.progress import HEARD_TICKS, span_of
 from ground_service.store import repository
@@ -38,19 +38,8 @@ def mission_of_vehicle(connection: Connection, vehicle: int | None) -> tuple[int
 
 def missions_in_force(connection: Connection) -> list[tuple[int, int, Mission]]:
     """Return the spacecraft, the id and the document of all descriptions in force."""
-    missions = repository.MISSIONS
-    query = (
-        select(missions.c.ccsds_id)
-        .where(missions.c.ccsds_id.is_not(None), missions.c.entered_by != ARCHIVE_ACTOR)
-        .distinct()
-        .order_by(missions.c.ccsds_id)
-    )
-    found = []
-    for spacecraft in connection.execute(query).scalars().all():
-        key = newest_of_spacecraft(connection, int(spacecraft))
-        if key is not None:
-            found.append((int(spacecraft), key, get_mission(connection, key)))
-    return found
+    found = keys_in_force(connection).items()
+    return [(spacecraft, key, get_mission(connection, key)) for spacecraft, key in found]
 
 
 def window_of(connection: Connection, window_id: int) -> Occurrence | None:

@@ -17,7 +17,7 @@ from ground_service.http.model import Paging
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
-from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.archive_hash import hash_of
 from tmtc.crc import append_crc
 from tmtc.downlink import encode_cadus
 from tmtc.packets import pack_packet
@@ -29,11 +29,6 @@ def ingest(ground: Ground, octets: bytes, folder: Path, name: str = "downlink.bi
     path = folder / name
     path.write_bytes(octets)
     return ingest_file(ground, path, spacecraft_id=SPACECRAFT)
-
-
-def archive(ground: Ground) -> str:
-    with ground.database.reading() as connection:
-        return archive_hash(connection, vehicle_id(connection, SPACECRAFT, "flight"))
 
 
 def rows(ground: Ground, table: Any) -> int:
@@ -51,7 +46,7 @@ def expected(packets: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> 
     folder = tmp_path_factory.mktemp("whole")
     ground = open_ground(folder / "home")
     ingest(ground, b"".join(packets), folder)
-    result = archive(ground)
+    result = hash_of(ground)
     ground.close()
     return result
 
@@ -71,7 +66,7 @@ def test_ingesting_twice_changes_nothing(
     ingest(ground, b"".join(packets), tmp_path)
     again = ingest(ground, b"".join(packets), tmp_path)
     assert (again.packets_new, again.packets_repeated) == (0, len(packets))
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -88,7 +83,7 @@ def test_any_order_split_and_repetition_gives_the_same_archive(
     for first, last in zip([0, *cuts], [*cuts, len(order)], strict=True):
         if last > first:
             ingest(ground, b"".join(packets[i] for i in order[first:last]), folder)
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
     ground.close()
 
 
@@ -127,7 +122,7 @@ def test_two_spacecraft_in_one_file_have_archives_of_their_own(
     (tmp_path / "mixed.cadu").write_bytes(mixed)
     result = ingest_file(ground, tmp_path / "mixed.cadu")
     assert result.packets_new == len(packets) + 20 and result.frames_bad == 0
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
     with ground.database.reading() as connection:
         other = vehicle_id(connection, 33, "flight")
         _, stored = repository.newest(connection, repository.PACKETS, Paging(), vehicle_id=other)
@@ -197,7 +192,7 @@ def test_octets_that_wait_are_counted_and_are_no_error(
     assert (last.frames_joined, last.octets_pending) == (0, 979)
     both = place(ground, stream[:300], 0, tmp_path)
     assert both.frames_joined == 1 and both.packets > 0 and both.packets_joined == 1
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
 
 
 def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(
@@ -230,7 +225,7 @@ def test_pieces_for_one_spacecraft_and_for_any_adjoin(
         mine = SPACECRAFT if number % 2 else None
         for spacecraft in (SPACECRAFT + 1, mine):
             place(ground, stream[start : start + 1_000], start, tmp_path, spacecraft_id=spacecraft)
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
 
 
 def test_octets_that_came_before_are_counted_as_repeated(
@@ -281,10 +276,10 @@ def test_frames_of_two_receivers_are_merged(
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     frames = [stream[at : at + 259] for at in range(0, len(stream), 259)]
     ingest(ground, b"".join(2 * frame for k, frame in enumerate(frames) if k % 4), tmp_path)
-    assert archive(ground) != expected
+    assert hash_of(ground) != expected
     kept = [frame for k, frame in enumerate(frames) if k % 4 != 2]
     ingest(ground, b"".join(kept[1::2] + kept[::2]), tmp_path)
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
 
 
 def test_many_fragments_are_stored_before_the_end_of_a_recording(
@@ -295,7 +290,7 @@ def test_many_fragments_are_stored_before_the_end_of_a_recording(
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     frames = [stream[at : at + 259] for at in range(0, len(stream), 259)]
     ingest(ground, b"".join(frames[1::2] + frames[::2]), tmp_path)
-    assert archive(ground) == expected
+    assert hash_of(ground) == expected
     assert rows(ground, repository.FRAGMENTS) == 0
 
 
@@ -344,7 +339,7 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
                 place(ground, octets, start, tmp_path)
             dialect.do_commit = commit
             place(ground, octets, start, tmp_path)
-            assert archive(ground) == expected, f"after commit {commits}"
+            assert hash_of(ground) == expected, f"after commit {commits}"
             with ground.database.reading() as connection:
                 stored = connection.execute(select(func.sum(repository.PIECES.c.packets_stored))).scalar_one()
             assert stored == len(packets), f"after commit {commits}"

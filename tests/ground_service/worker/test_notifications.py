@@ -20,6 +20,7 @@ from typing import Any
 
 import pytest
 
+from ground_service.access.audit_log import audit_head
 from ground_service.errors import InvalidInput
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground, open_ground
@@ -29,6 +30,7 @@ from ground_service.jobs.store import list_jobs
 from ground_service.missions.rules import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
+from ground_service.store.audit import Head
 from ground_service.worker import outgoing
 from ground_service.worker.automation.model import ActionFilter
 from ground_service.worker.automation.store import list_automation_actions
@@ -37,6 +39,7 @@ from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.notifications import ATTEMPTS, signature
 from ground_service.worker.notifications import send as send_to
 from ground_service.worker.outgoing import NotDelivered, permitted_address
+from ground_service.worker.upkeep import kept_heads, nightly
 from tests.ground_service.conftest import wait_for
 
 HERE = (ip_network("127.0.0.1"),)
@@ -330,8 +333,7 @@ def test_the_networks_are_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_settings().notify_networks == ()
 
 
-def test_a_rule_notifies_its_channels(webhook: Webhook, mailbox: Mailbox, local: Ground) -> None:
-    follow_in_process(local)
+def add_channels(ground: Ground, webhook: Webhook, mailbox: Mailbox) -> None:
     text = f"""
 name = "m"
 [spacecraft]
@@ -348,7 +350,32 @@ webhook = "{webhook.url}"
 email = ["a@b.example"]
 smtp = "{mailbox.address}"
 """
-    add_mission(local, text.encode())
+    add_mission(ground, text.encode())
+
+
+def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
+    webhook: Webhook, mailbox: Mailbox, local: Ground, tmp_path: Path
+) -> None:
+    add_channels(local, webhook, mailbox)
+    (local.home / "secrets").mkdir()
+    (local.home / "secrets/audit").write_text("key")
+    for name in ("hook", "people"):
+        nightly(local, {"audit_heads": f"channel:{name}"})
+    heads = tmp_path / "heads"
+    heads.mkdir()
+    (heads / "hook.json").write_bytes(webhook.received[0][1])
+    (heads / "mail.eml").write_text(mailbox.received[0][1])
+    now = audit_head(local)
+    assert kept_heads(local, str(heads)) == [Head(now.number, now.sha256)] * 2
+    with pytest.raises(
+        InvalidInput, match="expected a channel of a mission description in force, found none"
+    ):
+        nightly(local, {"audit_heads": "channel:none"})
+
+
+def test_a_rule_notifies_its_channels(webhook: Webhook, mailbox: Mailbox, local: Ground) -> None:
+    follow_in_process(local)
+    add_channels(local, webhook, mailbox)
     with local.database.writing() as connection:
         publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
     [action] = local.read(list_automation_actions, ActionFilter()).items
