@@ -11,7 +11,8 @@ from lunar.compressed import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
 from lunar.messages.horizons import is_horizons, parse_horizons
-from lunar.messages.oem import parse_oem
+from lunar.messages.kvn import Lines, numbered_lines
+from lunar.messages.oem import parse_oem_lines
 from lunar.messages.oem_xml import parse_oem_xml
 from lunar.messages.stk import parse_stk
 
@@ -19,7 +20,7 @@ EXPECTED = "a CCSDS OEM, STK .e or Horizons ephemeris"
 SPK_MARK = b"DAF/SPK"
 OCTETS_LIMIT = 96 << 20
 LINES_LIMIT = 1_000_000
-"""Limits of a file: a year of states each minute has 60 MB, and reading it takes 400 MB of memory."""
+"""Limits of a file: a year of states each minute has 60 MB, and reading it takes 280 MB of memory."""
 
 _FIRST = "CCSDS_OEM_VERS, stk.v., XML or a Horizons table"
 
@@ -46,10 +47,11 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
         raise DataFileError(path, f"octet {error.start}", EXPECTED, "octets that are no text") from None
     if text.lstrip()[:1] == "<":
         return parse_oem_xml(octets, source=str(path))
-    for line in text.split("\n", 50)[:50]:
-        word = line.strip()
+    for word in map(str.strip, text.split("\n", 50)[:50]):
         if word.startswith("CCSDS_OEM_VERS"):
-            return parse_oem(text, source=str(path))
+            reader = Lines(numbered_lines(text), str(path))
+            del octets, text  # the largest part of the memory
+            return parse_oem_lines(reader)
         if word.lower().startswith("stk.v"):
             return parse_stk(text, source=str(path))
         if word and not word.startswith(("COMMENT", "#")):

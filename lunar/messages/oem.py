@@ -220,7 +220,7 @@ def _read_states(reader: Lines, system: str) -> tuple[IntArray, FloatArray, int]
         # The reader of numpy takes epochs and numbers in one go; what it refuses is gone through line by line.
         with suppress(ValueError):
             table = np.loadtxt(
-                rows, dtype=[("epoch", "U40"), ("state", "f8", width - 1)], comments=None, ndmin=1
+                rows, dtype=[("epoch", "S40"), ("state", "f8", width - 1)], comments=None, ndmin=1
             )
     if table is None:
         for k, row in enumerate(rows):
@@ -241,15 +241,16 @@ def _read_states(reader: Lines, system: str) -> tuple[IntArray, FloatArray, int]
     return to_utc_ns(_epochs(reader, table["epoch"], begin), system), numbers, begin
 
 
-def _epochs(reader: Lines, texts: NDArray[np.str_], begin: int) -> IntArray:
+def _epochs(reader: Lines, texts: NDArray[np.bytes_], begin: int) -> IntArray:
     # numpy reads calendar dates in one go; other notations and faults go through the slow reader, which names the line.
-    if np.all(np.strings.endswith(texts, "Z")):
-        texts = np.strings.rstrip(texts, "Z")
-    if texts[0][4:5] == "-" and texts[0][7:8] == "-":
+    if np.all(np.strings.endswith(texts, b"Z")):
+        texts = np.strings.rstrip(texts, b"Z")
+    if texts[0][4:5] == b"-" and texts[0][7:8] == b"-":
         with suppress(ValueError):
             return texts.astype("datetime64[ns]").astype(np.int64)
     return np.array(
-        [reader.epoch(str(text), "UTC", begin + k) for k, text in enumerate(texts)], dtype=np.int64
+        [reader.epoch(text.decode("latin-1"), "UTC", begin + k) for k, text in enumerate(texts)],
+        dtype=np.int64,
     )
 
 
@@ -262,17 +263,17 @@ def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], begin:
             format_utc(int(utc_ns[k + 1]), 6),
             begin + k + 1,
         )
-    # START_TIME and STOP_TIME may be rounded: a millisecond of grace.
-    outside = np.flatnonzero((utc_ns < times["START_TIME"] - 10**6) | (utc_ns > times["STOP_TIME"] + 10**6))
+    start_ns, stop_ns, grace_ns = times["START_TIME"], times["STOP_TIME"], 10**6  # Both may be rounded.
+    outside = np.flatnonzero((utc_ns < start_ns - grace_ns) | (utc_ns > stop_ns + grace_ns))
     if outside.size:
-        span = f"{format_utc(times['START_TIME'])}..{format_utc(times['STOP_TIME'])} (START_TIME..STOP_TIME)"
+        span = f"{format_utc(start_ns)}..{format_utc(stop_ns)} (START_TIME..STOP_TIME)"
         k = int(outside[0])
         raise reader.error(f"an epoch within {span}", format_utc(int(utc_ns[k])), begin + k)
-    if times["STOP_TIME"] > utc_ns[-1] + 10**6 or times["START_TIME"] < utc_ns[0] - 10**6:
-        side, key = (-1, "STOP_TIME") if times["STOP_TIME"] > utc_ns[-1] + 10**6 else (0, "START_TIME")
-        word = "last" if side else "first"
+    is_cut = stop_ns > utc_ns[-1] + grace_ns
+    if is_cut or start_ns < utc_ns[0] - grace_ns:
+        side, key = (-1, "STOP_TIME") if is_cut else (0, "START_TIME")
         raise reader.error(
-            f"a {word} state at {key} = {format_utc(times[key])}",
+            f"a {'last' if side else 'first'} state at {key} = {format_utc(times[key])}",
             f"{format_utc(int(utc_ns[side]))}; the segment is cut short",
             begin + (len(utc_ns) - 1 if side else 0),
         )
@@ -286,25 +287,21 @@ def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], begin:
         )
 
 
-def _read_covariances(reader: Lines, system: str, segment_frame: str) -> Iterator[Covariance]:
+def _read_covariances(reader: Lines, system: str, frame: str) -> Iterator[Covariance]:
     """Yield the covariances of the block that the next line opens, if it opens one."""
-    trailing = list(reader.comments())
-    del trailing  # Comments after the states belong to nothing that is kept.
+    list(reader.comments())  # Comments after the states belong to nothing that is kept.
     if reader.peek() != "COVARIANCE_START":
         return
     reader.take()
     # A frame holds until the next is named; without any, the covariance is in the frame of the segment.
-    frame = segment_frame
     while True:
-        for _ in reader.comments():
-            pass
+        list(reader.comments())
         if reader.peek() == "COVARIANCE_STOP":
             reader.take()
             return
         _, value = reader.keyword(("EPOCH",))
         epoch = reader.epoch(value, system)
-        for _ in reader.comments():
-            pass
+        list(reader.comments())
         if (reader.peek() or "").startswith("COV_REF_FRAME"):
             _, frame = reader.keyword(("COV_REF_FRAME",))
         values: list[float] = []
