@@ -163,7 +163,7 @@ def cli_page() -> str:
         "|---|---|---|",
         '| bash | `~/.bashrc` | `eval "$(linna completion bash)"` |',
         '| zsh, after `compinit` | `~/.zshrc` | `eval "$(linna completion zsh)"` |',
-        "| fish | `~/.config/fish/config.fish` | `linna completion fish \\| source` |",
+        "| fish | `~/.config/fish/config.fish` | <code>linna completion fish &#124; source</code> |",
     ]
     for group in GROUPS:
         importlib.import_module(f"linna.commands.{GROUPS[group][0]}")
