@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import re
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -265,139 +266,35 @@ def test_the_description_is_complete(client: TestClient) -> None:
             assert "application/problem+json" in json.dumps(operation["responses"]["422"])
 
 
-# Every operation, and the lowest role that may do it.
-MATRIX = [
-    ("GET", "/users", "admin"),
-    ("POST", "/users", "admin"),
-    ("GET", "/users/nobody", "admin"),
-    ("PATCH", "/users/nobody", "admin"),
-    ("POST", "/users/nobody/tokens", "admin"),
-    ("GET", "/tokens", "admin"),
-    ("DELETE", "/tokens/999", "admin"),
-    ("GET", "/audit", "operator"),
-    ("GET", "/audit/head", "operator"),
-    ("GET", "/status", "viewer"),
-    ("GET", "/ephemerides", "viewer"),
-    ("POST", "/ephemerides", "operator"),
-    ("POST", "/telemetry", "operator"),
-    ("POST", "/archives", "operator"),
-    ("GET", "/ingests", "viewer"),
-    ("GET", "/ingests/1", "viewer"),
-    ("GET", "/missions", "viewer"),
-    ("POST", "/missions", "operator"),
-    ("GET", "/missions/00000000", "viewer"),
-    ("GET", "/passes", "viewer"),
-    ("POST", "/passes", "operator"),
-    ("GET", "/passes/1", "viewer"),
-    ("GET", "/passes/1/summary", "viewer"),
-    ("GET", "/passes/1/completeness", "viewer"),
-    ("GET", "/passes/1/detections", "viewer"),
-    ("GET", "/passes/1/states", "viewer"),
-    ("GET", "/passes/1/events", "viewer"),
-    ("GET", "/passes/1/telemetry/power_w", "viewer"),
-    ("GET", "/passes/1/parameters", "viewer"),
-    ("GET", "/passes/1/craters", "viewer"),
-    ("GET", "/events", "viewer"),
-    ("GET", "/passes/1/reports", "viewer"),
-    ("GET", "/passes/1/packets/housekeeping", "viewer"),
-    ("POST", "/passes/1/reports", "operator"),
-    ("GET", "/spacecraft/76/telemetry/power_w", "viewer"),
-    ("GET", "/spacecraft/76/trends", "viewer"),
-    ("GET", "/spacecraft/76/parameters", "viewer"),
-    ("GET", "/spacecraft/76/images", "viewer"),
-    ("GET", "/spacecraft/76/thumbnails/1", "viewer"),
-    ("GET", "/passes/1/images/1", "viewer"),
-    ("GET", "/spacecraft/76/correlations", "viewer"),
-    ("POST", "/spacecraft/76/correlations", "operator"),
-    ("POST", "/spacecraft/76/correlations/run", "operator"),
-    ("POST", "/spacecraft/76/receptions", "operator"),
-    ("GET", "/spacecraft/76/time-reports", "viewer"),
-    ("GET", "/spacecraft/76/uplink", "viewer"),
-    ("POST", "/windows/search", "viewer"),
-    ("GET", "/plan/forecast", "viewer"),
-    ("GET", "/plan/crater-density", "viewer"),
-    ("GET", "/displays", "viewer"),
-    ("GET", "/displays/mine", "viewer"),
-    ("PUT", "/displays/mine", "operator"),
-    ("DELETE", "/displays/mine", "operator"),
-    ("GET", "/windows", "viewer"),
-    ("POST", "/windows", "operator"),
-    ("GET", "/windows/1", "viewer"),
-    ("PATCH", "/windows/1", "operator"),
-    ("DELETE", "/windows/1", "operator"),
-    ("POST", "/windows/1/uplink", "operator"),
-    ("GET", "/builds", "viewer"),
-    ("POST", "/builds", "operator"),
-    ("POST", "/builds/current", "operator"),
-    ("DELETE", "/ephemerides/1", "operator"),
-    ("GET", "/regression-archives", "viewer"),
-    ("POST", "/regression-archives", "operator"),
-    ("PATCH", f"/regression-archives/{'0' * 64}", "operator"),
-    ("DELETE", "/regression-archives", "operator"),
-    ("POST", f"/regression-archives/{'0' * 64}/frames", "operator"),
-    ("POST", "/passes/1/regression-archive", "operator"),
-    ("GET", "/spacecraft/76/performance", "viewer"),
-    ("POST", "/spacecraft/76/monthly-reports/2029-08", "operator"),
-    ("GET", "/monthly-reports", "viewer"),
-    ("GET", f"/monthly-reports/{'0' * 32}", "viewer"),
-    ("POST", "/analyses", "operator"),
-    ("GET", "/regressions", "viewer"),
-    ("POST", "/regressions", "operator"),
-    ("GET", f"/regressions/{'0' * 32}", "viewer"),
-    ("GET", f"/regressions/{'0' * 32}/report", "viewer"),
-    ("GET", "/telecommands", "viewer"),
-    ("POST", "/telecommands", "operator"),
-    ("GET", "/telecommands/1", "viewer"),
-    ("POST", "/telecommands/1/release", "operator"),
-    ("POST", "/telecommands/1/reject", "operator"),
-    ("POST", "/uplink", "operator"),
-    ("GET", "/spacecraft", "viewer"),
-    ("GET", "/parameters", "viewer"),
-    ("GET", "/catalogues", "viewer"),
-    ("POST", "/catalogues", "operator"),
-    ("DELETE", f"/catalogues/{'0' * 64}", "operator"),
-    ("GET", "/landmarks", "viewer"),
-    ("GET", "/landmarks/1", "viewer"),
-    ("POST", "/landmarks/1/accept", "operator"),
-    ("POST", "/landmarks/1/reject", "operator"),
-    ("POST", "/passes/1/landmarks", "operator"),
-    ("GET", "/automation/rules", "viewer"),
-    ("GET", "/automation/actions", "viewer"),
-    ("POST", "/automation/actions/1/approve", "operator"),
-    ("POST", "/automation/actions/1/refuse", "operator"),
-    ("POST", "/automation/actions/1/repeat", "operator"),
-    ("GET", "/exports/formats", "viewer"),
-    ("POST", "/exports", "viewer"),
-    ("GET", "/session", "viewer"),
-    ("DELETE", "/session", "viewer"),
-    ("GET", "/reports", "viewer"),
-    ("GET", "/alarms", "viewer"),
-    ("GET", "/alarms/1", "viewer"),
-    ("POST", "/alarms/1/acknowledge", "operator"),
-    ("POST", "/alarms/1/shelve", "operator"),
-    ("GET", "/requests", "viewer"),
-    ("POST", "/requests", "operator"),
-    ("GET", "/requests/1", "viewer"),
-    ("PATCH", "/requests/1", "operator"),
-    ("DELETE", "/requests/1", "operator"),
-    ("GET", "/requests/1/plan", "viewer"),
-    ("GET", "/links", "viewer"),
-    ("GET", "/links/canberra", "viewer"),
-    ("POST", "/links/canberra/send", "operator"),
-    ("GET", "/contacts", "viewer"),
-    ("GET", "/jobs", "viewer"),
-    ("GET", f"/jobs/{'0' * 32}", "viewer"),
-    ("POST", f"/jobs/{'0' * 32}/repeat", "operator"),
-    ("GET", f"/reports/{'0' * 32}", "viewer"),
-    ("GET", f"/reports/{'0' * 32}/summary", "viewer"),
-    ("GET", f"/reports/{'0' * 32}/overview", "viewer"),
-]
+# Viewers read and operators do everything else, except these.
+EXCEPTIONS = {
+    ("GET", "/audit"): "operator",
+    ("GET", "/audit/head"): "operator",
+    ("GET", "/users"): "admin",
+    ("POST", "/users"): "admin",
+    ("GET", "/users/{name}"): "admin",
+    ("PATCH", "/users/{name}"): "admin",
+    ("POST", "/users/{name}/tokens"): "admin",
+    ("GET", "/tokens"): "admin",
+    ("DELETE", "/tokens/{token_id}"): "admin",
+    ("POST", "/exports"): "viewer",
+    ("POST", "/windows/search"): "viewer",
+    ("DELETE", "/session"): "viewer",
+}
 
 
 def test_every_operation_asks_for_its_role(guarded: tuple[TestClient, dict[str, str]]) -> None:
     client, tokens = guarded
     ranks = ["viewer", "operator", "admin"]
-    for method, path, lowest in MATRIX:
+    described = client.get(
+        f"{V1}/openapi.json", headers={"Authorization": f"Bearer {tokens['viewer']}"}
+    ).json()
+    operations = {(m.upper(), p.removeprefix(V1)) for p, verbs in described["paths"].items() for m in verbs}
+    operations.remove(("POST", "/session"))  # whose token is in the body
+    assert len(operations) > 60 and operations >= set(EXCEPTIONS)
+    for method, template in sorted(operations):
+        lowest = EXCEPTIONS.get((method, template), "viewer" if method == "GET" else "operator")
+        path = re.sub(r"\{\w+\}", "999", template)
         assert is_problem(client.request(method, V1 + path), 401), path
         assert is_problem(client.request(method, V1 + path, headers={"Authorization": "Bearer x"}), 401), path
         for role in ranks:
@@ -408,26 +305,6 @@ def test_every_operation_asks_for_its_role(guarded: tuple[TestClient, dict[str, 
                 assert status == 403, (path, role)
             else:
                 assert status not in (401, 403), (path, role)
-
-
-def test_the_matrix_above_names_every_operation(client: TestClient) -> None:
-    document = client.get(f"{V1}/openapi.json").json()
-    described = {
-        (m.upper(), p.removeprefix(V1)) for p, operations in document["paths"].items() for m in operations
-    } - {("POST", "/session")}  # whose token is in the body
-
-    def template(path: str) -> tuple[str, ...]:
-        parts = path.split("/")
-        return tuple(
-            p
-            for p in {p for _, p in described}
-            if len(p.split("/")) == len(parts)
-            and all(a == b or a.startswith("{") for a, b in zip(p.split("/"), parts, strict=True))
-        )
-
-    named = [(method, p) for method, path, _ in MATRIX for p in template(path) if (method, p) in described]
-    assert sorted(named) == sorted(described)
-    assert len(MATRIX) == len(described)
 
 
 def test_what_happens_is_sent_live_and_can_be_caught_up_with(
@@ -611,10 +488,11 @@ def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client: 
             assert answers[0].headers.get(name) == answers[1].headers.get(name)
 
 
-def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
+def test_figures_of_work_that_is_over_go_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from ground_service.jobs.service import enter_job
     from ground_service.worker.jobs import run_job
 
+    monkeypatch.setattr("ground_service.worker.scheduler.TICK_S", 600.0)  # it would take the job up
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
         ground = opened.app.state.ground
         job = enter_job(ground, "report", {"pass_id": 1})

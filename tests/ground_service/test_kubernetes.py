@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import kubernetes_validate
 import pytest
 import yaml
 from sqlalchemy import make_url
@@ -49,6 +48,8 @@ def test_every_file_is_part_of_the_base() -> None:
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("resource", [one for one in RESOURCES if one["kind"] != "Cluster"], ids=name_of)
 def test_a_resource_is_valid(resource: dict[str, Any], version: str) -> None:
+    import kubernetes_validate
+
     kubernetes_validate.validate(resource, version, strict=True)
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import erfa
 import numpy as np
-import pymap3d
 import pytest
 import spiceypy
 from hypothesis import given
@@ -139,6 +138,8 @@ def test_the_frame_bias_of_j2000_is_that_of_erfa():
 
 @given(latitudes, longitudes)
 def test_enu_is_that_of_pymap3d_on_a_sphere(latitude, longitude):
+    import pymap3d
+
     ball = pymap3d.Ellipsoid(MOON_RADIUS_M, MOON_RADIUS_M)
     place = mcmf_from_spherical(latitude, longitude)
     beyond = place + np.array([300.0, -200.0, 500.0])

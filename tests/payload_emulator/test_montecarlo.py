@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from lunar.datafolder import DataFolder
 from lunar.frames import rtn_from_inertial
@@ -122,18 +122,15 @@ def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(
     assert result.anees > 10.0
 
 
-@pytest.mark.parametrize("noise_deg, limit_m", [(0.2, 100.0), (1.0, 130.0)])
-def test_an_attitude_of_a_degree_neither_diverges_nor_lies(
-    navigation_case: Any, noise_deg: float, limit_m: float
-) -> None:
+def test_an_attitude_of_a_degree_neither_diverges_nor_lies(navigation_case: Any) -> None:
     # A wide field of view sees its own attitude: with known errors of the sensor (single frame, 20 craters, 30 km) the
-    # place is worse by 1.4 at 0.2 degrees and by 1.8 without any attitude; a filter has 93 m (median) at 1 degree.
-    noise = float(np.radians(noise_deg))
+    # place is worse by 1.8 without any attitude; a filter has 93 m (median) at 1 degree.
+    noise = float(np.radians(1.0))
     parameters = replace(PARAMETERS, errors=replace(PARAMETERS.errors, attitude_noise_rad=noise))
     case = navigation_case(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
     runs = [fly(case, seed) for seed in (21, 22, 23, 24)]
     result = consistency(runs)
-    assert result.median_m <= limit_m
+    assert result.median_m <= 130.0
     assert result.largest_m <= 500.0
     assert result.fixed_share >= 0.95
     assert result.wrong_share <= 0.01
@@ -162,11 +159,8 @@ def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(
     assert np.all(run.error_m[58:] < 500.0)
 
 
-@pytest.mark.parametrize("distance_m", [20_000.0, 50_000.0])
-def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(
-    navigation_case: Any, distance_m: float
-) -> None:
-    case = navigation_case(40, kidnap=Kidnap(25, distance_m, announced=True), parameters=PARAMETERS)
+def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(navigation_case: Any) -> None:
+    case = navigation_case(40, kidnap=Kidnap(25, 50_000.0, announced=True), parameters=PARAMETERS)
     run = fly(case, 4)
     assert np.all(run.error_m[29:] < 500.0)
 
@@ -196,7 +190,7 @@ def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(navigation_case: Any
 
 def test_false_detections_alone_give_no_fix(navigation_case: Any) -> None:
     blind = SimulatedDetector(recall=(0.0, 0.0, 0.0, 0.0), precision=0.06)
-    for sigma, frames in ((100.0, 60), (10_000.0, 12)):
+    for sigma, frames in ((100.0, 60), (10_000.0, 6)):
         case = navigation_case(
             frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1, parameters=PARAMETERS
         )
@@ -235,7 +229,7 @@ def shipped_consistency(case: Any) -> Consistency:
 def test_the_shipped_filter_knows_its_errors(shipped: Any) -> None:
     result = shipped_consistency(shipped)
     # Errors that last count once a run: chi-square of 4 x 6 degrees over 4, from SciPy.
-    low, high = np.array(chi2.ppf([0.025, 0.975], 6 * SHIPPED_RUNS)) / SHIPPED_RUNS
+    low, high = chdtri(6 * SHIPPED_RUNS, np.array([0.975, 0.025])) / SHIPPED_RUNS
     assert low <= result.anees <= high
     assert 0.85 <= result.nis_per_degree <= 1.15
     assert result.fixed_share >= 0.95 and result.wrong_share <= 0.01
@@ -249,7 +243,7 @@ def test_a_filter_that_leaves_out_what_detections_share_is_found_out_by_its_erro
         detector=replace(shipped.detector, bias_sigma_px=0.25),
     )
     runs = [fly(case, seed) for seed in (31, 32)]
-    assert consistency(runs, settle_frames=40).anees > chi2.ppf(0.975, 12) / 2.0
+    assert consistency(runs, settle_frames=40).anees > chdtri(12, 0.025) / 2.0
 
 
 def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle() -> None:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from reports.figures.canvas import TimeScale, thinned
 from reports.figures.navigation import zoom_span
@@ -26,6 +25,8 @@ from reports.values import NavigationSeries, NavigationStatistics, TimeSpan, Tra
 @pytest.mark.parametrize("dof", [1, 2, 3, 12, 60, 400])
 @pytest.mark.parametrize("probability", [0.025, 0.5, 0.975])
 def test_chi_squared_quantiles_are_those_of_scipy(dof: int, probability: float) -> None:
+    from scipy import stats
+
     expected = float(stats.chi2.ppf(probability, dof))
     assert float(chi2_quantile(probability, dof)) == pytest.approx(expected, rel=1e-9)
 

@@ -25,15 +25,19 @@ from tmtc.downlink import (
 from tmtc.errors import LinkFormatError
 from tmtc.packets import pack_packet
 
-PACKETS = make_packets(1500, seed=5)
 SETTINGS = LinkSettings()
 ZONE = 1115 - 6 - 2
 
 
 @functools.cache
+def sent() -> list[bytes]:
+    return make_packets(1500, seed=5)
+
+
+@functools.cache
 def cadus() -> np.ndarray:
     """Return the undamaged stream, one CADU per row."""
-    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    octets = encode_cadus(sent(), spacecraft_id=76)
     return np.frombuffer(octets, dtype=np.uint8).reshape(-1, SETTINGS.cadu_length)
 
 
@@ -46,7 +50,7 @@ def with_bit_errors(rows: np.ndarray, rate: float, seed: int) -> np.ndarray:
 def packets_within(received: set[int]) -> list[bytes]:
     """Return the packets whose frames were all received."""
     at, whole = 0, []
-    for packet in PACKETS:
+    for packet in sent():
         frames = range(at // ZONE, (at + len(packet) - 1) // ZONE + 1)
         if received.issuperset(frames):
             whole.append(packet)
@@ -76,14 +80,14 @@ def test_weak_frames_at_the_start_hide_neither_the_settings_nor_the_rest(weak):
 @pytest.mark.parametrize("octets", [77_000, 79_000, 3_000_000])
 def test_noise_before_the_first_frame_hides_nothing(octets):
     noise = np.random.default_rng(octets).integers(0, 256, octets, dtype=np.uint8)
-    decoded = check(np.concatenate((noise, cadus().reshape(-1))), PACKETS)
+    decoded = check(np.concatenate((noise, cadus().reshape(-1))), sent())
     assert decoded.octets["unsynchronised"] == octets
 
 
 @pytest.mark.parametrize("rate", [0.0, 2e-3])
 def test_a_station_header_before_each_frame_is_told_from_the_frame(rate):
     header = np.random.default_rng(8).integers(0, 256, (len(cadus()), 8), dtype=np.uint8)
-    decoded = check(np.hstack((header, with_bit_errors(cadus(), rate, seed=9))), PACKETS)
+    decoded = check(np.hstack((header, with_bit_errors(cadus(), rate, seed=9))), sent())
     assert decoded.settings is not None and decoded.settings.coding == "rs"
     assert (decoded.symbols_corrected > 0) == (rate > 0)
 
@@ -93,7 +97,7 @@ def test_gaps_of_any_length_between_frames_cost_nothing():
     parts = []
     for row in cadus():
         parts += [rng.integers(0, 256, int(rng.integers(0, 60)), dtype=np.uint8), row]
-    check(np.concatenate(parts), PACKETS)
+    check(np.concatenate(parts), sent())
 
 
 @pytest.mark.parametrize(("rate", "seed"), [(2e-2, 0), (3e-2, 1)])
@@ -106,9 +110,9 @@ def test_frames_that_no_code_can_repair_are_never_good(rate, seed):
 
 
 def test_a_frame_without_code_and_checksum_is_unchecked_and_never_good():
-    octets = encode_cadus(PACKETS, spacecraft_id=76, coding="none", checksum=False)
+    octets = encode_cadus(sent(), spacecraft_id=76, coding="none", checksum=False)
     decoded = decode(octets)
-    assert decoded.frames is not None and decoded.packets == len(PACKETS)
+    assert decoded.frames is not None and decoded.packets == len(sent())
     assert set(decoded.frames.verdict.tolist()) == {FRAME_UNCHECKED}
     assert decoded.accounting()["frames_unchecked"] == decoded.frame_count
 
@@ -124,7 +128,7 @@ def test_noise_is_never_a_frame_or_a_packet(seed):
 
 
 def test_every_frame_twice_gives_every_packet():
-    decoded = check(np.repeat(cadus(), 2, axis=0), PACKETS)
+    decoded = check(np.repeat(cadus(), 2, axis=0), sent())
     assert (decoded.frames_lost, decoded.sequence.missing, decoded.sequence.conflicts) == (0, 0, 0)
 
 
@@ -138,20 +142,20 @@ def test_two_receivers_with_losses_give_the_union():
 
 
 def test_odd_frames_followed_by_even_frames_give_every_packet():
-    decoded = check(np.concatenate((cadus()[1::2], cadus()[0::2])), PACKETS)
+    decoded = check(np.concatenate((cadus()[1::2], cadus()[0::2])), sent())
     assert (decoded.frames_lost, decoded.sequence.missing) == (0, 0)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_frames_in_any_order_give_every_packet(seed):
     order = np.random.default_rng(seed).permutation(len(cadus()))
-    decoded = check(cadus()[order], PACKETS)
+    decoded = check(cadus()[order], sent())
     assert decoded.frames_lost == 0
 
 
 def test_copies_of_frames_of_a_long_packet_are_combined():
     long = append_crc(pack_packet(0x55, bytes(range(256)) * 24, sequence_count=3)[:-2])
-    octets = DownlinkEncoder(5, LinkSettings(frame_length=223)).encode([*PACKETS[:3], long, *PACKETS[3:6]])
+    octets = DownlinkEncoder(5, LinkSettings(frame_length=223)).encode([*sent()[:3], long, *sent()[3:6]])
     rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, 259)
     mixed = np.concatenate((rows[:5], rows[9:14], rows[4:10], rows[14:], rows[2:7]))
     decoded = decode(mixed.tobytes())
@@ -168,7 +172,7 @@ def test_bit_slips_cost_only_the_frames_they_hit():
 
 
 def test_an_inverted_stream_is_read():
-    check(255 - cadus(), PACKETS)
+    check(255 - cadus(), sent())
 
 
 def test_foreign_packets_are_not_ordered_by_a_time_they_do_not_carry():

@@ -1,5 +1,7 @@
 """The whole chain, packets to CADUs and back, under every setting and every injury."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -53,7 +55,9 @@ def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> 
     return packets
 
 
-PACKETS = make_packets(200)
+@functools.cache
+def sent() -> list[bytes]:
+    return make_packets(200)
 
 
 def assert_all_octets_are_accounted_for(octets, decoded) -> None:
@@ -67,7 +71,7 @@ def assert_all_octets_are_accounted_for(octets, decoded) -> None:
 @pytest.mark.parametrize("frame_length", [223, 892, 1000, 1115])
 def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, coding, checksum, frame_length):
     octets = encode_cadus(
-        PACKETS,
+        sent(),
         spacecraft_id=76,
         frame_length=frame_length,
         coding=coding,
@@ -75,7 +79,7 @@ def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, codi
         checksum=checksum,
     )
     decoded = decode(octets)
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
     assert decoded.spacecraft_id == 76 and decoded.complete
     assert decoded.settings.coding == coding and decoded.settings.frame_length == frame_length
     assert decoded.settings.randomiser == randomiser
@@ -94,34 +98,34 @@ def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave)
         dual_basis=dual_basis,
         randomiser="long",
     )
-    octets = DownlinkEncoder(5, wanted).encode(PACKETS)
+    octets = DownlinkEncoder(5, wanted).encode(sent())
     decoded = decode(octets)
     assert decoded.settings == wanted
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
 
 
 def test_a_cadu_of_the_default_link_is_1279_octets():
-    octets = encode_cadus(PACKETS[:1], spacecraft_id=76)
+    octets = encode_cadus(sent()[:1], spacecraft_id=76)
     assert len(octets) == 1279 and octets[:4] == ASM
 
 
 def test_frames_are_what_spacepackets_reads():
     octets = encode_cadus(
-        PACKETS[:40], spacecraft_id=76, virtual_channel=2, coding="none", randomiser="none", frame_length=512
+        sent()[:40], spacecraft_id=76, virtual_channel=2, coding="none", randomiser="none", frame_length=512
     )
     frames = [octets[at + 4 : at + 516] for at in range(0, len(octets), 516)]
     theirs = [TmTransferFrame.unpack(frame, 512, has_error_control_field=True) for frame in frames]
     assert [f.primary_header.vc_frame_count for f in theirs] == list(range(len(frames)))
     assert {f.primary_header.vc_id for f in theirs} == {2}
     stream = b"".join(bytes(f.data_field) for f in theirs)
-    assert stream.startswith(b"".join(PACKETS[:40]))
+    assert stream.startswith(b"".join(sent()[:40]))
 
 
 def test_a_file_of_bare_packets_is_recognised():
-    octets = b"".join(PACKETS)
+    octets = b"".join(sent())
     decoded = decode(octets)
     assert decoded.settings is None and decoded.frames is None
-    assert decoded.packets == len(PACKETS) and decoded.complete
+    assert decoded.packets == len(sent()) and decoded.complete
     assert decoded.by_apid == {0xA0: 20, 0xA1: 200, 0xA4: 200}
     assert_all_octets_are_accounted_for(octets, decoded)
 
@@ -136,7 +140,7 @@ def test_packets_longer_than_frames_span_them():
     long = [pack_packet(0x7A, bytes(5000) + b"\0\0", sequence_count=0)]
     from tmtc.crc import append_crc
 
-    packets = [append_crc(p[:-2]) for p in long] + PACKETS[:3]
+    packets = [append_crc(p[:-2]) for p in long] + sent()[:3]
     decoded = decode(encode_cadus(packets, spacecraft_id=1, frame_length=223))
     assert list(decoded.cut.packets(decoded.buffer)) == packets
 
@@ -155,21 +159,21 @@ def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
 
 def test_counts_go_on_from_one_dump_to_the_next_and_past_255():
     encoder = DownlinkEncoder(76, LinkSettings(frame_length=64, coding="none"))
-    octets = b"".join(encoder.encode(PACKETS[k : k + 7]) for k in range(0, len(PACKETS), 7))
+    octets = b"".join(encoder.encode(sent()[k : k + 7]) for k in range(0, len(sent()), 7))
     decoded = decode(octets)
     assert decoded.frame_count > 256 and decoded.frames_lost == 0
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
 
 
 def test_virtual_channels_are_rebuilt_apart_and_idle_frames_are_counted():
     encoder = DownlinkEncoder(76)
     octets = b""
-    for k in range(0, len(PACKETS), 20):
-        octets += encoder.encode(PACKETS[k : k + 10], virtual_channel=0)
+    for k in range(0, len(sent()), 20):
+        octets += encoder.encode(sent()[k : k + 10], virtual_channel=0)
         octets += encoder.idle(2)
-        octets += encoder.encode(PACKETS[k + 10 : k + 20], virtual_channel=1)
+        octets += encoder.encode(sent()[k + 10 : k + 20], virtual_channel=1)
     decoded = decode(octets)
-    assert sorted(decoded.cut.packets(decoded.buffer)) == sorted(PACKETS)
+    assert sorted(decoded.cut.packets(decoded.buffer)) == sorted(sent())
     assert decoded.complete and decoded.octets["idle_frames"] == 2 * 21 * 1107
     assert_all_octets_are_accounted_for(octets, decoded)
 
@@ -177,39 +181,39 @@ def test_virtual_channels_are_rebuilt_apart_and_idle_frames_are_counted():
 def test_the_command_link_control_word_comes_down_with_each_frame():
     clcw = Clcw(3, 9, retransmit=True)
     encoder = DownlinkEncoder(76)
-    octets = encoder.encode(PACKETS, clcw=pack_clcw(clcw)) + encoder.idle(1, clcw=pack_clcw(clcw))
+    octets = encoder.encode(sent(), clcw=pack_clcw(clcw)) + encoder.idle(1, clcw=pack_clcw(clcw))
     decoded = decode(octets)
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
     assert {unpack_clcw(int(word).to_bytes(4, "big")) for word in decoded.frames.clcw} == {clcw}
 
 
 def test_each_frame_carries_the_control_word_of_the_last_packet_that_began():
     settings = LinkSettings()
     encoder = DownlinkEncoder(76, settings)
-    clcws = [pack_clcw(Clcw(0, k & 0xFF, farm_b_counter=k >> 8)) for k in range(len(PACKETS))]
-    octets = encoder.encode(PACKETS, clcw=clcws)
+    clcws = [pack_clcw(Clcw(0, k & 0xFF, farm_b_counter=k >> 8)) for k in range(len(sent()))]
+    octets = encoder.encode(sent(), clcw=clcws)
     decoded = decode(octets)
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS and decoded.complete
+    assert list(decoded.cut.packets(decoded.buffer)) == sent() and decoded.complete
     zone = settings.frame_length - 6 - 4 - 2
-    starts = np.concatenate(([0], np.cumsum([len(packet) for packet in PACKETS])[:-1]))
+    starts = np.concatenate(([0], np.cumsum([len(packet) for packet in sent()])[:-1]))
     for frame, word in enumerate(decoded.frames.clcw):
         begun = int(np.count_nonzero(starts < (frame + 1) * zone)) - 1
         assert int(word).to_bytes(4, "big") == clcws[begun]
     with pytest.raises(ValueRefused, match="one for each packet"):
-        encoder.encode(PACKETS, clcw=clcws[1:])
+        encoder.encode(sent(), clcw=clcws[1:])
     with pytest.raises(ValueRefused, match="4 octets"):
-        encoder.encode(PACKETS[:1], clcw=b"\x01\x00\x00")
+        encoder.encode(sent()[:1], clcw=b"\x01\x00\x00")
 
 
 def test_frames_with_and_without_control_words_are_read_from_one_stream():
     encoder = DownlinkEncoder(76)
-    octets = encoder.encode(PACKETS[:50]) + encoder.encode(PACKETS[50:], clcw=pack_clcw(Clcw(0, 5)))
+    octets = encoder.encode(sent()[:50]) + encoder.encode(sent()[50:], clcw=pack_clcw(Clcw(0, 5)))
     decoded = decode(octets)
-    assert sorted(decoded.cut.packets(decoded.buffer)) == sorted(PACKETS) and decoded.complete
+    assert sorted(decoded.cut.packets(decoded.buffer)) == sorted(sent()) and decoded.complete
     assert_all_octets_are_accounted_for(octets, decoded)
     (seen,) = decoded.uplink
     assert 0 < seen.frames < decoded.frame_count and seen.report_value == 5 and seen.changes == 0
-    assert decode(encoder.encode(PACKETS)).uplink == ()
+    assert decode(encoder.encode(sent())).uplink == ()
 
 
 # injuries of the link
@@ -221,9 +225,9 @@ def frame_of(octets: bytes, settings: LinkSettings, k: int) -> slice:
 
 def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
     settings = LinkSettings()
-    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    octets = encode_cadus(sent(), spacecraft_id=76)
     spans, at = [], 0
-    for packet in PACKETS:
+    for packet in sent():
         spans.append((at // 1107, (at + len(packet) - 1) // 1107))
         at += len(packet)
     lost = 5
@@ -232,7 +236,7 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
         octets[: frame_of(octets, settings, lost).start] + octets[frame_of(octets, settings, lost).stop :]
     )
     decoded = decode(damaged)
-    assert list(decoded.cut.packets(decoded.buffer)) == [p for k, p in enumerate(PACKETS) if k not in hit]
+    assert list(decoded.cut.packets(decoded.buffer)) == [p for k, p in enumerate(sent()) if k not in hit]
     assert decoded.frames_lost == 1 and decoded.frames_bad == 0
     assert decoded.sequence.missing == len(hit)
     assert_all_octets_are_accounted_for(damaged, decoded)
@@ -240,7 +244,7 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
 
 def test_frames_that_come_twice_or_late_are_not_lost():
     settings = LinkSettings()
-    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    octets = encode_cadus(sent(), spacecraft_id=76)
     frames = [octets[k : k + settings.cadu_length] for k in range(0, len(octets), settings.cadu_length)]
     again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
     assert decode(b"".join(again)).frames_lost == 0
@@ -250,7 +254,7 @@ def test_frames_that_come_twice_or_late_are_not_lost():
 
 
 def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
-    octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76))
+    octets = bytearray(encode_cadus(sent(), spacecraft_id=76))
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
     decoded = decode(bytes(octets))
     assert decoded.frames_bad == 1 and decoded.frames.verdict[5] == FRAME_UNCORRECTABLE
@@ -259,28 +263,28 @@ def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
 
 
 def test_correctable_errors_cost_nothing_and_are_counted():
-    octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76))
+    octets = bytearray(encode_cadus(sent(), spacecraft_id=76))
     for frame in (1, 3):
         for k in range(16 * 5):  # sixteen errors in each of the five codewords
             octets[frame * 1279 + 4 + 200 + k] ^= 0x5A
     decoded = decode(bytes(octets))
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
     assert decoded.symbols_corrected == 160 and decoded.complete
     assert decoded.frames.corrected[[1, 3]].tolist() == [[16] * 5] * 2
 
 
 def test_a_stream_whose_every_codeword_has_errors_is_still_recognised():
-    octets = bytearray(encode_cadus(PACKETS[:60], spacecraft_id=76, randomiser="long"))
+    octets = bytearray(encode_cadus(sent()[:60], spacecraft_id=76, randomiser="long"))
     for frame in range(len(octets) // 1279):
         octets[frame * 1279 + 300 : frame * 1279 + 305] = bytes(5)
         octets[frame * 1279 + 400 : frame * 1279 + 405] = bytes(5)
     decoded = decode(bytes(octets))
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS[:60]
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()[:60]
     assert decoded.settings.randomiser == "long"
 
 
 def test_a_bad_frame_checksum_discards_the_frame_of_an_uncoded_link():
-    octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76, coding="none"))
+    octets = bytearray(encode_cadus(sent(), spacecraft_id=76, coding="none"))
     octets[3 * 1119 + 500] ^= 1
     decoded = decode(bytes(octets))
     assert decoded.frames_bad == 1 and decoded.frames.verdict[3] == FRAME_BAD_CHECKSUM
@@ -289,9 +293,9 @@ def test_a_bad_frame_checksum_discards_the_frame_of_an_uncoded_link():
 
 def test_frames_of_another_spacecraft_are_not_used():
     other = encode_cadus(make_packets(3, seed=9), spacecraft_id=77)
-    octets = encode_cadus(PACKETS, spacecraft_id=76) + other
+    octets = encode_cadus(sent(), spacecraft_id=76) + other
     decoded = decode(octets)
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
     assert decoded.frames_bad == len(other) // 1279
     assert (decoded.frames.verdict == FRAME_FOREIGN).sum() == len(other) // 1279
     assert decode(octets, spacecraft_id=77).packets == len(make_packets(3, seed=9))
@@ -299,45 +303,45 @@ def test_frames_of_another_spacecraft_are_not_used():
 
 def test_attaching_in_mid_stream_gives_no_bogus_packet_and_loses_no_whole_one():
     # the first frames begin with the rest of a packet whose head was never received
-    octets = encode_cadus(PACKETS, spacecraft_id=76)[3 * 1279 :]
+    octets = encode_cadus(sent(), spacecraft_id=76)[3 * 1279 :]
     decoded = decode(octets)
     found = list(decoded.cut.packets(decoded.buffer))
-    assert found == PACKETS[len(PACKETS) - len(found) :]
-    starts = np.cumsum([0] + [len(p) for p in PACKETS])
+    assert found == sent()[len(sent()) - len(found) :]
+    starts = np.cumsum([0] + [len(p) for p in sent()])
     assert len(found) == int(np.count_nonzero(starts[:-1] >= 3 * 1107))
-    assert decoded.octets["orphaned"] == starts[len(PACKETS) - len(found)] - 3 * 1107
+    assert decoded.octets["orphaned"] == starts[len(sent()) - len(found)] - 3 * 1107
     assert decoded.crc_errors == 0
 
 
 def test_attaching_in_mid_frame_costs_only_that_frame():
-    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    octets = encode_cadus(sent(), spacecraft_id=76)
     decoded = decode(octets[777:])
     assert decoded.octets["unsynchronised"] == 1279 - 777
     assert_all_octets_are_accounted_for(octets[777:], decoded)
 
 
 def test_a_truncated_downlink_gives_all_whole_frames():
-    octets = encode_cadus(PACKETS, spacecraft_id=76)[: 7 * 1279 + 600]
+    octets = encode_cadus(sent(), spacecraft_id=76)[: 7 * 1279 + 600]
     decoded = decode(octets)
     assert decoded.frame_count == 7 and decoded.octets["unsynchronised"] == 600
     found = list(decoded.cut.packets(decoded.buffer))
-    assert found == PACKETS[: len(found)] and decoded.crc_errors == 0
+    assert found == sent()[: len(found)] and decoded.crc_errors == 0
     assert_all_octets_are_accounted_for(octets, decoded)
 
 
 def test_a_dump_that_comes_twice_is_duplicates():
-    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    octets = encode_cadus(sent(), spacecraft_id=76)
     decoded = decode(octets + octets)
     found = decoded.sequence
-    assert (found.duplicates, found.gaps, found.conflicts) == (len(PACKETS), 0, 0)
+    assert (found.duplicates, found.gaps, found.conflicts) == (len(sent()), 0, 0)
 
 
 def test_late_playback_out_of_order_leaves_no_gap():
     encoder = DownlinkEncoder(76)
-    half = len(PACKETS) // 2
-    octets = encoder.encode(PACKETS[half:]) + encoder.encode(PACKETS[:half])
+    half = len(sent()) // 2
+    octets = encoder.encode(sent()[half:]) + encoder.encode(sent()[:half])
     decoded = decode(octets)
-    assert (decoded.sequence.gaps, decoded.sequence.duplicates, decoded.packets) == (0, 0, len(PACKETS))
+    assert (decoded.sequence.gaps, decoded.sequence.duplicates, decoded.packets) == (0, 0, len(sent()))
 
 
 def test_a_reboot_starts_new_counts_and_is_no_loss():
@@ -351,7 +355,7 @@ def test_packets_outside_the_dictionary_are_counted_as_unknown():
     from tmtc.crc import append_crc
 
     stranger = append_crc(pack_packet(0x55, bytes(30), sequence_count=0)[:-2])
-    decoded = decode(b"".join([*PACKETS[:5], stranger, *PACKETS[5:]]))
+    decoded = decode(b"".join([*sent()[:5], stranger, *sent()[5:]]))
     assert decoded.unknown == 1 and not decoded.complete
     assert decoded.by_apid[0x55] == 1
 
@@ -364,7 +368,7 @@ def test_markers_without_frames_between_them_are_an_error_that_says_so():
 
 
 def test_settings_that_are_given_are_used():
-    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    octets = encode_cadus(sent(), spacecraft_id=76)
     wrong = decode(octets, settings=LinkSettings(randomiser="none", dual_basis=False))
     assert wrong.packets == 0 and wrong.frames_bad == wrong.frame_count
     assert_all_octets_are_accounted_for(octets, wrong)
@@ -379,18 +383,18 @@ def test_the_legacy_sequence_is_a_codeword_so_that_the_code_alone_cannot_tell_it
 
 def test_impossible_settings_are_refused():
     with pytest.raises(ValueRefused, match="spacecraft_id"):
-        encode_cadus(PACKETS, spacecraft_id=1024)
+        encode_cadus(sent(), spacecraft_id=1024)
     with pytest.raises(ValueRefused, match="frame_length"):
-        encode_cadus(PACKETS, spacecraft_id=1, frame_length=2049, coding="none")
+        encode_cadus(sent(), spacecraft_id=1, frame_length=2049, coding="none")
     with pytest.raises(ValueRefused, match="virtual_channel"):
-        encode_cadus(PACKETS, spacecraft_id=1, virtual_channel=8)
+        encode_cadus(sent(), spacecraft_id=1, virtual_channel=8)
     with pytest.raises(LinkFormatError, match="found 1117"):
-        encode_cadus(PACKETS, spacecraft_id=1, frame_length=1117)
+        encode_cadus(sent(), spacecraft_id=1, frame_length=1117)
 
 
 def test_the_largest_frame_of_the_standard_is_a_frame():
-    decoded = decode(encode_cadus(PACKETS, spacecraft_id=1, frame_length=2048, coding="none"))
-    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    decoded = decode(encode_cadus(sent(), spacecraft_id=1, frame_length=2048, coding="none"))
+    assert list(decoded.cut.packets(decoded.buffer)) == sent()
 
 
 SENT = make_packets(30, seed=7)

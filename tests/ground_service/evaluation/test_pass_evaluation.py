@@ -473,6 +473,7 @@ def test_without_a_reference_the_report_says_what_was_flown_and_why_no_more() ->
     assert [one.name for one in report.navigation] == ["paper", "anchored"]
     assert np.isnan(series(report, "paper").error_rtn_m).all() and report.reference is None
     assert series(report, "paper").reset_trigger[6] == "safety_timeout"
+    assert series(report, "paper").outcome == paper().outcome != ()
     assert report.verdict_level == "unknown"
 
 

@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas
 import pyarrow.parquet
 import pyogrio
 import pytest
 import spiceypy
-import xarray
 from PIL import Image
 
 from ground_service.errors import EvaluationError, FileDamaged, NotFound
@@ -283,6 +281,9 @@ def test_csv_tables_have_every_sample_with_units(rich_ground: Ground, rich_pass:
 
 
 def test_netcdf_has_the_tables_as_groups(rich_ground: Ground, rich_pass: RichPass, tmp_path: Path) -> None:
+    import pandas
+    import xarray
+
     path = tmp_path / "pass.nc"
     path.write_bytes(export(rich_ground, "netcdf"))
     rows = unzipped(export(rich_ground, "csv"))

@@ -9,11 +9,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import nbformat
 import numpy as np
 import pytest
 import uvicorn
-from nbclient import NotebookClient
 
 import docs_site
 import linna
@@ -162,6 +160,9 @@ def test_a_notebook_runs(
     rich_ground: Ground,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    import nbformat  # two seconds, which the other tests need not spend
+    from nbclient import NotebookClient
+
     monkeypatch.setenv("LINNA_HOME", str(rich_ground.home))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.delenv("MPLBACKEND", raising=False)  # pictures are outputs of cells

@@ -194,7 +194,7 @@ def telemetry(frames: int = 5) -> list[bytes]:
     return sent.packets
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_the_state_follows_telemetry_in_whatever_order_it_comes(
     client: TestClient, order: tuple[int, ...]
 ) -> None:

@@ -1,7 +1,6 @@
 """CCSDS OEM both ways against the independent `oem` package, all versions, and every fault with its line."""
 
 import numpy as np
-import oem as independent
 import pytest
 
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
@@ -161,6 +160,8 @@ def test_every_time_system_keeps_the_epochs_to_the_nanosecond(system):
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
 def test_the_independent_reader_reads_what_we_write(tmp_path):
+    import oem as independent
+
     path = tmp_path / "ours.oem"
     covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
     ephemeris = example_ephemeris(covariances=(covariance,))
@@ -185,6 +186,8 @@ def test_the_independent_reader_reads_what_we_write(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
 def test_we_read_what_the_independent_writer_writes(tmp_path):
+    import oem as independent
+
     ours, theirs = tmp_path / "ours.oem", tmp_path / "theirs.oem"
     ephemeris = example_ephemeris()
     save_oem(ephemeris, ours)
@@ -198,6 +201,8 @@ def test_we_read_what_the_independent_writer_writes(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
 def test_interpolation_agrees_with_the_independent_reader(tmp_path):
+    import oem as independent
+
     path = tmp_path / "ours.oem"
     ephemeris = example_ephemeris()
     save_oem(ephemeris, path)

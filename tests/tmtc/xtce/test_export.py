@@ -44,13 +44,18 @@ def test_the_form_with_arrays_validates_against_the_schema_and_is_short(tmp_path
     assert len(text) < 300_000
 
 
+@pytest.fixture(scope="module")
+def imported():
+    return parse_xtce(format_xtce())
+
+
 @pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
-def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(definition):
+def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(definition, imported):
     rng = np.random.default_rng(18)
     counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
     packets = [random_packet(definition, count, rng) for count in counts]
     cut = whole_packets(np.array([len(packet) for packet in packets]))
-    found = Decoder(parse_xtce(format_xtce()), "CCSDSPacket").decode(b"".join(packets), cut)
+    found = Decoder(imported, "CCSDSPacket").decode(b"".join(packets), cut)
     assert found.counts()["decoded"] == len(packets)
     (table,) = found.tables.values()
     assert table.name == definition.name
@@ -131,7 +136,9 @@ def random_packet(definition: PacketDefinition, count: int, rng: np.random.Gener
 @pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
 def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, decoder):
     rng = np.random.default_rng(17)
-    counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
+    counts = [0, 1, 2, 40] if definition.group else [0, 0, 0]
+    if definition.name == "detections":
+        counts.append(255)  # the longest; this decoder needs a second for it
     for count in counts:
         octets = random_packet(definition, count, rng)
         with warnings.catch_warnings():
