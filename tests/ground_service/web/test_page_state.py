@@ -378,9 +378,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     wait_until(lambda: times(page, 1) == (62.0, 75.0), "not changed by the form")
     answered(page)
     # In one step: an update of the page replaces the bar.
-    page.evaluate(
-        """document.querySelector('#timeline [data-window="1"]').scrollIntoView({block: "center"})"""
-    )
+    page.evaluate("document.querySelector('#timeline [data-window=\"1\"]').scrollIntoView()")
     box = bar.locator("rect").bounding_box()
     page.mouse.move(box["x"] + 3, box["y"] + 5)  # the start
     page.mouse.down()
