@@ -110,7 +110,7 @@ GROUPS = {
     ),
     "smoother": Group(
         ("ground_service/evaluation/navigation/smoother.py",),
-        (f"{_GROUND_TESTS}/evaluation/test_smoother.py",),
+        (f"{_GROUND_TESTS}/evaluation/test_smoother.py", f"{_GROUND_TESTS}/exports/test_exports.py"),
     ),
     "gates": Group(
         ("ground_service/regression/gates/core.py", "ground_service/regression/gates/statistics.py"),
@@ -157,11 +157,7 @@ GROUPS = {
     ),
     "authorisation": Group(
         ("ground_service/access/service.py", "ground_service/access/security.py"),
-        (
-            f"{_GROUND_TESTS}/access/test_users.py",
-            f"{_GROUND_TESTS}/access/test_access.py",
-            f"{_GROUND_TESTS}/access/test_security.py",
-        ),
+        (f"{_GROUND_TESTS}/access",),
     ),
     "commanding": Group(
         (
