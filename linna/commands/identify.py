@@ -189,7 +189,7 @@ def _as_json(row: Share) -> dict[str, Any]:
 
 
 def _key(scenario: str, numbers: bytes, model_sha256: str) -> str:
-    """What detections depend on, as one hash."""
+    """Return the SHA-256 of everything on which the detections depend."""
     import hashlib
 
     return hashlib.sha256(b"|".join([scenario.encode(), numbers, model_sha256.encode()])).hexdigest()

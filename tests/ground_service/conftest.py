@@ -17,7 +17,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from ground_service.app import create_app
+from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.ground import Ground, open_ground
 from ground_service.settings import Settings
 from ground_service.store import database as databases
@@ -560,3 +561,21 @@ def migrated_postgres(postgres_server: str) -> Callable[[], str]:
 def postgres_url(new_postgres_database: Callable[[], str]) -> str:
     """URL of an empty PostgreSQL database that the tests of one module share."""
     return new_postgres_database()
+
+
+@dataclass
+class Clock:
+    """Mission time in nanoseconds since 1970, which passes only when a test says so."""
+
+    utc_ns: int = field(default_factory=utc_now_ns)
+
+    def advance(self, seconds: float) -> None:
+        self.utc_ns += round(seconds * 1e9)
+
+
+@pytest.fixture
+def mission_time() -> Iterator[Clock]:
+    made = Clock()
+    set_mission_clock(lambda: made.utc_ns)
+    yield made
+    set_mission_clock(None)

@@ -426,7 +426,7 @@ def _incoming_shadow(
 
 @lru_cache(maxsize=4)
 def pixel_shifts(camera: BrownCamera) -> tuple[Image, Image]:
-    """Where every pixel of the picture would lie without distortion, less where it lies: u and v (H, W) in pixels."""
+    """Return the undistorted less the distorted place of every pixel: u and v, each (H, W), in pixels."""
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
     ideal = camera.focal_px * camera.undistorted(np.stack([u, v], axis=-1)) + np.array(camera.centre_px)
     shift_u, shift_v = (ideal[..., 0] - u).astype(np.float32), (ideal[..., 1] - v).astype(np.float32)

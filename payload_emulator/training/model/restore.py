@@ -34,7 +34,7 @@ _UNREADABLE = (
     OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, EOFError, AssertionError,
     UnpicklingError, StructError, DecodeError,
 )  # fmt: skip
-"""What torch and onnx raise for octets and values that are not theirs."""
+"""Errors of torch and onnx for octets and values of another kind."""
 
 
 @contextmanager

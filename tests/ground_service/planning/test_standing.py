@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from ground_service.clock import set_mission_clock
 from ground_service.contacts.commanding.model import TelecommandFilter
 from ground_service.contacts.commanding.service import get_command, list_telecommands
 from ground_service.errors import InvalidInput, NotFound, PlanConflicts
@@ -26,7 +24,7 @@ from ground_service.planning.request_model import RequestTerms, StandingRequestC
 from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
 from ground_service.worker.follow_up import follow_in_process
-from tests.ground_service.conftest import START, save_circle
+from tests.ground_service.conftest import START, Clock, save_circle
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 NS = 10**9
@@ -64,17 +62,10 @@ uplink = "127.0.0.1:9"
 AUTOMATIC = '[approval]\nwindows = "automatic"\n'
 
 
-@dataclass
-class Now:
-    utc_ns: int = field(default=START)
-
-
 @pytest.fixture
-def now() -> Iterator[Now]:
-    moment = Now()
-    set_mission_clock(lambda: moment.utc_ns)
-    yield moment
-    set_mission_clock(None)
+def now(mission_time: Clock) -> Clock:
+    mission_time.utc_ns = START
+    return mission_time
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -116,7 +107,7 @@ def request(ground: Ground, **changes: object) -> int:
     return standing.add_request(ground, StandingRequestIn.model_validate(values), actor="ann").id
 
 
-def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: Path, now: Now) -> None:
+def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: Path, now: Clock) -> None:
     prepare(either, oem)
     key = request(either)
     done = standing.plan_tick(either, now.utc_ns)
@@ -142,7 +133,7 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     ]
 
 
-def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Now) -> None:
+def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Clock) -> None:
     prepare(either, oem)
     request(either)
     standing.plan_tick(either, now.utc_ns)
@@ -152,7 +143,7 @@ def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Now) -> 
     assert either.read(list_windows, WindowFilter()) == first
 
 
-def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Now) -> None:
+def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Clock) -> None:
     with open_ground(tmp_path / "home") as ground:
         follow_in_process(ground)
         prepare(ground, oem)
@@ -161,7 +152,7 @@ def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, 
         assert sum(standing.plan_tick(ground, now.utc_ns).values()) == 0
 
 
-def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem: Path, now: Now) -> None:
+def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem: Path, now: Clock) -> None:
     prepare(either, oem)
     key = request(either)
     standing.plan_tick(either, now.utc_ns)
@@ -182,7 +173,7 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
 
 
 def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
-    either: Ground, oem: Path, now: Now, monkeypatch: pytest.MonkeyPatch
+    either: Ground, oem: Path, now: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepare(either, oem)
     request(either)
@@ -203,7 +194,7 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
 
 
 def test_windows_of_the_present_period_count_long_after_they_ended(
-    ground: Ground, oem: Path, now: Now
+    ground: Ground, oem: Path, now: Clock
 ) -> None:
     prepare(ground, oem)
     key = request(ground, windows=1)
@@ -221,7 +212,7 @@ def test_windows_of_the_present_period_count_long_after_they_ended(
 
 
 def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(
-    ground: Ground, oem: Path, now: Now
+    ground: Ground, oem: Path, now: Clock
 ) -> None:
     prepare(ground, oem, LINKS)
     request(ground, windows=2)
@@ -236,7 +227,7 @@ def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_relea
     assert ground.read(get_window, first.id).reason == standing.NOT_APPROVED
 
 
-def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Now) -> None:
+def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Clock) -> None:
     closed = 'outages = ["2029-08-07T00:00:00Z/2029-08-07T18:00:00Z"]\nminimum_elevation_deg = 0.0\n'
     text = MISSION.format(extra=AUTOMATIC + LINKS).replace("minimum_elevation_deg = 0.0\n", closed)
     add_mission(ground, text.encode(), actor="ann")
@@ -250,7 +241,7 @@ def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Now)
     assert planned and all(one.start.utc_ns > START + 12 * HOUR for one in planned)
 
 
-def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: Path, now: Now) -> None:
+def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(ground, oem, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
     key = request(ground, windows=20, maximum_duration_s=900.0, minimum_duration_s=800.0)
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 2
@@ -258,7 +249,7 @@ def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: 
     assert "more than 0.5 h of observation within 24 h" in reasons
 
 
-def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem: Path, now: Now) -> None:
+def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(ground, oem)
     region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
     key = request(ground, windows=5, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
@@ -276,7 +267,7 @@ UPLOADS = "[uploads]\ntables = []\n"
 ONE_PERSON = AUTOMATIC + 'one_person_for = ["perform_function/set_mode"]\n'
 
 
-def test_sequences_of_windows_do_not_overlap(ground: Ground, oem: Path, now: Now) -> None:
+def test_sequences_of_windows_do_not_overlap(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(ground, oem, ONE_PERSON + LINKS + UPLOADS)
     request(ground, windows=9, minimum_duration_s=200.0, maximum_duration_s=400.0)
     standing.plan_tick(ground, now.utc_ns)
@@ -286,7 +277,7 @@ def test_sequences_of_windows_do_not_overlap(ground: Ground, oem: Path, now: Now
     assert len(windows) == 9 and min(between) == 81.0
 
 
-def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem: Path, now: Now) -> None:
+def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(ground, oem, LINKS + UPLOADS)
     request(ground, windows=1)
     standing.plan_tick(ground, now.utc_ns)
@@ -299,7 +290,7 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem:
     )
 
 
-def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Now) -> None:
+def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(
         ground, oem, AUTOMATIC + LINKS + "[observation]\nlatitude_limit_deg = 50\nneeds_daylight = false\n"
     )
@@ -326,14 +317,14 @@ def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Now) 
         planning.add_window(ground, entry, actor="ann")
 
 
-def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Now) -> None:
+def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Clock) -> None:
     add_mission(ground, MISSION.format(extra=AUTOMATIC).encode(), actor="ann")
     key = request(ground)
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 0
     assert ground.read(get_plan, key).reason == "no reference ephemeris covers the coming days"
 
 
-def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, now: Now) -> None:
+def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(ground, oem)
     key = request(ground)
     standing.change_request(ground, key, StandingRequestChange(state="paused"), actor="ann")
@@ -355,7 +346,7 @@ def test_contradictory_terms_are_refused(ground: Ground) -> None:
 
 
 def test_processes_that_plan_at_the_same_time_make_one_plan(
-    migrated_postgres, oem: Path, tmp_path: Path, now: Now
+    migrated_postgres, oem: Path, tmp_path: Path, now: Clock
 ) -> None:
     url = migrated_postgres()
     grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.contacts.links import service
 from ground_service.contacts.links.runner import LinkRunner
 from ground_service.ground import Ground
@@ -72,25 +71,6 @@ def station() -> Iterator[Station]:
     made = Station()
     yield made
     made.close()
-
-
-@dataclass
-class MissionTime:
-    """Mission time that passes only when a test says so."""
-
-    utc_ns: int = field(default_factory=utc_now_ns)
-
-    def advance(self, seconds: float) -> None:
-        """Let mission time pass."""
-        self.utc_ns += round(seconds * 1e9)
-
-
-@pytest.fixture
-def mission_time() -> Iterator[MissionTime]:
-    made = MissionTime()
-    set_mission_clock(lambda: made.utc_ns)
-    yield made
-    set_mission_clock(None)
 
 
 HEAD = 'name = "selenita"\n[spacecraft]\nid = 76\n'

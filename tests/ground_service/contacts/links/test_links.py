@@ -27,7 +27,8 @@ from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
 from tests.ground_service.archive_hash import archive_hash
-from tests.ground_service.contacts.links.conftest import MissionTime, Station, declare, operated
+from tests.ground_service.conftest import Clock
+from tests.ground_service.contacts.links.conftest import Station, declare, operated
 from tests.serving import wait_for
 from tmtc.uplink import UplinkDecoder
 
@@ -123,7 +124,7 @@ def test_parts_of_frames_are_ingested_as_they_arrive(
 
 
 def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(
-    ground: Ground, station: Station, stream: bytes, expected: str, mission_time: MissionTime
+    ground: Ground, station: Station, stream: bytes, expected: str, mission_time: Clock
 ) -> None:
     declare(ground, station.link())
     with operated(ground) as runner:
@@ -176,7 +177,7 @@ def test_octets_are_acknowledged_when_they_are_on_disk(
 
 
 def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
-    either: Ground, station: Station, stream: bytes, mission_time: MissionTime
+    either: Ground, station: Station, stream: bytes, mission_time: Clock
 ) -> None:
     declare(either, station.link())
     keys = released(either, 3)
@@ -265,7 +266,7 @@ def test_a_process_without_the_lease_takes_no_telecommands(either: Ground, stati
 
 
 def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
-    ground: Ground, station: Station, stream: bytes, mission_time: MissionTime
+    ground: Ground, station: Station, stream: bytes, mission_time: Clock
 ) -> None:
     declare(ground, station.link())
     keys = released(ground)
@@ -312,7 +313,7 @@ class Socket:
 
 
 def test_octets_that_are_read_late_are_no_silence(
-    ground: Ground, station: Station, stream: bytes, mission_time: MissionTime
+    ground: Ground, station: Station, stream: bytes, mission_time: Clock
 ) -> None:
     """A process that was held up finds octets of the whole time: their contact goes on, and no frame is cut."""
     declare(ground, station.link())
@@ -453,7 +454,7 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
     ground: Ground,
     station: Station,
     synthetic_pass: Any,
-    mission_time: MissionTime,
+    mission_time: Clock,
     share: float,
     missed: int,
 ) -> None:
@@ -479,7 +480,7 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
 
 
 def test_missed_contacts_are_recorded_once_with_the_reason(
-    either: Ground, station: Station, synthetic_pass: Any, mission_time: MissionTime
+    either: Ground, station: Station, synthetic_pass: Any, mission_time: Clock
 ) -> None:
     from ground_service.missions.ephemerides.service import add_ephemeris
     from tests.ground_service.conftest import START
@@ -717,7 +718,7 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
 
 
 def test_the_next_owner_knows_when_a_contact_was_heard_last(
-    either: Ground, station: Station, stream: bytes, mission_time: MissionTime
+    either: Ground, station: Station, stream: bytes, mission_time: Clock
 ) -> None:
     """Mission time may stand still then: counted from the start of the process, the silence would never end."""
     declare(either, station.link())
