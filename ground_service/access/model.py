@@ -19,6 +19,15 @@ Days = Annotated[
 ]
 
 
+MissionNames = Annotated[
+    list[Annotated[str, Field(min_length=1, max_length=200)]], Field(max_length=100, examples=[["selenita"]])
+]
+Missions = Annotated[
+    MissionNames | None,
+    Field(default=None, min_length=1, description="Names of mission descriptions; null: all missions"),
+]
+"""Missions that a user or token is limited to."""
+
 Words = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """Text of a filter."""
 
@@ -30,6 +39,7 @@ class User(Entity):
     role: Role
     state: Literal["active", "disabled"]
     created: UtcTime
+    missions: Missions
     provider: str | None = Field(
         default=None, description="Issuer of the OpenID provider that states the role; null: added here"
     )
@@ -62,6 +72,7 @@ class Token(Entity):
     created: UtcTime
     expires: UtcTime | None = Field(description="null: never")
     revoked: UtcTime | None
+    missions: Missions
     used: UtcTime | None = Field(description="Last use, to the hour; null: never used")
     parent_id: int | None = Field(
         default=None, description="Token that a browser session was started with; null: no such session"
@@ -83,9 +94,18 @@ class TokenRecord(Entity):
     used_utc_ns: int | None
     parent_id: int | None
     provider_session: str | None
+    missions: tuple[str, ...] | None
     name: str
     role: Role
     state: Literal["active", "disabled"] = Field(description="State of the user")
+    user_missions: tuple[str, ...] | None
+
+    @property
+    def limits(self) -> tuple[str, ...] | None:
+        """Missions that both the user and the token may use; None: all."""
+        if self.missions is None or self.user_missions is None:
+            return self.user_missions if self.missions is None else self.missions
+        return tuple(one for one in self.missions if one in self.user_missions)
 
     def expired(self, utc_ns: int) -> bool:
         """Return whether the validity has ended at a time."""
@@ -120,6 +140,9 @@ class Session(Entity):
 
     name: str = Field(examples=["ann"])
     role: Role
+    missions: tuple[str, ...] | None = Field(
+        default=None, description="Missions that the caller is limited to; null: all"
+    )
     expires: UtcTime | None = Field(description="null: unlimited")
     browser: bool = Field(description="Whether the request used the cookie of a browser session")
     provider: bool = Field(
@@ -146,20 +169,23 @@ class NewUser(Given):
 
     name: str = Field(pattern=USER_NAME, examples=["ann"])
     role: Role
+    missions: Missions
     days_valid: Days
 
 
 class UserChange(Given):
-    """Change of the state or role of a user, or both."""
+    """Change of the state, role or missions of a user."""
 
     state: Literal["active", "disabled"] | None = None
     role: Role | None = None
+    missions: MissionNames | None = Field(default=None, description="Empty: all missions")
 
 
 class NewToken(Given):
     """Token to create."""
 
     days_valid: Days
+    missions: Missions
     revoke_others: bool = Field(default=False, description="Revoke all earlier tokens of the user")
 
 

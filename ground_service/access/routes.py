@@ -78,7 +78,14 @@ def list_users(ground: GroundOf, _: Admin) -> PageOf[User]:
 @access.post("/users", status_code=201, responses=problems(409))
 def add_user(ground: GroundOf, caller: Admin, given: NewUser) -> UserWithToken:
     """Add a user; the response contains the token, which cannot be read again."""
-    token = users.add_user(ground, given.name, given.role, days_valid=given.days_valid, actor=caller.name)
+    token = users.add_user(
+        ground,
+        given.name,
+        given.role,
+        days_valid=given.days_valid,
+        missions=given.missions,
+        actor=caller.name,
+    )
     return UserWithToken(user=users.get_user(ground, given.name), token=token)
 
 
@@ -90,15 +97,23 @@ def get_user(ground: GroundOf, _: Admin, name: UserName) -> User:
 
 @access.patch("/users/{name}", responses=problems(409))
 def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChange) -> User:
-    """Disable or enable a user, or change the role; 409 states the conflicting state."""
-    return users.change_user(ground, name, state=given.state, role=given.role, actor=caller.name)
+    """Disable or enable a user, or change the role or missions; 409 states the conflicting state."""
+    return users.change_user(
+        ground, name, state=given.state, role=given.role, missions=given.missions, actor=caller.name
+    )
 
 
 @access.post("/users/{name}/tokens", status_code=201)
 def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken) -> UserWithToken:
     """Create a token for a user; the response contains it, and it cannot be read again."""
-    make = users.renew_token if given.revoke_others else users.add_token
-    token = make(ground, name, days_valid=given.days_valid, actor=caller.name)
+    token = users.add_token(
+        ground,
+        name,
+        days_valid=given.days_valid,
+        missions=given.missions,
+        revoke_others=given.revoke_others,
+        actor=caller.name,
+    )
     return UserWithToken(user=users.get_user(ground, name), token=token)
 
 

@@ -11,7 +11,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy import Connection
+from starlette.concurrency import run_in_threadpool
 
+from ground_service.access.scopes import check_scope
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.errors import Forbidden, NotAuthorised
 from ground_service.http.common import GroundOf, linked
@@ -44,11 +46,13 @@ def caller_of(
 
 
 def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:
-    """Return a dependency that rejects callers without this role or a higher one."""
+    """Return a dependency that rejects callers without this role or a higher one, or for other spacecraft."""
 
-    async def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
+    async def check(request: Request, caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
         if not caller.may(role):
             raise Forbidden(f"{caller.name}: expected the role {role} or higher, found {caller.role}")
+        if caller.missions is not None:
+            await run_in_threadpool(check_scope, request, caller)
         return caller
 
     return check
@@ -69,8 +73,10 @@ def add_list(
     signature = inspect.signature(work, eval_str=True)
     asked = list(signature.parameters.values())[1].annotation
 
-    def endpoint(ground: GroundOf, request: Request, asked: Any, **_: Any) -> PageOf[Any]:
-        return linked(request, ground.read(work, asked))
+    def endpoint(ground: GroundOf, request: Request, asked: Any, caller: Caller) -> PageOf[Any]:
+        with ground.database.reading() as connection:
+            connection.execution_options(spacecraft=caller.spacecraft)
+            return linked(request, work(connection, asked))
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     kinds = {"ground": GroundOf, "caller": role, "request": Request, "asked": Annotated[asked, Query()]}

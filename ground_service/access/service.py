@@ -10,9 +10,10 @@ import hashlib
 import math
 import re
 import secrets
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from sqlalchemy import Connection
 
@@ -23,6 +24,7 @@ from ground_service.errors import Conflict, InvalidInput, NotAuthorised, StoreEr
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.store import audit as audit_log
+from ground_service.store.vehicles import spacecraft_of_missions
 
 ROLES = ("viewer", "operator", "admin")
 """Each may do what those before it may: look; plan, upload and command; manage users."""
@@ -49,17 +51,37 @@ RESERVED_NAMES = ("local", "service", "archive", "planner", "link", "telemetry",
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 
 
+class OfSpacecraft(Protocol):
+    """Something that belongs to a spacecraft."""
+
+    @property
+    def spacecraft_id(self) -> int | None: ...
+
+
+Owned = TypeVar("Owned", bound=OfSpacecraft)
+
+
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Authenticated caller with role and token."""
+    """Authenticated caller with role and token; one who is limited to missions has names and spacecraft of these."""
 
     name: str
     role: Role
     token_id: int | None = None
+    missions: tuple[str, ...] | None = None
+    spacecraft: frozenset[int] | None = None
 
     def may(self, role: str) -> bool:
         """Whether the caller has this role or a higher one."""
         return ROLES.index(self.role) >= ROLES.index(role)
+
+    def may_use(self, *spacecraft_id: int | None) -> bool:
+        """Whether the caller may read and command all of these spacecraft; None is one that is not known."""
+        return self.spacecraft is None or self.spacecraft.issuperset(spacecraft_id)
+
+    def own(self, items: Iterable[Owned]) -> list[Owned]:
+        """Return those of a list that belong to spacecraft of the caller."""
+        return [one for one in items if self.may_use(one.spacecraft_id)]
 
 
 LOCAL_CALLER = Caller("local", "admin")
@@ -67,9 +89,15 @@ LOCAL_CALLER = Caller("local", "admin")
 
 
 def add_user(
-    ground: Ground, name: str, role: str, *, days_valid: float | None = None, actor: str = "local"
+    ground: Ground,
+    name: str,
+    role: str,
+    *,
+    days_valid: float | None = None,
+    missions: Sequence[str] | None = None,
+    actor: str = "local",
 ) -> str:
-    """Add a user and return the token, which cannot be read again later.
+    """Add a user, who may be limited to missions, and return the token, which cannot be read again later.
 
     Raises
     ------
@@ -82,32 +110,31 @@ def add_user(
     lifetime_ns = _lifetime_ns(days_valid)
     now = utc_now_ns()
     with ground.database.writing() as connection:
-        user = _add_user(connection, name, role, now)
+        user = _add_user(connection, name, role, now, missions)
         token_id, token = _add_token(connection, user, now, lifetime_ns)
-        audit(connection, actor, "add user", name, {"role": role, "token_id": token_id})
+        detail = {"role": role, "token_id": token_id, **_limits(missions)}
+        audit(connection, actor, "add user", name, detail)
     return token
 
 
-def renew_token(ground: Ground, name: str, *, days_valid: float | None = None, actor: str = "local") -> str:
-    """Create a token for a user, revoke all earlier ones, and return it."""
+def add_token(
+    ground: Ground,
+    name: str,
+    *,
+    days_valid: float | None = None,
+    missions: Sequence[str] | None = None,
+    revoke_others: bool = False,
+    actor: str = "local",
+) -> str:
+    """Create a token for a user, which may be limited to missions, and return it; earlier ones can be revoked."""
     lifetime_ns = _lifetime_ns(days_valid)
     now = utc_now_ns()
     with ground.database.writing() as connection:
         user = store.get_user(connection, name)
-        revoked = store.revoke_tokens(connection, user, now)
-        token_id, token = _add_token(connection, user, now, lifetime_ns)
-        audit(connection, actor, "renew token", name, {"token_id": token_id, "revoked": revoked})
-    return token
-
-
-def add_token(ground: Ground, name: str, *, days_valid: float | None = None, actor: str = "local") -> str:
-    """Create a further token for a user and return it; earlier ones remain valid."""
-    lifetime_ns = _lifetime_ns(days_valid)
-    now = utc_now_ns()
-    with ground.database.writing() as connection:
-        user = store.get_user(connection, name)
-        token_id, token = _add_token(connection, user, now, lifetime_ns)
-        audit(connection, actor, "add token", name, {"token_id": token_id})
+        detail = {"revoked": store.revoke_tokens(connection, user, now)} if revoke_others else {}
+        token_id, token = _add_token(connection, user, now, lifetime_ns, missions=missions)
+        action = "renew token" if revoke_others else "add token"
+        audit(connection, actor, action, name, {"token_id": token_id, **detail, **_limits(missions)})
     return token
 
 
@@ -167,9 +194,15 @@ def get_user(ground: Ground, name: str) -> User:
 
 
 def change_user(
-    ground: Ground, name: str, *, state: str | None = None, role: str | None = None, actor: str = "local"
+    ground: Ground,
+    name: str,
+    *,
+    state: str | None = None,
+    role: str | None = None,
+    missions: Sequence[str] | None = None,
+    actor: str = "local",
 ) -> User:
-    """Disable or enable a user, or change the role.
+    """Disable or enable a user, or change the role or the missions (empty: all).
 
     Raises
     ------
@@ -178,8 +211,8 @@ def change_user(
     Conflict
         If the user has this state or role already, or is the last active administrator.
     """
-    if state is None and role is None:
-        raise InvalidInput("user", name, "a new state or role", "neither")
+    if state is None and role is None and missions is None:
+        raise InvalidInput("user", name, "a new state, role or missions", "none of them")
     if state is not None and state not in STATES:
         raise InvalidInput("user", "state", " or ".join(STATES), repr(state)[:80])
     if role is not None:
@@ -201,6 +234,10 @@ def change_user(
                 raise Conflict(f"user {name}: the OpenID provider {user.provider} states the role")
             _set_role(connection, user, role)
             audit(connection, actor, "change role", name, {"from": user.role, "to": role})
+        if missions is not None:
+            store.limit_user(connection, user, missions)
+            change = {"from": user.missions, "to": list(missions) or None}
+            audit(connection, actor, "change missions", name, change)
         return User.of(dict(store.get_user(connection, name)))
 
 
@@ -256,7 +293,9 @@ def authenticate(ground: Ground, token: str) -> Caller:
         raise NotAuthorised("token: has expired; 'linna user token NAME' gives a new one")
     if found.used_utc_ns is None or found.used_utc_ns <= now - USED_STEP_NS:
         _note_use(ground, found.id, now)
-    return Caller(found.name, found.role, found.id)
+    limits = found.limits
+    spacecraft = None if limits is None else ground.read(spacecraft_of_missions, limits)
+    return Caller(found.name, found.role, found.id, limits, spacecraft)
 
 
 def start_session(ground: Ground, token: str) -> tuple[str, Session]:
@@ -280,7 +319,12 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
             expires = min(expires, parent.expires_utc_ns)
         user = store.get_user(connection, caller.name)
         key, secret = _add_token(
-            connection, user, now, expires - now, parent_id=parent.parent_id or parent.id
+            connection,
+            user,
+            now,
+            expires - now,
+            parent_id=parent.parent_id or parent.id,
+            missions=parent.missions,
         )
         audit(
             connection, caller.name, "start session", caller.name, {"token_id": key, "parent_id": parent.id}
@@ -288,6 +332,7 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
     started = Session(
         name=caller.name,
         role=user.role,
+        missions=caller.missions,
         expires=UtcTime(expires),
         browser=True,
         time=UtcTime(mission_now_ns()),
@@ -306,6 +351,7 @@ def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
     return Session(
         name=caller.name,
         role=caller.role,
+        missions=caller.missions,
         expires=until,
         browser=browser,
         provider=provider,
@@ -363,8 +409,14 @@ def _lifetime_ns(days: float | None) -> int | None:
     return int(days * 86_400e9)
 
 
-def _add_user(connection: Connection, name: str, role: str, now: int) -> UserRecord:
-    if not store.add_user(connection, name, role, now):
+def _limits(missions: Sequence[str] | None) -> dict[str, list[str]]:
+    return {"missions": list(missions)} if missions else {}
+
+
+def _add_user(
+    connection: Connection, name: str, role: str, now: int, missions: Sequence[str] | None = None
+) -> UserRecord:
+    if not store.add_user(connection, name, role, now, missions=missions):
         raise Conflict(f"user {name}: exists already")
     return store.get_user(connection, name)
 
@@ -387,6 +439,7 @@ def _add_token(
     lifetime_ns: int | None,
     parent_id: int | None = None,
     provider_session: str | None = None,
+    missions: Sequence[str] | None = None,
 ) -> tuple[int, str]:
     token = "linna_" + secrets.token_urlsafe(TOKEN_OCTETS)
     expires = None if lifetime_ns is None else now + lifetime_ns
@@ -399,5 +452,6 @@ def _add_token(
         expires_utc_ns=expires,
         parent_id=parent_id,
         provider_session=provider_session,
+        missions=missions,
     )
     return key, token

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
-from sqlalchemy import Connection, delete, func, or_, select, update
+from sqlalchemy import Connection, String, delete, false, func, null, or_, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.access.model import AuditEntry, AuditFilter, StoredAnswer, TokenRecord, User, UserRecord
 from ground_service.errors import Conflict, NotFound
 from ground_service.http.model import PageOf
 from ground_service.store import repository
-from ground_service.store.repository import page
+from ground_service.store.models import METADATA
+from ground_service.store.repository import page, spacecraft_of
 from ground_service.store.states import change_if
 
 USERS, TOKENS = repository.USERS, repository.TOKENS
@@ -33,9 +34,11 @@ def add_user(
     *,
     issuer: str | None = None,
     subject: str | None = None,
+    missions: Sequence[str] | None = None,
 ) -> bool:
     """Add a user, or with issuer and subject that of an OpenID provider; return False if another was faster."""
-    values = {"name": name, "role": role, "state": "active", "created_utc_ns": now_utc_ns}
+    values: dict[str, Any] = {"name": name, "role": role, "state": "active", "created_utc_ns": now_utc_ns}
+    values["missions"] = _names(missions)
     values |= {} if issuer is None else {"issuer": issuer, "subject": subject}
     return repository.add_new(connection, USERS, **values) is not None
 
@@ -91,6 +94,11 @@ def change_user(connection: Connection, user: UserRecord, column: str, expected:
     raise Conflict(f"user {user.name}: expected {column} {expected}, found {found}")
 
 
+def limit_user(connection: Connection, user: UserRecord, missions: Sequence[str]) -> None:
+    """Limit a user to missions; none: to all."""
+    repository.change(connection, USERS, user.id, missions=_names(missions))
+
+
 def add_token(
     connection: Connection,
     user: UserRecord,
@@ -101,6 +109,7 @@ def add_token(
     expires_utc_ns: int | None,
     parent_id: int | None = None,
     provider_session: str | None = None,
+    missions: Sequence[str] | None = None,
 ) -> int:
     """Add a token, or with `parent_id` or `provider_session` that of a browser session; return its id."""
     return int(
@@ -114,6 +123,7 @@ def add_token(
             expires_utc_ns=expires_utc_ns,
             parent_id=parent_id,
             provider_session=provider_session,
+            missions=_names(missions),
         )
     )
 
@@ -214,6 +224,33 @@ def delete_answers(connection: Connection, before_utc_ns: int) -> int:
     return int(connection.execute(query).rowcount)
 
 
+Owner = Literal[
+    "passes", "windows", "standing_requests", "telecommands", "alarms", "ingests", "landmarks",
+    "automation_actions", "reports", "monthly_reports", "missions", "links",
+]  # fmt: skip
+"""Table whose rows belong to a spacecraft."""
+
+
+def owner_of(connection: Connection, names: Sequence[Owner], key: Any) -> int | None:
+    """Return the spacecraft of the row with this key in one of several tables; None without any.
+
+    The key of a mission description is its revision or the first digits of it.
+    """
+    for name in names:
+        table = METADATA.tables[name]
+        column = table.c.revision if name == "missions" else next(iter(table.primary_key.columns))
+        if isinstance(column.type, String):
+            text = str(key)
+            here = column.startswith(text, autoescape=True) if name == "missions" else column == text
+        else:
+            here = column == int(key) if str(key).isdecimal() else false()
+        owner = spacecraft_of(table)
+        owners = set() if owner is None else set(connection.execute(select(owner).where(here)).scalars())
+        if owners:
+            return owners.pop() if len(owners) == 1 else None
+    return None
+
+
 def list_audit(connection: Connection, asked: AuditFilter) -> PageOf[AuditEntry]:
     """Return a page of the audit entries, newest first."""
     table = AUDIT.c
@@ -230,7 +267,12 @@ def list_audit(connection: Connection, asked: AuditFilter) -> PageOf[AuditEntry]
 
 def _tokens() -> Select[Any]:
     joined = TOKENS.join(USERS, USERS.c.id == TOKENS.c.user_id)
-    return select(TOKENS, USERS.c.name, USERS.c.role, USERS.c.state).select_from(joined)
+    limits = USERS.c.missions.label("user_missions")
+    return select(TOKENS, USERS.c.name, USERS.c.role, USERS.c.state, limits).select_from(joined)
+
+
+def _names(missions: Sequence[str] | None) -> Any:
+    return list(missions) if missions else null()
 
 
 def _user(row: Mapping[str, Any]) -> UserRecord:

@@ -636,8 +636,17 @@ class Operations(Connection):
     def start_regression(self, request: Document, *, key: str | None = None) -> jobs.Job:
         """Compare a candidate build with a baseline: a job for every missing replay, and one for the verdict."""
 
-    @operation("POST /analyses", body="request")
-    def start_analysis(self, request: Document, *, key: str | None = None) -> jobs.Job:
+    @operation("POST /analyses", body=("candidate", "baseline", "archives", "passes", "workers"))
+    def start_analysis(
+        self,
+        candidate: str,
+        *,
+        baseline: str = "current",
+        archives: Sequence[str] | None = None,
+        passes: Sequence[int] | None = None,
+        workers: int | None = None,
+        key: str | None = None,
+    ) -> jobs.Job:
         """Return the metrics of one build (candidate and baseline alike) as a job, without a verdict."""
 
     @operation("GET /regressions", reads="regression.store.list_regressions")
@@ -670,9 +679,14 @@ class Operations(Connection):
     def list_users(self) -> list[access.User]:
         """List all users."""
 
-    @operation("POST /users", body=("name", "role", "days_valid"))
+    @operation("POST /users", body=("name", "role", "missions", "days_valid"))
     def add_user(
-        self, name: str, role: access.Role, *, days_valid: float | None = None
+        self,
+        name: str,
+        role: access.Role,
+        *,
+        missions: Sequence[str] | None = None,
+        days_valid: float | None = None,
     ) -> access.UserWithToken:
         """Add a user; the response contains the token, which cannot be read again."""
 
@@ -680,19 +694,25 @@ class Operations(Connection):
     def get_user(self, name: str) -> access.User:
         """Show one user."""
 
-    @operation("PATCH /users/{name}", body=("state", "role"))
+    @operation("PATCH /users/{name}", body=("state", "role", "missions"))
     def change_user(
         self,
         name: str,
         *,
         state: Literal["active", "disabled"] | None = None,
         role: access.Role | None = None,
+        missions: Sequence[str] | None = None,
     ) -> access.User:
-        """Disable or enable a user, or change the role; 409 states the conflicting state."""
+        """Disable or enable a user, or change the role or missions; 409 states the conflicting state."""
 
-    @operation("POST /users/{name}/tokens", body=("days_valid", "revoke_others"))
+    @operation("POST /users/{name}/tokens", body=("days_valid", "missions", "revoke_others"))
     def add_token(
-        self, name: str, *, days_valid: float | None = None, revoke_others: bool = False
+        self,
+        name: str,
+        *,
+        days_valid: float | None = None,
+        missions: Sequence[str] | None = None,
+        revoke_others: bool = False,
     ) -> access.UserWithToken:
         """Create a token for a user; the response contains it, and it cannot be read again."""
 

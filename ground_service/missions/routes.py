@@ -34,9 +34,7 @@ def add_mission(
 
     Only an administrator may change which telecommands need a second person.
     """
-    return service.add_mission(
-        ground, document, source=name, actor=caller.name, may_change_approval=caller.role == "admin"
-    )
+    return service.add_mission(ground, document, source=name, actor=caller.name, caller=caller)
 
 
 @missions.get("/missions/{revision}")

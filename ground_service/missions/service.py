@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from sqlalchemy import Connection
 
-from ground_service.access.service import audit
+from ground_service.access.service import LOCAL_CALLER, Caller, audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Forbidden, InvalidInput
 from ground_service.events import MissionAdded, publish
@@ -72,7 +72,7 @@ def add_mission(
     *,
     source: str = "mission.toml",
     actor: str = "local",
-    may_change_approval: bool = True,
+    caller: Caller = LOCAL_CALLER,
 ) -> MissionDetail:
     """Add a mission description as a revision; the same content gives the same revision.
 
@@ -80,11 +80,18 @@ def add_mission(
     ------
     Forbidden
         It changes which telecommands need a second person, whether windows are approved by a person, the links or the
-        channels of notifications, and the caller is not permitted to change these.
+        channels of notifications, and the caller is not permitted to change these; or it is of a spacecraft or has
+        the name of a mission that the caller is not limited to.
     """
     mission, text = read_mission(octets, source)
+    named = caller.missions is None or mission.name in caller.missions
+    if not named or not caller.may_use(mission.spacecraft.id):
+        raise Forbidden(
+            f"{source}: {caller.name}: expected name and spacecraft of {', '.join(caller.missions or ())}, "
+            f"found {mission.name!r} and {mission.spacecraft.id}"
+        )
     with ground.database.writing() as connection:
-        if not may_change_approval and mission.spacecraft.id is not None:
+        if not caller.may("admin") and mission.spacecraft.id is not None:
             in_force = store.approval_in_force(connection, mission.spacecraft.id)
             if _persons(mission.approval) != _persons(in_force):
                 raise Forbidden(

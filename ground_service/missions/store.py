@@ -21,12 +21,10 @@ from ground_service.missions.model import (
 )
 from ground_service.missions.rules import Channel
 from ground_service.store import repository
+from ground_service.store.vehicles import ARCHIVE_ACTOR
 
 MISSIONS = repository.MISSIONS
 CATALOGUE_KIND, WITHDRAWN_KIND = "catalogue", "withdrawn catalogue"
-ARCHIVE_ACTOR = "archive"
-"""Actor of mission descriptions that are imported with pass archives."""
-
 REVISION_PREFIX = 8
 """Smallest number of hash digits that identify a revision."""
 

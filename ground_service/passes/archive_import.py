@@ -17,13 +17,12 @@ from ground_service.missions.ephemerides.attitudes import attitude_file, load_at
 from ground_service.missions.ephemerides.store import add_ephemeris
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
-from ground_service.missions.store import ARCHIVE_ACTOR
 from ground_service.missions.timekeeping.recorrelation import enter_receptions, read_receptions
 from ground_service.passes import store
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
-from ground_service.store.vehicles import SPACECRAFT_ID_MAX, vehicle_id
+from ground_service.store.vehicles import ARCHIVE_ACTOR, SPACECRAFT_ID_MAX, vehicle_id
 from ground_service.text import require_line
 from ground_service.toml import read_json
 from lunar.catalogue import load_catalogue

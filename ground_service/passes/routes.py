@@ -236,9 +236,9 @@ def get_trend(
 
 
 @passes.get("/spacecraft")
-def list_spacecraft(ground: GroundOf, _: Viewer) -> PageOf[SpacecraftInstance]:
+def list_spacecraft(ground: GroundOf, caller: Viewer) -> PageOf[SpacecraftInstance]:
     """List the spacecraft, flown ones first."""
-    return PageOf.all_of(newest.list_spacecraft(ground))
+    return PageOf.all_of(caller.own(newest.list_spacecraft(ground)))
 
 
 @passes.get("/spacecraft/{spacecraft_id}/parameters")

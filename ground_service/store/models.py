@@ -572,9 +572,10 @@ USERS = Table(
     column("created_utc_ns", BigInteger),
     optional("issuer", String(512)),
     optional("subject", String(255)),
+    optional("missions", JSON),
     UniqueConstraint("issuer", "subject"),
 )
-"""User of the service with one role; `state` is active or disabled.
+"""User of the service with one role; `state` is active or disabled, `missions` the names it is limited to.
 
 `issuer` and `subject` identify a user of an OpenID provider; NULL for users that were added here.
 """
@@ -591,8 +592,9 @@ TOKENS = Table(
     *optionals(BigInteger, "expires_utc_ns", "revoked_utc_ns", "used_utc_ns"),
     optional("parent_id", ForeignKey("tokens.id")),
     optional("provider_session", String(255)),
+    optional("missions", JSON),
 )
-"""Bearer token of a user; only its hash is stored.
+"""Bearer token of a user; only its hash is stored. `missions` limits it further than its user.
 
 `hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour. The token of a browser
 session has the token that it was started with in `parent_id`, and is valid only while that one is. The token of a

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
-from sqlalchemy import Connection, Table, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Table, func, insert, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.errors import NotFound
@@ -120,9 +120,12 @@ def page(
     """Return a page of the rows of a query in an order, and the number of all rows.
 
     A filter with the name of a column selects the rows with its value, or one of its values; `others` are filters with
-    another meaning, which the query has already.
+    another meaning, which the query has already. A connection with the option `spacecraft` selects their rows only.
     """
     columns = query.selected_columns
+    spacecraft = connection.get_execution_options().get("spacecraft")
+    if spacecraft is not None and (owner := spacecraft_of(next(iter(columns)).table)) is not None:
+        query = query.where(owner.in_(spacecraft))
     for name, value in asked.filters().items():
         if name in columns and name not in others:
             query = query.where(
@@ -138,6 +141,24 @@ def newest(connection: Connection, table: Table, asked: Asked, **equal: Any) -> 
     key = next(iter(table.primary_key.columns))
     order = [table.c.created_utc_ns, key] if "created_utc_ns" in table.c else [key]
     return page(connection, _where(table, equal), asked, *(column.desc() for column in order))
+
+
+def spacecraft_of(table: Table) -> ColumnElement[Any] | None:
+    """Return the spacecraft of a row of a table, as an expression; None: rows have none."""
+    vehicles, passes, pieces, columns = VEHICLES.alias(), PASSES.alias(), PIECES.alias(), table.c
+    for name in ("ccsds_id", "spacecraft_id"):
+        if name in columns:
+            return columns[name]
+    if "vehicle_id" in columns:
+        known = select(vehicles.c.ccsds_id).where(vehicles.c.id == columns.vehicle_id).scalar_subquery()
+        if table is not INGESTS:
+            return known
+        stated = select(pieces.c.spacecraft_id).where(pieces.c.ingest_id == columns.id).scalar_subquery()
+        return func.coalesce(known, stated)
+    if "pass_id" in columns:
+        of_pass = select(vehicles.c.ccsds_id).join(passes, passes.c.vehicle_id == vehicles.c.id)
+        return of_pass.where(passes.c.id == columns.pass_id).scalar_subquery()
+    return None
 
 
 def _insert_of(connection: Connection) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, select
@@ -10,6 +11,9 @@ from sqlalchemy.exc import IntegrityError
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.store import repository
 from ground_service.text import require_line
+
+ARCHIVE_ACTOR = "archive"
+"""Actor of mission descriptions that are imported with pass archives."""
 
 FLOWN = "flight"
 """Instance of the spacecraft that flies; others are emulated or replayed runs."""
@@ -89,6 +93,17 @@ def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
         if again is None:
             raise
         return int(again["id"])
+
+
+def spacecraft_of_missions(connection: Connection, names: Collection[str]) -> frozenset[int]:
+    """Return the spacecraft whose mission description in force has one of these names."""
+    table = repository.MISSIONS.c
+    query = select(table.ccsds_id, table.name).where(
+        table.ccsds_id.is_not(None), table.entered_by != ARCHIVE_ACTOR
+    )
+    rows = connection.execute(query.order_by(table.created_utc_ns, table.id))
+    newest = {int(number): name for number, name in rows}
+    return frozenset(number for number, name in newest.items() if name in names)
 
 
 def change_vehicle(connection: Connection, vehicle: int, **columns: int | None) -> None:

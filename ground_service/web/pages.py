@@ -17,6 +17,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
+from ground_service.access.scopes import check_scope
 from ground_service.access.security import caller_of
 from ground_service.errors import InvalidInput, NotAuthorised, NotFound
 from ground_service.evaluation.performance.store import get_monthly_report
@@ -165,7 +166,7 @@ def _html_file(ground: Ground, report_id: str) -> str:
 def _document(request: Request, read: Callable[[Ground], bytes]) -> Response:
     """Return a document to a signed-in browser; others are sent to the sign-in dialog and back."""
     try:
-        caller_of(request, None)
+        check_scope(request, caller_of(request, None))
     except NotAuthorised:
         return RedirectResponse(f"/?next={quote(request.url.path)}", status_code=303)
     headers = {"Content-Security-Policy": REPORT_POLICY}

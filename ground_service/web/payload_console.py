@@ -16,7 +16,7 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from ground_service.http.common import API_PREFIX
 from ground_service.http.requests import query_is_known
-from ground_service.web.sockets import TRY_AGAIN_LATER, Session, Sockets, until_over
+from ground_service.web.sockets import POLICY_VIOLATION, TRY_AGAIN_LATER, Session, Sockets, until_over
 
 LINE_LIMIT_OCTETS = 8 << 20
 WAITING_LIMIT = 4
@@ -36,7 +36,11 @@ async def watch_payload(socket: WebSocket) -> None:
         return
     sockets: Sockets = socket.app.state.sockets
     async with sockets.admitted(socket) as session:
-        if session is not None:
+        if session is None:
+            return
+        if session.caller.missions is not None:  # the console is of no mission
+            await socket.close(POLICY_VIOLATION)
+        else:
             await until_over(session, _watched(session))
 
 

@@ -33,6 +33,7 @@ from ground_service.http.proxies import address_key
 from ground_service.http.times import time_text
 from ground_service.passes.live import newest_packets
 from ground_service.store.events import LoggedEvent
+from ground_service.store.vehicles import all_vehicles
 from ground_service.store.wakeups import listen
 
 Source = tuple[int, str]
@@ -82,7 +83,7 @@ class Session:
     """Socket and its caller, as last verified; `ended` holds the close code.
 
     `messages` are queued events with their numbers, `values` the newest values that were not sent yet (None: not
-    requested).
+    requested), `vehicles` those of a caller who is limited to missions.
     """
 
     socket: WebSocket
@@ -91,6 +92,7 @@ class Session:
     ended: asyncio.Future[int]
     messages: deque[tuple[int, str]] = field(default_factory=deque)
     values: dict[Source, str] | None = None
+    vehicles: frozenset[int] = frozenset()
     ready: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def accept(self) -> None:
@@ -102,6 +104,10 @@ class Session:
         """Request that the socket is closed."""
         if not self.ended.done():
             self.ended.set_result(code)
+
+    def permits(self, vehicle: int | None) -> bool:
+        """Return whether the caller may see messages of a vehicle; None: of no vehicle, or of an unknown one."""
+        return self.caller.missions is None or vehicle in self.vehicles
 
     def offer(self, number: int, text: str) -> None:
         """Queue an event."""
@@ -168,6 +174,7 @@ class Sockets:
             yield None
             return
         session = Session(socket, caller, token, asyncio.get_running_loop().create_future())
+        session.vehicles = await run_in_threadpool(self._vehicles, caller)
         self._sessions.add(session)
         self._holders[holder] += 1
         try:
@@ -198,7 +205,7 @@ class Sockets:
             async with self._replays:
                 items = await run_in_threadpool(read_events, self._ground.database, at, BATCH)
             for item in items:
-                if item.number <= known:
+                if item.number <= known and session.permits(item.payload.get("vehicle_id")):
                     await session.socket.send_text(text_of(item))
             at = items[-1].number if items else known
         await session.send_offered(max(number, known))
@@ -233,7 +240,8 @@ class Sockets:
             for item in items:
                 text = text_of(item)
                 for session in self._readers:
-                    session.offer(item.number, text)
+                    if session.permits(item.payload.get("vehicle_id")):
+                        session.offer(item.number, text)
                 self._number = item.number
             if len(items) == BATCH:
                 self._committed.set()
@@ -256,7 +264,8 @@ class Sockets:
         for source, payload in found:
             text = f'{{"sequence":{self._number},"time":"{time}","kind":"values","payload":{payload}}}'
             for session in self._readers:
-                session.offer_values(source, text)
+                if session.permits(source[0]):
+                    session.offer_values(source, text)
 
     async def _verify(self) -> None:
         while True:
@@ -275,6 +284,14 @@ class Sockets:
                         session.end(POLICY_VIOLATION)
                     else:
                         session.caller = caller
+                        session.vehicles = await run_in_threadpool(self._vehicles, caller)
+
+    def _vehicles(self, caller: Caller) -> frozenset[int]:
+        """Return the vehicles of a caller who is limited to missions; none for others."""
+        if caller.spacecraft is None:
+            return frozenset()
+        known = self._ground.read(all_vehicles)
+        return frozenset(one.id for one in known if one.ccsds_id in caller.spacecraft)
 
     def _verified(self, token: str | None) -> Caller | None:
         """Return the caller of a token; the local user if there are no users."""

@@ -161,7 +161,7 @@ def _baseline(arguments: argparse.Namespace) -> int:
 
     with ground_client(arguments, background=True) as service:
         request = _comparison(service, arguments, arguments.build, arguments.build)
-        figures = service.wait(service.start_analysis(request).id, progress=_percent()).result or {}
+        figures = service.wait(service.start_analysis(**request).id, progress=_percent()).result or {}
     emit(arguments, figures, text=baseline_text(figures))
     return 2 if figures["not_flown"] else 0
 

@@ -1,8 +1,9 @@
-"""`linna user add | token | ensure | list | disable | enable | role | tokens | revoke`: users and their tokens."""
+"""`linna user add | token | ensure | list | disable | enable | role | missions | tokens | revoke`: users and tokens."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._ground import add_service_options, local_actor, open_service
@@ -18,17 +19,36 @@ if TYPE_CHECKING:
 Role = Literal["viewer", "operator", "admin"]
 
 
-def _add(service: Client, name: str, role: Role, *, days: float | None = None) -> dict[str, Any]:
-    return {"name": name, "role": role, "token": service.add_user(name, role, days_valid=days).token}
+def _add(
+    service: Client,
+    name: str,
+    role: Role,
+    *,
+    missions: Sequence[str] | None = None,
+    days: float | None = None,
+) -> dict[str, Any]:
+    made = service.add_user(name, role, missions=missions, days_valid=days)
+    return {"name": name, "role": role, "token": made.token}
 
 
-def _renew(service: Client, name: str, *, keep: bool = False, days: float | None = None) -> dict[str, Any]:
-    made = service.add_token(name, days_valid=days, revoke_others=not keep)
+def _renew(
+    service: Client,
+    name: str,
+    *,
+    keep: bool = False,
+    missions: Sequence[str] | None = None,
+    days: float | None = None,
+) -> dict[str, Any]:
+    made = service.add_token(name, missions=missions, days_valid=days, revoke_others=not keep)
     return {"name": name, "token": made.token}
 
 
 def _rank(service: Client, name: str, role: Role) -> User:
     return service.change_user(name, role=role)
+
+
+def _limit(service: Client, name: str, missions: Sequence[str] = ()) -> User:
+    return service.change_user(name, missions=list(missions))
 
 
 def _revoke(service: Client, token_id: int) -> Token:
@@ -60,18 +80,25 @@ def _ensure(arguments: argparse.Namespace) -> int:
 
 
 def _changed(user: User) -> str:
-    return f"{user.name}: {user.role}, {user.state}"
+    return f"{user.name}: {user.role}, {user.state}{_missions(user)}"
+
+
+def _missions(limited: User | Token) -> str:
+    return f", missions {', '.join(limited.missions)}" if limited.missions else ""
 
 
 def _token(one: Token) -> str:
     return (
         f"{one.id:>5}  {one.user:<12} {one.hint:<12}  {one.state:<8} created {one.created[:19]}Z  "
         f"expires {one.expires[:19] + 'Z' if one.expires else 'never':<20}  "
-        f"used {one.used[:13] + 'h' if one.used else 'never'}"
+        f"used {one.used[:13] + 'h' if one.used else 'never'}{_missions(one)}"
     )
 
 
-DAYS = {"days": Option("validity of the token in days (default: unlimited)", "D")}
+DAYS = {
+    "days": Option("validity of the token in days (default: unlimited)", "D"),
+    "missions": Option("only this mission; can be repeated (default: all)", "NAME", "--mission"),
+}
 COMMANDS: Commands = {
     "add": Command(
         _add,
@@ -90,16 +117,26 @@ COMMANDS: Commands = {
         "change_user",
         "disable a user and all tokens of the user",
         _changed,
-        preset={"state": "disabled", "role": None},
+        preset={"state": "disabled", "role": None, "missions": None},
     ),
     "enable": Command(
-        "change_user", "enable a disabled user", _changed, preset={"state": "active", "role": None}
+        "change_user",
+        "enable a disabled user",
+        _changed,
+        preset={"state": "active", "role": None, "missions": None},
+    ),
+    "missions": Command(
+        _limit,
+        "limit a user to missions",
+        _changed,
+        options={"missions": "names of mission descriptions (default: all)"},
+        positional=["missions"],
     ),
     "role": Command(_rank, "change the role of a user", _changed, positional=["role"]),
     "list": Command(
         "list_users",
         "list all users",
-        lambda user: f"{user.role:<9} {user.state:<9} {user.name}",
+        lambda user: f"{user.role:<9} {user.state:<9} {user.name}{_missions(user)}",
         "users",
         "no users",
     ),

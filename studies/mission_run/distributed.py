@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import SecretStr
 
-from ground_service.access.service import add_user, renew_token
+from ground_service.access.service import add_token, add_user
 from ground_service.client import Client
 from ground_service.clock import ClockFile, set_mission_clock
 from ground_service.contacts.links import service as links
@@ -162,4 +162,4 @@ def _token(ground: Ground, name: str) -> str:
     try:
         return add_user(ground, name, "admin")
     except Conflict:
-        return renew_token(ground, name)
+        return add_token(ground, name, revoke_others=True)

@@ -126,7 +126,7 @@ def is_flat(model: type[BaseModel]) -> bool:
             return is_plain(get_args(kind)[0])
         if origin in (Union, types.UnionType):
             return all(map(is_plain, get_args(kind)))
-        return kind in PLAIN or origin in (Literal, dict)
+        return kind in PLAIN or origin in (Literal, dict, list)
 
     fields = model.model_fields.values()
     return len(fields) == 1 or (len(fields) <= FEW and all(is_plain(field.annotation) for field in fields))

@@ -298,6 +298,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("user", "disable", "bob")
             do("user", "enable", "bob")
             do("user", "role", "bob", "operator")
+            do("user", "missions", "bob", "selenita")
+            do("user", "token", "bob", "--keep", "--mission", "selenita")
             ask("user", "disable", "ann")  # the last administrator
             ask("user", "list")
             tokens = do("user", "tokens", "bob")["tokens"]

@@ -24,9 +24,9 @@ DAY_NS = 86_400 * NS
 
 
 @links.get("/links")
-def list_links(ground: GroundOf, _: Viewer) -> PageOf[LinkStatus]:
+def list_links(ground: GroundOf, caller: Viewer) -> PageOf[LinkStatus]:
     """List the links of the mission descriptions in force with their state."""
-    return PageOf.all_of(service.list_links(ground))
+    return PageOf.all_of(caller.own(service.list_links(ground)))
 
 
 @links.get("/links/{name}")
@@ -44,7 +44,7 @@ def send_link(ground: GroundOf, caller: Operator, name: LinkName) -> LinkStatus:
 @links.get("/contacts")
 def list_contacts(
     ground: GroundOf,
-    _: Viewer,
+    caller: Viewer,
     since: Annotated[GivenTime | None, Query(description="Default: a day before mission time")] = None,
     until: Annotated[GivenTime | None, Query(description="Default: two days after `since`")] = None,
     link: Annotated[str | None, Query(max_length=64, description="Contacts of this link only")] = None,
@@ -52,4 +52,4 @@ def list_contacts(
     """List contacts that took place, were missed or are predicted from the geometry of the stations."""
     start = mission_now_ns() - DAY_NS if since is None else since.utc_ns
     stop = start + 2 * DAY_NS if until is None else until.utc_ns
-    return service.list_contacts(ground, start, stop, link)
+    return service.list_contacts(ground, start, stop, link, may_use=caller.may_use)

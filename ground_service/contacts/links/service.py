@@ -9,7 +9,7 @@ given to the link of that station.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 from sqlalchemy import Connection
@@ -119,8 +119,14 @@ def request_send(ground: Ground, name: str, *, actor: str) -> LinkStatus:
         return _link(connection, declared)
 
 
-def list_contacts(ground: Ground, start_utc_ns: int, stop_utc_ns: int, link: str | None = None) -> Contacts:
-    """Return stored and predicted contacts between two times.
+def list_contacts(
+    ground: Ground,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+    link: str | None = None,
+    may_use: Callable[[int], bool] = lambda _: True,
+) -> Contacts:
+    """Return stored and predicted contacts, of spacecraft that may be used, between two times.
 
     Raises
     ------
@@ -134,13 +140,13 @@ def list_contacts(ground: Ground, start_utc_ns: int, stop_utc_ns: int, link: str
         found = f"{(stop_utc_ns - start_utc_ns) / NS:.0f} s"
         raise InvalidInput("contacts", "until", f"a time after since, by at most {days} days", found)
     with ground.database.reading() as connection:
-        declared = _declared(connection)
-        if link is not None:
-            declared = {link: _find(connection, link)}
+        declared = _declared(connection) if link is None else {link: _find(connection, link)}
+        declared = {name: one for name, one in declared.items() if may_use(one.spacecraft_id)}
         rows = store.contacts_between(connection, start_utc_ns, stop_utc_ns, link)
         spacecraft = {
             vehicle: get_vehicle(connection, vehicle).ccsds_id for vehicle in {row.vehicle_id for row in rows}
         }
+    rows = [row for row in rows if may_use(spacecraft[row.vehicle_id])]
     contacts = [_contact(row, spacecraft[row.vehicle_id]) for row in rows]
     unpredicted = {}
     for name, one in declared.items():

@@ -34,7 +34,9 @@ async def add_ephemeris(
     stored = await upload.stored()
 
     def add() -> Ephemeris:
-        return service.add_ephemeris(ground, stored, name=name, precedence=precedence, actor=caller.name)
+        return service.add_ephemeris(
+            ground, stored, name=name, precedence=precedence, actor=caller.name, caller=caller
+        )
 
     return await upload.run(add)
 
@@ -45,5 +47,5 @@ add_list(ephemerides, "/ephemerides", store.list_ephemerides)
 @ephemerides.delete("/ephemerides/{ephemeris_id}", status_code=204, responses=problems(404, 409))
 def withdraw_ephemeris(ground: GroundOf, caller: Operator, ephemeris_id: RowId) -> Response:
     """Withdraw a reference ephemeris that no pass or window names; its file and the audit entries are kept."""
-    service.withdraw_ephemeris(ground, ephemeris_id, actor=caller.name)
+    service.withdraw_ephemeris(ground, ephemeris_id, actor=caller.name, caller=caller)
     return Response(status_code=204)

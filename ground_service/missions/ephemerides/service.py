@@ -7,9 +7,9 @@ from pathlib import Path
 
 from sqlalchemy import Connection
 
-from ground_service.access.service import audit
+from ground_service.access.service import LOCAL_CALLER, Caller, audit
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput
+from ground_service.errors import Forbidden, InvalidInput
 from ground_service.events import EphemerisAdded, publish
 from ground_service.ground import Ground
 from ground_service.missions.ephemerides import store
@@ -24,7 +24,13 @@ from lunar.messages.ephemeris_files import load_ephemeris
 
 
 def add_ephemeris(
-    ground: Ground, stored: StoredFile, *, name: str, precedence: int = 0, actor: str = "local"
+    ground: Ground,
+    stored: StoredFile,
+    *,
+    name: str,
+    precedence: int = 0,
+    actor: str = "local",
+    caller: Caller = LOCAL_CALLER,
 ) -> Ephemeris:
     """Enter an archived ephemeris file as a reference ephemeris; the same file again gives the same entry.
 
@@ -32,6 +38,8 @@ def add_ephemeris(
     ------
     InvalidInput
         If the file cannot be read as an ephemeris, or is that of an object that no mission description names.
+    Forbidden
+        If it is that of an object of another mission than those of the caller.
     """
     try:
         ephemeris = load_ephemeris(stored.path)
@@ -41,7 +49,7 @@ def add_ephemeris(
     now = utc_now_ns()
     with ground.database.writing() as connection:
         hold(connection, f"ephemeris {stored.sha256}")
-        _check_object(connection, ephemeris.segments[0].object_name)
+        _check_object(connection, ephemeris.segments[0].object_name, caller)
         register_file(connection, stored, "ephemeris", name, now)
         known = store.find_ephemeris(connection, sha256=stored.sha256, precedence=precedence, name=name)
         if known is not None:
@@ -59,15 +67,20 @@ def add_ephemeris(
         return added
 
 
-def _check_object(connection: Connection, name: str) -> None:
-    known = [one.spacecraft for one in missions_in_force(connection).values()]
-    if known and not any(one.is_object(name) for one in known):
-        names = ", ".join(one.name or "" for one in known)
+def _check_object(connection: Connection, name: str, caller: Caller) -> None:
+    missions = missions_in_force(connection)
+    owners = [number for number, one in missions.items() if one.spacecraft.is_object(name)]
+    if caller.spacecraft is not None and not (owners and caller.may_use(*owners)):
+        raise Forbidden(f"{caller.name}: expected an object of the caller's missions, found {name}")
+    if missions and not owners:
+        names = ", ".join(one.spacecraft.name or "" for one in missions.values())
         expected = f"a spacecraft with a mission description ({names}, or its spacecraft.object_names)"
         raise InvalidInput("ephemeris", "OBJECT_NAME", expected, name)
 
 
-def withdraw_ephemeris(ground: Ground, ephemeris_id: int, *, actor: str) -> None:
+def withdraw_ephemeris(
+    ground: Ground, ephemeris_id: int, *, actor: str, caller: Caller = LOCAL_CALLER
+) -> None:
     """Withdraw a reference ephemeris: plans and reports no longer use it; the audit log and its file are kept.
 
     Raises
@@ -76,6 +89,8 @@ def withdraw_ephemeris(ground: Ground, ephemeris_id: int, *, actor: str) -> None
         A pass or a window names it.
     """
     with ground.database.writing() as connection:
+        if caller.spacecraft is not None:
+            _check_object(connection, store.get_ephemeris(connection, ephemeris_id).object_name, caller)
         found = store.withdraw_ephemeris(connection, ephemeris_id)
         audit(
             connection, actor, "withdraw ephemeris", found.name, {"id": ephemeris_id, "sha256": found.sha256}

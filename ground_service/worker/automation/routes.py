@@ -13,9 +13,9 @@ automation = operations("automation")
 
 
 @automation.get("/automation/rules")
-def list_automation_rules(ground: GroundOf, _: Viewer) -> PageOf[RuleInForce]:
+def list_automation_rules(ground: GroundOf, caller: Viewer) -> PageOf[RuleInForce]:
     """List the rules in force by spacecraft, and the default rules of spacecraft without a mission description."""
-    return PageOf.all_of(service.list_rules(ground))
+    return PageOf.all_of(caller.own(service.list_rules(ground)))
 
 
 add_list(automation, "/automation/actions", store.list_automation_actions)

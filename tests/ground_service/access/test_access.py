@@ -45,7 +45,19 @@ def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> N
     ]
     (token,) = client.get(f"{V1}/tokens?user=ann", headers=admin).json()["items"]
     assert set(token) == {
-        *("id", "user", "hint", "state", "created", "expires", "revoked", "used", "parent_id", "kind")
+        *(
+            "id",
+            "user",
+            "hint",
+            "state",
+            "created",
+            "expires",
+            "revoked",
+            "used",
+            "parent_id",
+            "kind",
+            "missions",
+        )
     }
     assert made.json()["token"] not in str(token)
     changed = client.patch(f"{V1}/users/ann", json={"state": "disabled"}, headers=admin)

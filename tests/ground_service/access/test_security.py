@@ -15,6 +15,7 @@ from ground_service.errors import NotAuthorised
 from ground_service.ground import Ground
 from ground_service.http.problems import Forbidden
 
+NO_REQUEST: Any = None
 ROLES = ("viewer", "operator", "admin")
 
 
@@ -72,10 +73,10 @@ def test_a_role_may_do_what_those_below_it_may(role: str, needed: str) -> None:
     assert caller.may(needed) is allowed
     check = requires(needed)
     if allowed:
-        assert asyncio.run(check(caller)) is caller
+        assert asyncio.run(check(NO_REQUEST, caller)) is caller
     else:
         with pytest.raises(Forbidden, match=f"^ann: expected the role {needed} or higher, found {role}$"):
-            asyncio.run(check(caller))
+            asyncio.run(check(NO_REQUEST, caller))
 
 
 def test_a_role_that_does_not_exist_allows_nothing() -> None:

@@ -18,7 +18,6 @@ from ground_service.access.service import (
     has_users,
     list_tokens,
     list_users,
-    renew_token,
     revoke_token,
     token_sha256,
 )
@@ -74,7 +73,7 @@ def test_a_revoked_token_is_refused_and_others_stay(either: Ground) -> None:
     with pytest.raises(NotFound):
         revoke_token(either, 99)
     assert actions(either)[-1] == ("eve", "revoke token", "ann")
-    third = renew_token(either, "ann")
+    third = add_token(either, "ann", revoke_others=True)
     assert [token_valid(either, one) for one in (first, second, third)] == [False, False, True]
 
 
@@ -186,7 +185,7 @@ def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -
     add_user(ground, "ann", "admin", actor="eve")
     add_user(ground, "bob", "viewer", actor="ann")
     add_token(ground, "bob", actor="ann")
-    renew_token(ground, "bob", actor="ann")
+    add_token(ground, "bob", actor="ann", revoke_others=True)
     change_user(ground, "bob", role="operator", actor="ann")
     change_user(ground, "bob", state="disabled", role="viewer", actor="ann")
     change_user(ground, "bob", state="active", actor="ann")
@@ -209,7 +208,7 @@ def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -
 def test_who_is_not_named_is_local(ground: Ground) -> None:
     add_user(ground, "ann", "admin")
     add_token(ground, "ann")
-    renew_token(ground, "ann")
+    add_token(ground, "ann", revoke_others=True)
     add_user(ground, "bob", "viewer")
     change_user(ground, "bob", role="operator")
     revoke_token(ground, 3)
@@ -245,21 +244,18 @@ def test_a_token_is_shown_with_its_times_and_valid_up_to_its_last_instant(
     assert list_tokens(ground)[0].state == "revoked"
 
 
-@pytest.mark.parametrize("make", [add_token, renew_token])
-def test_further_tokens_expire_too(
-    ground: Ground, clock: Callable[[int], None], make: Callable[..., str]
-) -> None:
+def test_further_tokens_expire_too(ground: Ground, clock: Callable[[int], None]) -> None:
     add_user(ground, "ann", "viewer")
-    token = make(ground, "ann", days_valid=0.5)
+    token = add_token(ground, "ann", days_valid=0.5)
     assert list_tokens(ground)[0].expires == "2027-01-15T20:00:01.234567Z"
     clock(NOW + 12 * HOUR_NS)
     assert not token_valid(ground, token)
     with pytest.raises(
         InvalidInput, match=r"^token, days valid: expected more than 0, at most 36500, found -1"
     ):
-        make(ground, "ann", days_valid=-1)
+        add_token(ground, "ann", days_valid=-1)
     with pytest.raises(NotFound):
-        make(ground, "bob")
+        add_token(ground, "bob")
 
 
 def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(
@@ -360,7 +356,7 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground: 
     with pytest.raises(Conflict, match="user ann: exists already"):
         add_user(ground, "ann", "viewer")
     for change, message in (
-        ({}, "user ann: expected a new state or role, found neither"),
+        ({}, "user ann: expected a new state, role or missions, found none of them"),
         ({"state": "asleep"}, "user state: expected active or disabled, found 'asleep'"),
         ({"role": "root"}, "user role: expected viewer, operator, admin, found 'root'"),
     ):
@@ -398,7 +394,7 @@ def test_renewing_revokes_only_the_tokens_of_that_user(ground: Ground) -> None:
     add_user(ground, "ann", "viewer")
     revoke_token(ground, 2)
     add_token(ground, "ann")
-    renew_token(ground, "ann")
+    add_token(ground, "ann", revoke_others=True)
     # The one that was revoked before is not revoked again.
     assert details(ground)[-1][3] == {"token_id": 4, "revoked": 1}
     assert token_valid(ground, other)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ground_service.access.service import add_user
+from ground_service.access.service import Caller, add_user
 from ground_service.app import create_app
 from ground_service.contacts.commanding.service import enter_command, release_command
 from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
@@ -305,14 +305,17 @@ def test_a_description_in_an_archive_changes_nothing_of_what_people_approve(grou
     assert not released_by_one(ground, *SET_MODE)
 
 
+OPERATOR = Caller("ann", "operator")
+
+
 def test_only_an_administrator_changes_which_telecommands_need_a_second_person(ground) -> None:
     with pytest.raises(Forbidden, match="expected an administrator"):
-        add_mission(ground, approval_text(RELAXED), actor="ann", may_change_approval=False)
+        add_mission(ground, approval_text(RELAXED), actor="ann", caller=OPERATOR)
     add_mission(ground, approval_text(RAISED), actor="root")
     with pytest.raises(Forbidden):
-        add_mission(ground, TEXT.encode(), actor="ann", may_change_approval=False)
+        add_mission(ground, TEXT.encode(), actor="ann", caller=OPERATOR)
     changed = approval_text(RAISED).replace(b"fov_deg = 120", b"fov_deg = 119")
-    assert add_mission(ground, changed, actor="ann", may_change_approval=False).entered_by == "ann"
+    assert add_mission(ground, changed, actor="ann", caller=OPERATOR).entered_by == "ann"
 
 
 @pytest.mark.parametrize(

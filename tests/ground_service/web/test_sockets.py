@@ -64,7 +64,7 @@ def revoke(ground: Any, name: str) -> None:
 
 
 def renew(ground: Any, name: str) -> None:
-    users.renew_token(ground, name)
+    users.add_token(ground, name, revoke_others=True)
 
 
 @pytest.mark.parametrize("path", [LIVE, "/api/v1/payload"])

@@ -1,0 +1,256 @@
+"""Callers who are limited to missions: every operation has a decision, and none reaches another spacecraft."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fastapi.routing import APIRoute
+from sqlalchemy import BigInteger, Column, Float, Integer, LargeBinary, SmallInteger, Table
+from starlette.datastructures import QueryParams
+
+from ground_service.access.scopes import DECIDED, ROWS, Scope, check_scope, scope_of
+from ground_service.access.service import Caller, add_token, add_user, authenticate, change_user
+from ground_service.app import create_app
+from ground_service.errors import Forbidden
+from ground_service.events import CorrelationChanged, publish
+from ground_service.missions.service import add_mission
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.models import METADATA
+from lunar.timescales import format_utc
+from tests.ground_service.conftest import START, save_circle
+from tests.serving import TestClient
+
+V1 = "/api/v1"
+OURS, THEIRS = 78, 76
+KEY, REVISION = "0" * 32, "76" * 32
+DESCRIPTION = """
+name = "{name}"
+[spacecraft]
+id = {number}
+name = "{name}"
+[[links]]
+name = "{name}"
+kind = "file"
+downlink = "/nowhere/{name}"
+"""
+SAMPLE = create_app(Settings())
+CHECKED = [
+    route
+    for route in SAMPLE.state.operations
+    if isinstance(route, APIRoute)
+    and (
+        "requires.<locals>.check" in repr([one.call for one in route.dependant.dependencies])
+        or route.path.startswith(V1)
+        or route.name.endswith("report_page")
+        or route.name == "regression_page"
+    )
+]
+NAMES = [f"{'/'.join(sorted(route.methods))} {route.path}" for route in CHECKED]
+OPEN = ("all", "list", "content")
+OURS_LISTED = {"list_missions": 1, "list_spacecraft": 1, "list_links": 1, "list_automation_rules": 6}
+"""Numbers of entries of spacecraft 78."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """A service with a row of spacecraft 76 in each table, and a caller of the mission of spacecraft 78 only."""
+
+    client: TestClient
+    ours: Caller
+    theirs: Caller
+    token: str
+
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"Authorization": f"Bearer {self.token}"}
+
+    @property
+    def cookie(self) -> dict[str, str]:
+        return {"Cookie": f"linna_session={self.token}"}
+
+
+def dummy(column: Column[Any]) -> Any:
+    if isinstance(column.type, BigInteger | Integer | SmallInteger):
+        return 1
+    if isinstance(column.type, Float):
+        return 1.0
+    if isinstance(column.type, LargeBinary):
+        return b""
+    return {} if str(column.type) == "JSON" else KEY
+
+
+def row_of(connection: Any, table: Table, **given: Any) -> None:
+    """Insert a row with these values, and others that only have the type of their columns."""
+    needed = [one for one in table.c if not one.nullable and one.name not in given]
+    repository.add(connection, table, **{one.name: dummy(one) for one in needed}, **given)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    settings = Settings(home=tmp_path_factory.mktemp("fleet"), links=False, plan_hourly=False)
+    with TestClient(create_app(settings, inline_jobs=True)) as client:
+        ground = client.app.state.ground
+        for name, number in (("ours", OURS), ("theirs", THEIRS)):
+            add_mission(ground, DESCRIPTION.format(name=name, number=number).encode())
+        tables = METADATA.tables
+        with ground.database.writing() as connection:
+            row_of(connection, tables["files"], sha256=KEY)
+            row_of(connection, tables["vehicles"], id=1, ccsds_id=THEIRS, instance="flight")
+            row_of(connection, tables["vehicles"], id=2, ccsds_id=OURS, instance="flight")
+            row_of(connection, tables["passes"], id=1, vehicle_id=1)
+            row_of(
+                connection, tables["missions"], id=9, revision=REVISION, ccsds_id=THEIRS, entered_by="archive"
+            )
+            row_of(connection, tables["links"], name="theirs", ccsds_id=THEIRS)
+            row_of(connection, tables["ingests"], id=1, vehicle_id=1)
+            for name in ("landmarks", "monthly_reports"):
+                row_of(connection, tables[name], spacecraft_id=THEIRS)
+            for name in ("windows", "standing_requests", "telecommands", "alarms"):
+                row_of(connection, tables[name], id=1, vehicle_id=1)
+            row_of(connection, tables["automation_actions"], id=1, vehicle_id=1, pass_id=1)
+            row_of(connection, tables["reports"], pass_id=1)
+        token = add_user(ground, "ann", "admin", missions=["ours"])
+        other = add_user(ground, "bob", "admin", missions=["theirs"])
+        yield Fleet(client, authenticate(ground, token), authenticate(ground, other), token)
+
+
+def values_of(route: APIRoute) -> dict[str, str]:
+    """Return the path parameters of a request about spacecraft 76."""
+    known = {"spacecraft_id": str(THEIRS), "report_id": KEY, "revision": REVISION, "name": "theirs"}
+    known |= {"job_id": KEY, "key": KEY, "regression_id": KEY, "sha256": REVISION, "digest": REVISION}
+    known |= {"parameter": "x", "packet": "x", "month": "2029-08", "ticks": "1", "frame_number": "1"}
+    return {name: known.get(name, "1") for name in re.findall(r"{(\w+)", route.path)}
+
+
+def test_every_decision_is_that_of_an_operation() -> None:
+    names = {route.name for route in SAMPLE.state.operations}
+    assert len(CHECKED) > 100
+    assert [one for found in DECIDED.values() for one in found if one not in names] == []
+
+
+@pytest.mark.parametrize("route", CHECKED, ids=NAMES)
+def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: APIRoute, fleet: Fleet) -> None:
+    scope = scope_of(route)
+    assert scope is not None, "decide in ground_service/access/scopes.py which spacecraft it concerns"
+    values = values_of(route)
+    stated = {scope.parameter: 1 if scope.parameter in ROWS else THEIRS}
+    query = QueryParams(stated if scope.place == "query" else {})
+    body: Any = stated if scope.place == "body" else None
+    if scope.decision not in OPEN:
+        for method in route.methods - {"HEAD"}:
+            path = route.path.format(**values)
+            headers = fleet.headers if path.startswith(V1) else fleet.cookie
+            answer = fleet.client.request(method, path, params=dict(query), json=body, headers=headers)
+            assert answer.status_code == 403, answer.text
+            assert "expected a spacecraft of the missions ours, found" in answer.json()["detail"]
+    state = SimpleNamespace(ground=fleet.client.app.state.ground)
+    asked = SimpleNamespace(
+        scope={"route": route},
+        path_params=values,
+        query_params=query,
+        _json=body,
+        app=SimpleNamespace(state=state),
+    )
+    for caller in (Caller("eve", "viewer"), fleet.theirs):
+        if scope.decision == "service" and caller.missions is not None:
+            with pytest.raises(Forbidden, match="found an operation of the whole service"):
+                check_scope(asked, caller)  # type: ignore[arg-type]
+        else:
+            check_scope(asked, caller)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", sorted(DECIDED["list"]))
+def test_a_list_leaves_out_other_spacecraft(name: str, fleet: Fleet) -> None:
+    (route,) = (one for one in CHECKED if one.name == name)
+    answer = fleet.client.get(route.path, headers=fleet.headers)
+    assert answer.status_code == 200, answer.text
+    assert "theirs" not in answer.text and f'"spacecraft_id":{THEIRS}' not in answer.text
+    assert answer.json().get("total", 0) == OURS_LISTED.get(name, 0)
+
+
+def test_an_operation_without_a_decision_is_refused(fleet: Fleet) -> None:
+    async def new() -> None: ...
+
+    route = APIRoute("/new", new)
+    assert scope_of(route) is None
+    asked: Any = SimpleNamespace(scope={"route": route})
+    with pytest.raises(Forbidden, match="operation of the whole service"):
+        check_scope(asked, fleet.ours)
+
+
+def test_a_spacecraft_that_is_not_stated_is_not_one_of_the_caller(fleet: Fleet) -> None:
+    answer = fleet.client.post(f"{V1}/telemetry", content=b"x", headers=fleet.headers)
+    assert answer.status_code == 403
+    assert "as spacecraft_id, found none" in answer.json()["detail"]
+    search = {"spacecraft_id": None, "start": format_utc(START), "stop": format_utc(START + 10**12)}
+    assert fleet.client.post(f"{V1}/windows/search", json=search, headers=fleet.headers).status_code == 403
+    assert fleet.client.get(f"{V1}/parameters", headers=fleet.headers).status_code == 403
+    assert fleet.client.get(f"{V1}/parameters?spacecraft_id={OURS}", headers=fleet.headers).status_code != 403
+
+
+def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet: Fleet, tmp_path: Any) -> None:
+    for name, number in (("ours", THEIRS), ("theirs", OURS), ("theirs", THEIRS), ("ours", 5)):
+        text = DESCRIPTION.format(name=name, number=number) + "[evidence]\nseed = 1\n"
+        answer = fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers)
+        assert answer.status_code == 403, answer.text
+    text = DESCRIPTION.format(name="ours", number=OURS) + "[evidence]\nseed = 1\n"
+    assert (
+        fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers).status_code == 201
+    )
+    orbit = save_circle(tmp_path / "orbit.oem").read_text()
+    added = {}
+    for name in ("THEIRS", "OURS"):
+        named = re.sub(r"(OBJECT_NAME\s*=\s*)\S.*", rf"\g<1>{name}", orbit)
+        answer = fleet.client.post(f"{V1}/ephemerides", content=named.encode(), headers=fleet.headers)
+        added[name] = answer.status_code
+        if name == "THEIRS":
+            unlimited = {
+                "Authorization": f"Bearer {add_user(fleet.client.app.state.ground, 'eve', 'operator')}"
+            }
+            foreign = fleet.client.post(
+                f"{V1}/ephemerides", content=named.encode(), headers=unlimited
+            ).json()["id"]
+        else:
+            own = answer.json()["id"]
+    assert added == {"THEIRS": 403, "OURS": 201}
+    assert fleet.client.delete(f"{V1}/ephemerides/{foreign}", headers=fleet.headers).status_code == 403
+    assert fleet.client.delete(f"{V1}/ephemerides/{own}", headers=fleet.headers).status_code == 204
+
+
+def test_a_token_limits_its_user_further_and_so_do_its_sessions(fleet: Fleet) -> None:
+    client, ground = fleet.client, fleet.client.app.state.ground
+    add_user(ground, "fay", "viewer", missions=["ours", "theirs"])
+    token = add_token(ground, "fay", missions=["ours", "elsewhere"])
+    assert authenticate(ground, token).missions == ("ours",)
+    assert authenticate(ground, token).spacecraft == {OURS}
+    started = client.post(f"{V1}/session", json={"token": token})
+    assert started.json()["missions"] == ["ours"]
+    cookie = {"Cookie": f"linna_session={started.cookies['linna_session']}"}
+    client.cookies.clear()
+    assert client.get(f"{V1}/passes/1", headers=cookie).status_code == 403
+    change_user(ground, "fay", missions=["theirs"])
+    assert authenticate(ground, token).spacecraft == frozenset()
+    change_user(ground, "fay", missions=[])
+    assert authenticate(ground, token).spacecraft == {OURS}
+
+
+def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet: Fleet) -> None:
+    ground = fleet.client.app.state.ground
+    with fleet.client.websocket_connect(f"{V1}/live", headers=fleet.headers) as socket:
+        for vehicle in (1, 2):
+            with ground.database.writing() as connection:
+                publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=1))
+        assert socket.receive_json()["payload"]["vehicle_id"] == 2
+    with fleet.client.websocket_connect(f"{V1}/live?after=0", headers=fleet.headers) as socket:
+        assert socket.receive_json()["payload"]["vehicle_id"] == 2
+
+
+def test_a_scope_names_its_parameter() -> None:
+    (route,) = (one for one in CHECKED if one.name == "enter_telecommand")
+    assert scope_of(route) == Scope("spacecraft", "body", "spacecraft_id")
