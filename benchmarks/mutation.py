@@ -141,7 +141,6 @@ GROUPS = {
                 "observer",
                 "acquisition",
                 "burns",
-                "relative",
                 "landmark_map",
             )
         ),

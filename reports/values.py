@@ -335,7 +335,6 @@ class DetectorScore:
     curves: tuple[PrecisionRecallCurve, ...] = ()
     calibration: tuple[CalibrationBin, ...] = ()
     residuals: ResidualSeries | None = None
-    repeatability: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

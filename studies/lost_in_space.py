@@ -24,14 +24,11 @@ from lunar.camera import PinholeCamera, project_mcmf
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.navigation.lost_in_space import (
-    FRAMES_COMBINED,
-    LostFrame,
     LostParameters,
     Place,
     believed_place,
     candidate_places,
     place_index,
-    place_of_frames,
 )
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
 from payload_emulator.flight.vision.detections import Detections
@@ -40,6 +37,7 @@ from payload_emulator.session.camera import expose
 from payload_emulator.session.loading import onboard_catalogue
 from payload_emulator.session.scenario import DisturbancesSection, Scenario
 from payload_emulator.session.world import World
+from studies.lost_frames import FRAMES_COMBINED, LostFrame, place_of_frames
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 

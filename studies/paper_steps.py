@@ -243,7 +243,7 @@ def sample_dataset(shop: Workshop) -> dict[str, Any]:
 
     def make() -> dict[str, Any]:
         from payload_emulator.training.data.integrity import summarise
-        from payload_emulator.training.data.sheet import draw_sheet
+        from payload_emulator.training.evaluate.sheets import draw_sheet
 
         _build(shop, recipe, folder, shop.effort.sample_frames)
         sheet = draw_sheet(Dataset(folder), "", SAMPLE_COLUMNS, SAMPLE_ROWS, 320)

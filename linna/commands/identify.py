@@ -49,11 +49,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.flight.navigation.lost_in_space import FRAMES_COMBINED, LostParameters
+    from payload_emulator.flight.navigation.lost_in_space import LostParameters
     from payload_emulator.session.mission import level_of, level_text, unseen_share
     from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world import build_world
     from studies import lost_in_space as study
+    from studies.lost_frames import FRAMES_COMBINED
 
     _check(arguments, FRAMES_COMBINED)
     scenario = study.pointed(load_scenario(arguments.scenario), arguments.attitude_deg)

@@ -54,7 +54,8 @@ def _run_frame(arguments: argparse.Namespace) -> int:
     from linna.data import blender_python, data_folder
     from lunar.timescales import parse_utc
     from payload_emulator.session.frame import render_frame
-    from payload_emulator.training.evaluate.sheets import draw_labels, save_octets, save_png
+    from payload_emulator.training.data.dataset import write_whole
+    from payload_emulator.training.evaluate.sheets import draw_labels, save_png
 
     frame = render_frame(
         _scenario(arguments),
@@ -72,7 +73,7 @@ def _run_frame(arguments: argparse.Namespace) -> int:
     }
     if frame.filmic_png:
         filmic = arguments.out.with_name(f"{arguments.out.stem}-filmic.png")
-        save_octets(frame.filmic_png, filmic)
+        write_whole(filmic, frame.filmic_png)
         figures["filmic"] = str(filmic)
     log(f"{arguments.out}: {len(frame.labels)} craters; data: {'; '.join(frame.data_names)}")
     metadata = frame.metadata

@@ -21,6 +21,7 @@ from payload_emulator.session.scenario import SHIPPED, FaultsSection, Scenario
 from payload_emulator.session.schedule import fly_scenario
 from payload_emulator.session.spacecraft import new_spacecraft
 from payload_emulator.session.starting import load_scenario_payload
+from payload_emulator.session.typed_toml import TableFault, read_table
 from payload_emulator.session.world import World, build_world, clock_ticks
 from payload_emulator.sim.board.faults import Fault, parse_fault
 from tmtc.cuc import TICKS_PER_SECOND
@@ -28,7 +29,6 @@ from tmtc.dictionary import DICTIONARY
 
 CAMPAIGNS = SHIPPED / "campaigns"
 _SETTLING_S = 240.0
-_KEYS = {"name": str, "faults": list, "events": list, "safe": bool}
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
@@ -37,7 +37,7 @@ Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 class Case:
     """Faults that come together, the events of which one tells of them, and whether the payload shall end waiting."""
 
-    name: str
+    name: str = ""
     faults: tuple[str, ...] = ()
     events: tuple[str, ...] = ()
     safe: bool = False
@@ -48,8 +48,8 @@ class Campaign:
     """Cases to be flown with each of the seeds."""
 
     name: str
-    seeds: tuple[int, ...]
-    cases: tuple[Case, ...]
+    seeds: tuple[int, ...] = (1,)
+    case: tuple[Case, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,36 +86,23 @@ def load_campaign(path: Path | str) -> Campaign:
         raise ScenarioError(f"{path}: no such campaign file; shipped campaigns: {shipped}") from None
     except (ValueError, RecursionError) as error:
         raise ScenarioError(f"{where}: not TOML: {error}") from None
-    seeds, cases = table.get("seeds", [1]), table.get("case", [])
-    if not isinstance(seeds, list) or not seeds or not all(type(seed) is int and seed >= 0 for seed in seeds):
-        raise ScenarioError(f"{where}: seeds must be a list of whole numbers from 0, found {seeds!r}")
-    if not isinstance(cases, list) or not cases:
-        raise ScenarioError(f"{where}: expected one [[case]] or more, found none")
-    return Campaign(
-        str(table.get("name", where.stem)),
-        tuple(seeds),
-        tuple(_case(entry, f"{where}, case {k + 1}") for k, entry in enumerate(cases)),
-    )
-
-
-def _case(entry: dict[str, Any], where: str) -> Case:
-    for key, value in entry.items():
-        if key not in _KEYS:
-            raise ScenarioError(f"{where}: unknown key {key!r}; known keys: {', '.join(_KEYS)}")
-        if type(value) is not _KEYS[key]:
-            raise ScenarioError(f"{where}: {key} must be a {_KEYS[key].__name__}, found {value!r}")
+    try:
+        campaign = read_table(Campaign, {"name": where.stem} | table)
+    except TableFault as fault:
+        raise ScenarioError(f"{where}: {fault}") from None
+    if not campaign.seeds or min(campaign.seeds) < 0 or not campaign.case:
+        raise ScenarioError(f"{where}: expected seeds from 0 and one [[case]] or more, found none")
     known = DICTIONARY.labels("event_info", "event_id").values()
-    for event in entry.get("events", []):
-        if event not in known:
-            raise ScenarioError(f"{where}: events must be names of the dictionary, found {event!r}")
-    for text in entry.get("faults", []):
-        parse_fault(text)
-    return Case(
-        str(entry.get("name", where)),
-        tuple(entry.get("faults", [])),
-        tuple(entry.get("events", [])),
-        bool(entry.get("safe", False)),
-    )
+    for number, case in enumerate(campaign.case, start=1):
+        for event in case.events:
+            if event not in known:
+                raise ScenarioError(
+                    f"{where}, case {number}: events must be names of the dictionary, found {event!r}"
+                )
+        for text in case.faults:
+            parse_fault(text)
+    named = [replace(case, name=case.name or f"case {k}") for k, case in enumerate(campaign.case, start=1)]
+    return replace(campaign, case=tuple(named))
 
 
 def run_campaign(
@@ -124,7 +111,7 @@ def run_campaign(
     """Fly every case with every seed; the world is made once."""
     world = build_world(scenario, data)
     loaded, _, _ = load_scenario_payload(world, data)
-    runs = [(case, seed) for case in campaign.cases for seed in campaign.seeds]
+    runs = [(case, seed) for case in campaign.case for seed in campaign.seeds]
     return [
         fly_case(world, loaded, case, seed)
         for case, seed in (progress(runs, len(runs)) if progress else runs)

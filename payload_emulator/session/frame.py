@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,6 @@ from payload_emulator.sim.render.light import sun_angles
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.renderer import Rendering
 from payload_emulator.sim.render.sensor import Picture, take_picture
-
-RENDERERS = ("fast", "raymarch", "cycles")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,15 +85,21 @@ def render_frame(
     ScenarioError
         The epoch lies outside the orbit, or the spacecraft is below the ground.
     """
-    require_renderer(renderer_name)
+    find_renderer(renderer_name)
     world = world_at(scenario, data, [utc_ns])
     return take_frame(world, view_at(world, utc_ns), renderer_name, blender_python)
 
 
-def require_renderer(name: str) -> None:
-    """Refuse a renderer that there is not."""
-    if name not in RENDERERS:
-        raise ScenarioError(f"renderer: expected one of {', '.join(RENDERERS)}, found {name!r}")
+def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[..., Rendering]:
+    """The renderer of a name, called as `renderer.render`; `blender_python` is the interpreter that has Blender."""
+    if name == "cycles":
+        from payload_emulator.sim.render import cycles
+
+        return partial(cycles.render, python=blender_python)
+    found: dict[str, Callable[..., Rendering]] = {"fast": renderer.render, "raymarch": raymarch.render}
+    if name not in found:
+        raise ScenarioError(f"renderer: expected one of fast, raymarch, cycles, found {name!r}")
+    return found[name]
 
 
 def world_at(scenario: Scenario, data: DataFolder, epochs_utc_ns: Sequence[int]) -> World:
@@ -168,7 +173,7 @@ def take_frame(
         picture = render_scene(describe_scene(*pose, law), CyclesSettings(), blender_python)
         rendering, filmic_png = picture.rendering, picture.filmic_png
     else:
-        rendering = {"fast": renderer.render, "raymarch": raymarch.render}[renderer_name](*pose, law)
+        rendering = find_renderer(renderer_name)(*pose, law)
     # The noise is drawn from a separate stream: light and noise of a view do not depend on each other.
     rng = np.random.default_rng((world.scenario.seed, view.utc_ns, 1))
     metadata = metadata_of(world, view) | {"renderer": renderer_name}

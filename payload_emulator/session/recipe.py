@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,11 +30,6 @@ PAPER_SPLIT = "80/15/5"
 """Split of a source along an ephemeris: the last 5 % of its frames in time are the test arc, the rest is shuffled."""
 
 PAPER_SHARES = (0.80, 0.15, 0.05)
-TERRAINS = ("procedural", "real", "catalogue")
-LIGHTS = ("wide", "low", "paper")
-DEPTHS = (8, 16)
-COLOURS = ("gray", "rgb")
-FOOTPRINTS = ("inside", "centre")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +95,13 @@ class Source:
 
     name: str
     split: str
-    terrain: str
+    terrain: Literal["procedural", "real", "catalogue"]
     share: float
     seeds: tuple[int, ...] = (1,)
     boxes: tuple[Box, ...] = EVERYWHERE
     avoid: tuple[Box, ...] = ()
     buffer_km: float = 60.0
-    light: str = "wide"
+    light: Literal["wide", "low", "paper"] = "wide"
     vary: bool = True
     altitude_km: tuple[float, float] = (12.0, 50.0)
     ephemeris: str = ""
@@ -114,7 +109,7 @@ class Source:
     days: float = 1.0
     latitude_limit_deg: float = 60.0
     sharpen: bool = True
-    footprint: str = "inside"
+    footprint: Literal["inside", "centre"] = "inside"
     label_minimum_px: float = 5.0
     views: int = 1
     view_step_km: float = 24.5
@@ -136,9 +131,9 @@ class Recipe:
     height_px: int = 512
     fov_deg: float = 120.0
     frames_per_shard: int = 20
-    bits: int = 8
+    bits: Literal[8, 16] = 8
     renderer: str = "fast"
-    colour: str = "gray"
+    colour: Literal["gray", "rgb"] = "gray"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values; what came later than the first data sets is left out where it is not used."""
@@ -214,22 +209,22 @@ def load_recipe(path: Path) -> Recipe:
     for key in ("name", "seed"):
         if key not in settings:
             raise DatasetError(f"{path}: dataset.{key}: expected a value, found none")
-    if settings.get("bits", 8) not in DEPTHS:
-        raise DatasetError(f"{path}: dataset.bits: expected 8 or 16, found {settings['bits']!r}")
-    if settings.get("colour", "gray") not in COLOURS:
-        raise DatasetError(f"{path}: dataset.colour: expected gray or rgb, found {settings['colour']!r}")
     empty = Recipe(str(settings["name"]), 0, tuple(_source(path, n, item) for n, item in enumerate(sources)))
     return _read(path, "dataset", Recipe, settings, empty)
 
 
 def _read(path: Path, where: str, kind: type[Record], table: object, present: Record | None = None) -> Record:
     try:
-        return read_table(kind, table, present=present)
+        return read_table(kind, table, present=present, bounds=_bounds)
     except TableFault as fault:
         if not fault.known:
             raise DatasetError(f"{path}: {where}: {fault}") from None
         hint = f" (did you mean {fault.nearest!r}?)" if fault.nearest else ""
         raise DatasetError(f"{path}: {where}: unknown key {fault.place!r}{hint}") from None
+
+
+def _bounds(name: str) -> tuple[float, float]:
+    return (1.0, 50.0) if name == "label_minimum_px" else (-math.inf, math.inf)
 
 
 def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
@@ -239,26 +234,15 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
         if key not in values:
             raise DatasetError(f"{path}: {where}: {key}: expected a value, found none")
     splits = (*SPLITS, PAPER_SPLIT) if values.get("ephemeris") else SPLITS
-    for key, allowed in (
-        ("split", splits),
-        ("terrain", TERRAINS),
-        ("light", LIGHTS),
-        ("footprint", FOOTPRINTS),
-    ):
-        if key in values and values[key] not in allowed:
-            raise DatasetError(
-                f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}"
-            )
-    if "sharpen" in values and (values["terrain"] != "real" or not isinstance(values["sharpen"], bool)):
+    if values["split"] not in splits:
+        raise DatasetError(
+            f"{path}: {where}: split: expected one of {', '.join(splits)}, found {values['split']!r}"
+        )
+    if "sharpen" in values and values["terrain"] != "real":
         raise DatasetError(
             f"{path}: {where}: sharpen: expected true or false on real terrain, found {values['sharpen']!r} "
             f"on {values['terrain']} terrain"
         )
-    if "label_minimum_px" in values:
-        least = values["label_minimum_px"]
-        if isinstance(least, bool) or not isinstance(least, (int, float)) or not 1.0 <= least <= 50.0:
-            raise DatasetError(f"{path}: {where}: label_minimum_px: expected 1 to 50, found {least!r}")
-        values["label_minimum_px"] = float(least)
     for key in ("boxes", "avoid"):
         if key in values:
             values[key] = [_box(path, f"{where}: {key}", item) for item in values[key]]

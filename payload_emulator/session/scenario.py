@@ -8,10 +8,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
@@ -464,8 +464,10 @@ LARGEST_REGISTRATION_M = 5_000.0
 _MOON_RADIUS_KM = 1737.4
 
 
-Require = Callable[[bool, str, str, object], None]
-"""Refuses a value unless the first argument holds; the others are the key, what is expected and what was found."""
+class Require(Protocol):
+    """Refuses a value unless `good` holds; None for what was found: the value of the key."""
+
+    def __call__(self, good: bool, key: str, expected: str, found: object = None) -> None: ...
 
 
 def _check_cartesian(orbit: OrbitSection, require: Require) -> None:
@@ -479,9 +481,8 @@ def _check_cartesian(orbit: OrbitSection, require: Require) -> None:
             getattr(orbit, key) == getattr(default, key),
             f"orbit.{key}",
             "absent where orbit.position_km is given",
-            getattr(orbit, key),
         )
-    require(not orbit.oem, "orbit.oem", "absent where orbit.position_km is given", orbit.oem)
+    require(not orbit.oem, "orbit.oem", "absent where orbit.position_km is given")
     require(
         math.hypot(*orbit.position_km) > _MOON_RADIUS_KM,
         "orbit.position_km",
@@ -504,8 +505,10 @@ _ELEMENT_KEYS = (
 def _check(scenario: Scenario, source: str) -> None:
     """Refuse what cannot be flown; each message names the key, what is expected and what was found."""
 
-    def require(good: bool, key: str, expected: str, found: object) -> None:
+    def require(good: bool, key: str, expected: str, found: object = None) -> None:
         if not good:
+            section, _, name = key.partition(".")
+            found = getattr(getattr(scenario, section), name) if found is None else found
             raise ScenarioError(f"{source}: {key} must be {expected}, found {found!r}")
 
     for check in (
@@ -517,12 +520,13 @@ def _check(scenario: Scenario, source: str) -> None:
         _check_disturbances,
         _check_light,
         _check_navigation,
-        _check_link,
         _check_instruments,
     ):
         check(scenario, require)
     for text in scenario.faults.events:
         parse_fault(text)
+    for text in scenario.link.outages:
+        parse_outage(text)
 
 
 _ANY = math.inf
@@ -582,9 +586,7 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
     if orbit.position_km or orbit.velocity_km_s:
         _check_cartesian(orbit, require)
     elif not orbit.oem:
-        require(
-            0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1", orbit.eccentricity
-        )
+        require(0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1")
         perilune_km = orbit.semi_major_axis_km * (1.0 - orbit.eccentricity)
         require(
             perilune_km > _MOON_RADIUS_KM,
@@ -600,7 +602,6 @@ def _check_window(scenario: Scenario, require: Require) -> None:
         0.0 < window.latitude_limit_deg <= 90.0,
         "window.latitude_limit_deg",
         "over 0 and up to 90",
-        window.latitude_limit_deg,
     )
     lowest_deg, highest_deg = window.latitude_band_deg
     require(
@@ -613,13 +614,11 @@ def _check_window(scenario: Scenario, require: Require) -> None:
         0.0 < window.longitude_max_deg - window.longitude_min_deg <= 360.0,
         "window.longitude_max_deg",
         "over window.longitude_min_deg by up to 360",
-        window.longitude_max_deg,
     )
     require(
         window.search != "none" or window.duration_s > 0.0,
         "window.duration_s",
         "positive when window.search is 'none'",
-        window.duration_s,
     )
 
 
@@ -629,13 +628,11 @@ def _check_terrain(scenario: Scenario, require: Require) -> None:
         not shift or (len(shift) == 2 and max(map(abs, shift)) <= LARGEST_REGISTRATION_M),
         "terrain.registration_north_east_m",
         f"empty or two numbers of at most {LARGEST_REGISTRATION_M:g} m",
-        shift,
     )
     require(
         not shift or scenario.terrain.source in ("auto", "raster", "photograph"),
         "terrain.registration_north_east_m",
         f"empty where terrain.source is {scenario.terrain.source!r}",
-        shift,
     )
 
     photographs = scenario.terrain.photographs
@@ -643,13 +640,11 @@ def _check_terrain(scenario: Scenario, require: Require) -> None:
         bool(photographs) == (scenario.terrain.source == "photograph"),
         "terrain.photographs",
         "files where terrain.source is 'photograph', and none elsewhere",
-        photographs,
     )
     require(
         not scenario.terrain.heights or scenario.terrain.source == "photograph",
         "terrain.heights",
         f"empty where terrain.source is {scenario.terrain.source!r}",
-        scenario.terrain.heights,
     )
 
 
@@ -659,9 +654,8 @@ def _check_detector(scenario: Scenario, require: Require) -> None:
         detector.score_threshold < 0.0 or 0.0 < detector.score_threshold < 1.0,
         "detector.score_threshold",
         "between 0 and 1, or negative for that of the network",
-        detector.score_threshold,
     )
-    require(detector.network != "", "detector.network", "a shipped network or an ONNX file", detector.network)
+    require(detector.network != "", "detector.network", "a shipped network or an ONNX file")
 
 
 def _check_disturbances(scenario: Scenario, require: Require) -> None:
@@ -671,7 +665,6 @@ def _check_disturbances(scenario: Scenario, require: Require) -> None:
         not (moved and (scenario.maneuvers.enabled or orbit.oem)),
         "maneuvers.enabled",
         "false, and orbit.oem empty, where [disturbances] change the orbit",
-        scenario.maneuvers.enabled,
     )
 
 
@@ -681,13 +674,11 @@ def _check_light(scenario: Scenario, require: Require) -> None:
         light.elevation_min_deg <= light.elevation_max_deg,
         "light.elevation_min_deg",
         "no more than light.elevation_max_deg",
-        light.elevation_min_deg,
     )
     require(
         light.azimuth_min_deg <= light.azimuth_max_deg,
         "light.azimuth_min_deg",
         "no more than light.azimuth_max_deg",
-        light.azimuth_min_deg,
     )
 
 
@@ -700,13 +691,7 @@ def _check_navigation(scenario: Scenario, require: Require) -> None:
         reference.transverse_m >= 2.0 * reference.radial_m,
         "reference.transverse_m",
         "at least twice reference.radial_m",
-        reference.transverse_m,
     )
-
-
-def _check_link(scenario: Scenario, require: Require) -> None:
-    for text in scenario.link.outages:
-        parse_outage(text)
 
 
 def _check_instruments(scenario: Scenario, require: Require) -> None:

@@ -44,8 +44,6 @@ _SETTLED_ARC, _SETTLED_FRAMES = 2, 20
 # A pair is right if the crater truly lies within this of the detection: six pixels, or a quarter of its diameter.
 _RIGHT_PX, _RIGHT_OF_DIAMETER = 6.0, 0.25
 _LOG_DIAMETER_GATE = 0.4
-# A fix that leaves the position further off than this is wrong, whatever it was made of.
-_WRONG_FIX_M = 1_000.0
 # After a disturbance the estimate is back once it is this close, and stays so for as many frames with an image.
 _BACK_M, _BACK_FRAMES = 500.0, 4
 
@@ -172,9 +170,6 @@ def score_navigation(world: World, judged: JudgedSession | None) -> dict[str, An
     rows = [_arc_row(world, errors, judged.outcome, arc) for arc in arcs]
     first = arcs[_SETTLED_ARC][0] if len(arcs) > _SETTLED_ARC else _SETTLED_FRAMES
     settled = imaging[errors.frame] & (errors.frame >= first)
-    off = np.zeros(fixed.size, dtype=bool)
-    off[errors.frame] = errors.position_m > _WRONG_FIX_M
-    rich = imaging & (judged.findable >= 4)
     coast = errors.coast_end_m[errors.frame >= first]
     return {
         "navigation": {
@@ -193,12 +188,9 @@ def score_navigation(world: World, judged: JudgedSession | None) -> dict[str, An
             "nees6": _means(errors.nees[settled, None])[0],
             "nis_per_degree": judged.nis_per_degree(fixed),
             "fixed_share_imaging": _ratio(float(np.sum(fixed & imaging)), float(np.sum(imaging))),
-            "fixed_share_four_findable": _ratio(float(np.sum(fixed & rich)), float(np.sum(rich))),
-            "frames_four_findable": int(np.sum(rich)),
             "pairs": int(judged.pairs.sum()),
             "wrong_pairs_share": _ratio(float(judged.pairs[:, 1].sum()), float(judged.pairs.sum())),
             "wrong_fixes": judged.wrong_fixes,
-            "fixes_off_by_1_km": int(np.sum(fixed & off & (np.arange(fixed.size) >= first))),
             "recovery": _recovery(world, errors, imaging),
             "per_arc": rows,
         }

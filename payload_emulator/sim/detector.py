@@ -24,7 +24,7 @@ class SimulatedDetector:
     Attributes
     ----------
     recall
-        By size class 0, 1, 2 and 3 (3 to 5 km); `recall_outside` of craters of no class.
+        By size class 0, 1, 2 and 3 (3 to 5 km); craters of other sizes are not found.
     precision
         Share of detections that are craters; the others are distributed uniformly, with the diameters of true ones.
     sigma_px
@@ -41,7 +41,6 @@ class SimulatedDetector:
     """
 
     recall: tuple[float, float, float, float] = (0.6, 0.6, 0.7, 0.6)
-    recall_outside: float = 0.0
     precision: float = 0.85
     sigma_px: float = 1.5
     claimed_sigma_px: float | None = None
@@ -60,7 +59,7 @@ class SimulatedDetector:
 
     def found(self, diameter_m: FloatArray, rng: np.random.Generator) -> IntArray:
         """Return the indices of the craters (n,) that are found."""
-        recall = np.array([*self.recall, self.recall_outside])[size_class(diameter_m)]
+        recall = np.array([*self.recall, 0.0])[size_class(diameter_m)]
         return np.flatnonzero(rng.uniform(size=diameter_m.size) < recall)
 
     def detect(

@@ -11,7 +11,7 @@ from reports.figures import detector, gallery
 from reports.figures.canvas import WIDTH_IN
 from reports.published import SOURCE, TABLE_II
 from reports.sections.common import PassView
-from reports.text import NOT_A_VALUE, count_text, number_text, percent_text, significant_text
+from reports.text import NOT_A_VALUE, count_text, number_text, significant_text
 from reports.values import ClassScore, DetectorScore, GalleryFrame, ResidualSeries
 
 
@@ -94,15 +94,6 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
         )
     if score.residuals is not None and np.isfinite(score.residuals.du_px).any():
         blocks.append(_residuals(score.residuals))
-    if score.repeatability is not None and math.isfinite(score.repeatability):
-        blocks.append(
-            Paragraph(
-                f"Repeatability: a crater detected in one frame and visible in the next is detected again in "
-                f"{percent_text(score.repeatability, 1.0)} of cases. Frame-to-frame matching needs this twice, "
-                "a catalogue once.",
-                small=True,
-            )
-        )
     return blocks
 
 

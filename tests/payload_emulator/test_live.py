@@ -424,17 +424,21 @@ def test_the_shipped_campaign_names_every_kind_of_fault() -> None:
     campaign = load_campaign("faults")
     page = (Path(__file__).resolve().parents[2] / "docs" / "payload.md").read_text()
     assert all(f"`{kind}`" in page for kind in FAULT_KINDS)
-    assert {text.split()[0] for case in campaign.cases for text in case.faults} == set(FAULT_KINDS)
+    assert {text.split()[0] for case in campaign.case for text in case.faults} == set(FAULT_KINDS)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name = 1\n[[case]]\nfaults = ['meteor at 3']", "expected one of camera_dark"),
+        ("name = 'c'\n[[case]]\nfaults = ['meteor at 3']", "expected one of camera_dark"),
         ("[[case]]\nevents = ['boom']", "case 1: events must be names of the dictionary, found 'boom'"),
-        ("[[case]]\nfault = []", "unknown key 'fault'"),
-        ("seeds = []\n[[case]]\n", "seeds must be a list of whole numbers"),
-        ("seeds = [1]", "expected one .* or more, found none"),
+        (
+            "[[case]]\nfault = []",
+            r"case\[0\].fault: expected one of name, faults, events, safe, found an unknown key",
+        ),
+        ("seeds = []\n[[case]]\n", "expected seeds from 0"),
+        ("seeds = [1]", "one .* or more, found none"),
+        ("seeds = ['a']\n[[case]]\n", "expected a whole number, found 'a'"),
         ("[[", "not TOML"),
     ],
 )

@@ -282,7 +282,6 @@ def detector_score(seed: int = 3) -> DetectorScore:
             for s in np.arange(0.35, 1.0, 0.1)
         ),
         residuals=ResidualSeries(u, v, du, dv, azimuth, rng.uniform(8, 70, n)),
-        repeatability=0.81,
     )
 
 

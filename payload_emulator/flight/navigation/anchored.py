@@ -53,7 +53,6 @@ from payload_emulator.flight.navigation.landmark_map import (
 )
 from payload_emulator.flight.navigation.lost_in_space import PlaceIndex, place_index
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.flight.navigation.relative import Remembered, tie, with_clone, without_clone
 from payload_emulator.flight.navigation.scalar import Innovation, ScalarMeasurement, scalar_update
 from payload_emulator.flight.navigation.sighting import (
     LandmarkMap,
@@ -133,8 +132,6 @@ class AnchoredState:
     trusted
         Predictions for the frames in the window of the monitor since the last reset of the filter, oldest first,
         without craters; none while the attitude is degraded.
-    previous
-        Detections of the previous frame for the relative measurement; None without.
     places
         Search index of `landmarks`; None before the first search.
     """
@@ -148,7 +145,6 @@ class AnchoredState:
     fixed_ticks: int | None = None
     attitude: AttitudeMonitor = field(default_factory=AttitudeMonitor)
     trusted: tuple[FilterState, ...] = ()
-    previous: Remembered | None = None
     places: PlaceIndex | None = None
 
 
@@ -193,8 +189,6 @@ class AnchoredReport:
         The fix came from a widened search.
     lost
         The estimate is too uncertain to be of use.
-    ties
-        Detections of the previous frame that were found again by the relative measurement.
     fix
         The fix; None without one.
     new_landmarks
@@ -215,7 +209,6 @@ class AnchoredReport:
     expected: int
     reacquired: bool
     lost: bool = False
-    ties: int = 0
     fix: Fix | None = None
     new_landmarks: tuple[Landmark, ...] = ()
     attitude_declared_rad: float = 0.0
@@ -247,7 +240,6 @@ class _Decisions:
     candidates: int = 0
     expected: int = 0
     attitude_declared_rad: float = 0.0
-    ties: int = 0
     fix: Fix | None = None
     new_landmarks: tuple[Landmark, ...] = field(default=())
 
@@ -302,7 +294,7 @@ def step(
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
     prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors)
     if prior is not None and not is_usable(prior, parameters.limits):
-        state = replace(state, estimate=setup.initial, fixed_ticks=None, previous=None, trusted=())
+        state = replace(state, estimate=setup.initial, fixed_ticks=None, trusted=())
         prior = predicted(setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors)
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
@@ -314,9 +306,6 @@ def step(
         return state, _report(state, setup, Outcome.no_image, mcmf_from_icrf, decided)
     if camera_from_icrf is None or not len(found):
         return state, _report(state, setup, Outcome.coasted, mcmf_from_icrf, decided)
-    if parameters.relative.enabled:
-        state, ties = tied(state, found, camera_from_icrf, mcmf_from_icrf, setup)
-        decided = replace(decided, ties=ties)
     pose = kalman.pose_of(state.estimate, camera_from_icrf, mcmf_from_icrf)
     search = search_around(state, pose, found, setup)
     before = state.disagreements
@@ -339,8 +328,6 @@ def step(
     if parameters.map_landmarks:
         state, made = map_frame(state, fix, found, camera_from_icrf, mcmf_from_icrf, setup)
         decided = replace(decided, new_landmarks=decided.new_landmarks + made)
-    if parameters.relative.enabled:
-        state = remembered(state, fix, found, camera_from_icrf, mcmf_from_icrf, parameters)
     outcome = Outcome.fixed
     if fix is None:
         outcome = Outcome.refused if search.candidates else Outcome.coasted
@@ -423,31 +410,6 @@ def end_pass(state: AnchoredState, setup: AnchoredSetup) -> tuple[AnchoredState,
         landmarks = mapping.with_catalogue(mapped.landmarks, setup.catalogue)
         state = replace(state, landmarks=landmarks, places=None)
     return state, made
-
-
-def tied(
-    state: AnchoredState,
-    found: Detections,
-    camera_from_icrf: FloatArray,
-    mcmf_from_icrf: FloatArray,
-    setup: AnchoredSetup,
-) -> tuple[AnchoredState, int]:
-    """Return the state after the relative measurement against the previous frame, and the number of ties."""
-    parameters, prior, previous = setup.parameters, state.estimate, state.previous
-    state = replace(state, estimate=without_clone(prior), previous=None)
-    if previous is None or prior.position_sigma_m > tracking_limit_m(prior, parameters):
-        return state, 0
-    now = Remembered(found, detection_variance_px2(found, parameters), camera_from_icrf, mcmf_from_icrf)
-    measured, ties = tie(
-        prior,
-        previous,
-        now,
-        setup.camera,
-        state.surface_m,
-        parameters.errors.attitude_noise_rad,
-        parameters.relative,
-    )
-    return replace(state, estimate=measured) if is_usable(measured, parameters.limits) else state, ties
 
 
 def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: AnchoredSetup) -> Search:
@@ -607,23 +569,6 @@ def map_frame(
     return replace(state, mapped=mapped, surface_m=surface_m), made
 
 
-def remembered(
-    state: AnchoredState,
-    fix: Fix | None,
-    found: Detections,
-    camera_from_icrf: FloatArray,
-    mcmf_from_icrf: FloatArray,
-    parameters: AnchoredParameters,
-) -> AnchoredState:
-    """Return the state with the detections that no fix used, and the position from which they were seen."""
-    free = np.ones(len(found), dtype=bool)
-    if fix is not None:
-        free[fix.identification.detection] = False
-    left = found.select(free)
-    previous = Remembered(left, detection_variance_px2(left, parameters), camera_from_icrf, mcmf_from_icrf)
-    return replace(state, previous=previous, estimate=with_clone(state.estimate))
-
-
 def _report(
     state: AnchoredState,
     setup: AnchoredSetup,
@@ -656,7 +601,6 @@ def _report(
         decided.expected,
         fix is not None and fix.reacquired,
         is_lost(state, setup.parameters),
-        decided.ties,
         fix,
         decided.new_landmarks,
         decided.attitude_declared_rad,

@@ -12,7 +12,6 @@ from payload_emulator.flight.navigation.filter import CommonErrors
 from payload_emulator.flight.navigation.identification import IdentificationParameters
 from payload_emulator.flight.navigation.landmark_map import MappingParameters
 from payload_emulator.flight.navigation.lost_in_space import LostParameters
-from payload_emulator.flight.navigation.relative import RelativeParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +111,6 @@ class AnchoredParameters:
         that search.
     map_landmarks, mapping
         Whether craters that are not in the catalogue are mapped and used on later passes, and the parameters of this.
-    relative
-        Whether the motion between two frames is measured with uncatalogued detections, and the parameters of this.
     monitor
         Parameters of the monitor of the attitude.
     limits
@@ -141,6 +138,5 @@ class AnchoredParameters:
     map_landmarks: bool = True
     mapping: MappingParameters = field(default_factory=MappingParameters)
     crater_limit: int = 32
-    relative: RelativeParameters = field(default_factory=RelativeParameters)
     monitor: MonitorParameters = field(default_factory=MonitorParameters)
     limits: AnchoredLimits = field(default_factory=AnchoredLimits)

@@ -1,4 +1,4 @@
-"""Where the camera is when nothing is known of its place: one frame, or a few that the orbit links.
+"""Where the camera is when nothing is known of its place.
 
 The camera looks down with a known heading, both only as well as the ADCS holds them; altitude is known to lie in an
 interval, and the place anywhere over the map. Every pair of a detection and a crater puts the camera on one place for
@@ -17,25 +17,22 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
-from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.sighting import LandmarkMap
 from payload_emulator.flight.vision.detections import Detections
 
 NADIR_NORTH_UP: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """camera_from_enu of a camera that looks straight down, image up to the north."""
 
-FRAMES_COMBINED = 4
-
-# Candidates that a search of a frame returns, and those that take part in a search over several frames.
-_CANDIDATES, _CANDIDATES_COMBINED = 48, 12
+# Candidates that a search returns.
+_CANDIDATES = 48
 
 # Bins of rim height: half a bin moves a place by 350 m at the edge of the image.
 _HEIGHT_BIN_M = 400.0
@@ -65,11 +62,6 @@ _UNKNOWN_SCORE, _LEAST_SCORE = 0.5, 0.01
 _LARGEST_OFF_NADIR_RAD = 1.5
 # A fit may end this far outside the altitudes that were voted on, which are steps.
 _ALTITUDE_SLACK = 1.25
-# Two places of one orbit: what relief and a bent track add to their sigmas, the number of sigmas, the share by which
-# the speed of an elliptical orbit differs from a circular one, and the radial speed at an eccentricity of 0.02.
-_TRACK_DOUBT_M, _DOUBT_SIGMAS, _SPEED_SHARE, _RADIAL_SPEED_M_S = 1_500.0, 3.0, 0.05, 33.0
-# Legs longer than this show the direction of flight, which two legs of an orbit share to this cosine.
-_SHORTEST_LEG_M, _LEG_COSINE = 5_000.0, 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,15 +186,6 @@ class Place:
         return int(self.detection.size)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LostFrame:
-    """One frame of a search over several: detections, one sigma of each centre, and the time since the first."""
-
-    found: Detections
-    sigma_px: FloatArray
-    elapsed_s: float
-
-
 def place_index(landmarks: LandmarkMap) -> PlaceIndex:
     """Return the map sorted for the vote."""
     position = landmarks.position_mcmf_m
@@ -272,9 +255,9 @@ def candidate_places(
     for place in fits:
         if len(apart) == _CANDIDATES:
             break
-        if all(_distance_m(place, other) > _same_place_m(place, camera, parameters) for other in apart):
+        if all(distance_m(place, other) > _same_place_m(place, camera, parameters) for other in apart):
             apart.append(place)
-    return [_renumbered(place, usable) for place in apart]
+    return [replace(place, detection=usable[place.detection].astype(np.int64)) for place in apart]
 
 
 def find_place(
@@ -294,58 +277,6 @@ def believed_place(places: Sequence[Place], parameters: LostParameters = LostPar
         return None
     rival = places[1].log_false if len(places) > 1 else math.inf
     return places[0] if rival - places[0].log_false > math.log(parameters.rival_ratio) else None
-
-
-def find_place_in_frames(
-    frames: Sequence[LostFrame],
-    index: PlaceIndex,
-    camera: PinholeCamera,
-    parameters: LostParameters = LostParameters(),
-) -> tuple[Place, ...] | None:
-    """Return the places of frames seconds to a minute apart, one per frame that takes part; None where none is safe.
-
-    The last `FRAMES_COMBINED` frames are used, see `place_of_frames`.
-    """
-    frames = sorted(frames, key=lambda frame: frame.elapsed_s)[-FRAMES_COMBINED:]
-    candidates = [
-        candidate_places(frame.found, frame.sigma_px, index, camera, parameters) for frame in frames
-    ]
-    return place_of_frames(candidates, frames, parameters)
-
-
-def place_of_frames(
-    candidates: Sequence[Sequence[Place]],
-    frames: Sequence[LostFrame],
-    parameters: LostParameters = LostParameters(),
-) -> tuple[Place, ...] | None:
-    """Return the places of frames in order of time from the candidate places of each; None where none is safe.
-
-    Places of different frames support each other if an orbit leads from one to the next: the distance is that of a
-    circular orbit to five per cent, altitude changes little, the heading stays.
-    """
-    per_frame = [places[:_CANDIDATES_COMBINED] for places in candidates]
-    chains: list[tuple[float, tuple[tuple[int, Place], ...]]] = []
-    for number, places in enumerate(per_frame):
-        grown: list[tuple[float, tuple[tuple[int, Place], ...]]] = []
-        grown += [(place.log_false, ((number, place),)) for place in places]
-        for _, chain in list(chains):
-            for place in places:
-                longer = (*chain, (number, place))
-                if _one_orbit(longer, frames):
-                    grown.append((_log_false_of_chain(longer, parameters), longer))
-        chains += grown
-    chains.sort(key=lambda item: item[0])
-    if not chains or chains[0][0] > math.log(parameters.false_fix_limit):
-        return None
-    best = chains[0][1]
-    # A rival is what comes near the best, and a place of one frame that would be safe if it were alone.
-    near, alone = chains[0][0] + math.log(parameters.rival_ratio), math.log(parameters.false_fix_limit)
-    for log_false, chain in chains[1:]:
-        if log_false > near and (len(chain) > 1 or log_false > alone):
-            continue
-        if not _one_orbit(tuple(sorted((*best, *chain), key=lambda item: item[0])), frames):
-            return None
-    return tuple(place for _, place in best)
 
 
 def _voted(
@@ -545,49 +476,7 @@ def _log_share(
     return of_place + of_attitude + volume
 
 
-def _log_false_of_chain(chain: tuple[tuple[int, Place], ...], parameters: LostParameters) -> float:
-    """Return the logarithm of the largest probability that chance makes up a chain as good as this.
-
-    The first place may be anywhere; the next lies on a ring about it, a further one near a point. What a ring and a
-    point leave of the poses of a whole search is at most one in two thousand and one in two million.
-    """
-    total = 0.0
-    for number, (_, place) in enumerate(chain):
-        freed = (0.0, math.log(2e3), math.log(2e6))[min(number, 2)]
-        total += place.log_false - freed
-        # A place takes part only where it has something to say.
-        if number and place.log_false - freed > 0.0:
-            return math.inf
-    return total
-
-
-def _one_orbit(chain: Sequence[tuple[int, Place]], frames: Sequence[LostFrame]) -> bool:
-    """Return whether a low circular orbit leads through places in order of time."""
-    for (a, first), (b, second) in pairwise(chain):
-        elapsed_s = frames[b].elapsed_s - frames[a].elapsed_s
-        apart_m = _distance_m(first, second)
-        doubt_m = _TRACK_DOUBT_M + _DOUBT_SIGMAS * float(np.hypot(first.sigma_m.max(), second.sigma_m.max()))
-        if elapsed_s <= 0.0:
-            if apart_m > doubt_m:
-                return False
-            continue
-        radius = float(np.linalg.norm(first.position_mcmf_m))
-        expected_m = math.sqrt(GM_MOON_M3_S2 / radius) * elapsed_s
-        climb_m = abs(radius - float(np.linalg.norm(second.position_mcmf_m)))
-        if (
-            abs(apart_m - expected_m) > _SPEED_SHARE * expected_m + doubt_m
-            or climb_m > _RADIAL_SPEED_M_S * elapsed_s + 2.0 * doubt_m
-        ):
-            return False
-    for k in range(len(chain) - 2):
-        legs = [chain[k + 1 + j][1].position_mcmf_m - chain[k + j][1].position_mcmf_m for j in range(2)]
-        lengths = [float(np.linalg.norm(leg)) for leg in legs]
-        if min(lengths) > _SHORTEST_LEG_M and legs[0] @ legs[1] < _LEG_COSINE * lengths[0] * lengths[1]:
-            return False
-    return True
-
-
-def _distance_m(first: Place, second: Place) -> float:
+def distance_m(first: Place, second: Place) -> float:
     return float(np.linalg.norm(first.position_mcmf_m - second.position_mcmf_m))
 
 
@@ -595,17 +484,6 @@ def _same_place_m(place: Place, camera: PinholeCamera, parameters: LostParameter
     """Return how far apart two fits may lie and still be of one place."""
     altitude_m = float(np.linalg.norm(place.position_mcmf_m)) - MOON_RADIUS_M
     return 2.0 * parameters.block_px * altitude_m / camera.focal_px
-
-
-def _renumbered(place: Place, usable: IntArray) -> Place:
-    return Place(
-        place.position_mcmf_m,
-        place.attitude_rad,
-        place.sigma_m,
-        usable[place.detection].astype(np.int64),
-        place.index,
-        place.log_false,
-    )
 
 
 def _span(longitude: FloatArray) -> tuple[float, float]:

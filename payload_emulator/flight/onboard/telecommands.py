@@ -1,4 +1,4 @@
-"""What each telecommand does. Every function returns 0, or the code of the reason why nothing was done."""
+"""What each telecommand does. A function returns the code of the reason why nothing was done; 0 or None: it was."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def execute(machine: Machine, command: Command) -> int:
     machine.changed = True
     if command.name == "perform_function":
         first, second = float(command.values["argument_1"]), float(command.values["argument_2"])
-        return _FUNCTION_HANDLERS[name](machine, first, second)
-    return _HANDLERS[name](machine, command.values)
+        return _FUNCTION_HANDLERS[name](machine, first, second) or 0
+    return _HANDLERS[name](machine, command.values) or 0
 
 
 def _arguments_hold(name: str, first: float, second: float) -> bool:
@@ -223,10 +223,6 @@ def _insert_activity(machine: Machine, values: Values) -> int:
     return 0
 
 
-def _delete_activity(machine: Machine, values: Values) -> int:
-    return 0 if machine.schedule.delete(int(values["request_id"])) else failure("no_such_activity")
-
-
 def _report_schedule(machine: Machine, values: Values) -> int:
     activities = machine.schedule.activities
     machine.telemetry.send(
@@ -274,8 +270,8 @@ def _replay(machine: Machine, values: Values) -> int:
     return 0
 
 
-def _delete_store(machine: Machine, values: Values) -> int:
-    machine.store.delete(int(values["stop_ticks"]))
+def _delete_stored(machine: Machine, stop_ticks: int) -> int:
+    machine.store.delete(stop_ticks)
     return 0
 
 
@@ -301,11 +297,6 @@ def _report_store(machine: Machine, values: Values) -> int:
 
 
 # Services 17 and 20
-
-
-def _ping(machine: Machine, values: Values) -> int:
-    machine.telemetry.send("connection_report", {})
-    return 0
 
 
 def _request_parameter(machine: Machine, values: Values) -> int:
@@ -345,28 +336,8 @@ def _set_mode(machine: Machine, first: float, second: float) -> int:
     return 0
 
 
-def _start_observation(machine: Machine, first: float, second: float) -> int:
-    machine.observe(round(first * TICKS_PER_SECOND), round(second * TICKS_PER_SECOND))
-    return 0
-
-
-def _stop_observation(machine: Machine, first: float, second: float) -> int:
-    machine.enter(PayloadMode.standby)
-    return 0
-
-
 def _manual_step(machine: Machine, first: float, second: float) -> int:
     machine.observer.manual_step = True
-    return 0
-
-
-def _reset_estimators(machine: Machine, first: float, second: float) -> int:
-    machine.observer.reset()
-    return 0
-
-
-def _clear_store(machine: Machine, first: float, second: float) -> int:
-    machine.store.delete(1 << 62)
     return 0
 
 
@@ -375,28 +346,9 @@ def _reboot(machine: Machine, first: float, second: float) -> int:
     return 0
 
 
-def _check_tables(machine: Machine, first: float, second: float) -> int:
-    return failure("table_corrupt") if machine.memory.damaged() else 0
-
-
 def _synchronise_clock(machine: Machine, first: float, second: float) -> int:
     machine.counts["clock_status"] = 1
     machine.telemetry.event("info", "clock_synchronised", float(machine.telemetry.ticks))
-    return 0
-
-
-def _abort_uplink(machine: Machine, first: float, second: float) -> int:
-    machine.uplink.abort(int(first))
-    return 0
-
-
-def _widen(machine: Machine, first: float, second: float) -> int:
-    machine.observer.widen(first, second)
-    return 0
-
-
-def _resynchronise(machine: Machine, first: float, second: float) -> int:
-    # Its own count, whatever it is, has become the newest when it was accepted.
     return 0
 
 
@@ -405,12 +357,7 @@ def _thumbnail(machine: Machine, first: float, second: float) -> int:
     return 0
 
 
-def _map(machine: Machine, first: float, second: float) -> int:
-    send_large_data(machine, "landmark_map", map_octets(machine.observer.sightings))
-    return 0
-
-
-_HANDLERS: dict[str, Callable[[Machine, Values], int]] = {
+_HANDLERS: dict[str, Callable[[Machine, Values], int | None]] = {
     "enable_housekeeping": _switch_housekeeping(True),
     "disable_housekeeping": _switch_housekeeping(False),
     "request_housekeeping": _request_housekeeping,
@@ -426,31 +373,40 @@ _HANDLERS: dict[str, Callable[[Machine, Values], int]] = {
     "disable_schedule": _switch_schedule(False),
     "reset_schedule": _reset_schedule,
     "insert_activity": _insert_activity,
-    "delete_activity": _delete_activity,
+    "delete_activity": lambda machine, values: (
+        0 if machine.schedule.delete(int(values["request_id"])) else failure("no_such_activity")
+    ),
     "report_schedule": _report_schedule,
     "uplink_first": _uplink("uplink_first"),
     "uplink_middle": _uplink("uplink_middle"),
     "uplink_last": _uplink("uplink_last"),
     "replay_store": _replay,
-    "delete_store": _delete_store,
+    "delete_store": lambda machine, values: _delete_stored(machine, int(values["stop_ticks"])),
     "report_store": _report_store,
-    "test_connection": _ping,
+    "test_connection": lambda machine, values: machine.telemetry.send("connection_report", {}),
     "request_parameter": _request_parameter,
     "set_parameter": _set_parameter,
 }
-_FUNCTION_HANDLERS: dict[str, Callable[[Machine, float, float], int]] = {
+_FUNCTION_HANDLERS: dict[str, Callable[[Machine, float, float], int | None]] = {
     "set_mode": _set_mode,
-    "start_observation": _start_observation,
-    "stop_observation": _stop_observation,
+    "start_observation": lambda machine, duration_s, cadence_s: machine.observe(
+        round(duration_s * TICKS_PER_SECOND), round(cadence_s * TICKS_PER_SECOND)
+    ),
+    "stop_observation": lambda machine, *_: machine.enter(PayloadMode.standby),
     "manual_step": _manual_step,
-    "reset_estimators": _reset_estimators,
-    "clear_store": _clear_store,
+    "reset_estimators": lambda machine, *_: machine.observer.reset(),
+    "clear_store": lambda machine, *_: _delete_stored(machine, 1 << 62),
     "reboot": _reboot,
-    "check_tables": _check_tables,
+    "check_tables": lambda machine, *_: failure("table_corrupt") if machine.memory.damaged() else 0,
     "synchronise_clock": _synchronise_clock,
-    "abort_uplink": _abort_uplink,
-    "widen_estimate": _widen,
-    "resynchronise_commands": _resynchronise,
+    "abort_uplink": lambda machine, table, _: machine.uplink.abort(int(table)),
+    "widen_estimate": lambda machine, position_m, velocity_m_s: machine.observer.widen(
+        position_m, velocity_m_s
+    ),
+    # The own count of the command, whatever it is, has become the newest when it was accepted.
+    "resynchronise_commands": lambda *_: 0,
     "downlink_thumbnail": _thumbnail,
-    "downlink_map": _map,
+    "downlink_map": lambda machine, *_: send_large_data(
+        machine, "landmark_map", map_octets(machine.observer.sightings)
+    ),
 }

@@ -21,11 +21,10 @@ from lunar.frames import enu_from_mcmf, mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import RendererError, TerrainError
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
-from payload_emulator.sim.render.raymarch import rays_window
+from payload_emulator.sim.render.raymarch import height_above_ground_m, rays_window
 from payload_emulator.sim.terrain.tiles import (
     ALBEDO_SHIFT,
     MEAN_ALBEDO,
-    MEASURE_LEVEL,
     TILE_PIXELS,
     TILE_SHIFT,
     Terrain,
@@ -168,14 +167,8 @@ def describe_scene(
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     sun = np.asarray(sun_direction_mcmf, dtype=np.float64)
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-    ground = float(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
-    if altitude <= ground + 50.0:
-        raise TerrainError(
-            f"cycles: expected a camera above the ground, found it {altitude - ground:.0f} m above terrain "
-            f"of {ground:.0f} m"
-        )
+    level = terrain.level_for(height_above_ground_m("cycles", terrain, position) / camera.focal_px)
     south, north, west, east = _bounds(terrain, camera, position, rotation, sun, longitude)
-    level = terrain.level_for((altitude - ground) / camera.focal_px)
     photometry = photometry or Photometry()
     heights, albedo = _textures(terrain, south, north, west, east, level)
     albedo = MEAN_ALBEDO + photometry.albedo_contrast * (albedo - MEAN_ALBEDO)

@@ -49,14 +49,7 @@ def render(
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     sun = np.asarray(sun_direction_mcmf, dtype=np.float64)
-    latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-    ground = float(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
-    if altitude <= ground + 50.0:
-        raise TerrainError(
-            f"raymarch: expected a camera above the ground, found it {altitude - ground:.0f} m above terrain "
-            f"of {ground:.0f} m"
-        )
-    level = terrain.level_for((altitude - ground) / camera.focal_px)
+    level = terrain.level_for(height_above_ground_m("raymarch", terrain, position) / camera.focal_px)
     v, u = np.mgrid[0 : camera.height_px : every, 0 : camera.width_px : every]
     rays = camera.rays(np.stack([u, v], axis=-1).astype(np.float64)) @ rotation
     places = rays_window(camera, position, rotation, sun)
@@ -74,6 +67,18 @@ def render(
         range_m,
     )
     return Rendering(radiance, lit, range_m)
+
+
+def height_above_ground_m(renderer: str, terrain: Terrain, position_mcmf_m: FloatArray) -> float:
+    """Height of a camera at a position (3,) above the ground below it; TerrainError below 50 m."""
+    latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position_mcmf_m))
+    ground = float(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
+    if altitude <= ground + 50.0:
+        raise TerrainError(
+            f"{renderer}: expected a camera above the ground, found it {altitude - ground:.0f} m above terrain "
+            f"of {ground:.0f} m"
+        )
+    return altitude - ground
 
 
 def cast(

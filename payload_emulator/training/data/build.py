@@ -26,10 +26,11 @@ import numpy as np
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder, find_data
 from payload_emulator.errors import DatasetError
+from payload_emulator.session.frame import find_renderer
 from payload_emulator.session.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
-from payload_emulator.training.data.frames import describe, find_renderer, take_frame
+from payload_emulator.training.data.frames import describe, take_frame
 from payload_emulator.training.data.shots import (
     Place,
     draw_box,
@@ -98,6 +99,8 @@ def build(
 
     Raises
     ------
+    ScenarioError
+        There is no such renderer.
     DatasetError
         The folder holds another data set or is being written, the recipe needs data that are not there, a file cannot
         be written, or a worker died; what was finished before is kept.

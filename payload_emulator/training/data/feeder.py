@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray, OctetArray
 from lunar.catalogue import size_class
+from payload_emulator.flight.vision.detector import STRIDE_PX
 from payload_emulator.flight.vision.preprocess import Preparation, normalise, sun_up_turns, turn_forward
 from payload_emulator.training.data.dataset import LABEL_MINIMUM_DIAMETER_PX, Dataset, Frame, choose_tiers
 from payload_emulator.training.data.targets import Tier, make_targets
@@ -159,8 +160,8 @@ class TrainParameters:
     minutes : wall-clock budget; the learning rate falls to zero over it (0: `steps` counts instead).
     micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
     preparation : how RGB frames become gray; the paper's order needs a data set in colour.
-    backbone, stride_px, enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are
-        shorter in the image by the enlargement.
+    enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are shorter in the image
+        by the enlargement.
     """
 
     minutes: float = 15.0
@@ -182,8 +183,6 @@ class TrainParameters:
     pyramid_channels: int = 48
     detail_blocks: int = 1
     detail_channels: int = 24
-    backbone: str = "small"
-    stride_px: int = 4
     enlarge: int = 1
     preparation: Preparation = Preparation.gray_first
     augment: AugmentParameters = field(default_factory=AugmentParameters)
@@ -253,7 +252,7 @@ class Feeder:
             weights[near],
             size_class(craters["diameter_m"].astype(np.float64))[near] if p.paper_classes else None,
             np.nan_to_num(craters["depth_ratio"].astype(np.float64))[near],
-            p.stride_px // p.enlarge,
+            STRIDE_PX // p.enlarge,
         )
         return {
             "image": crop.image[None],

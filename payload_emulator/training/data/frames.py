@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,6 @@ from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_m
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
-from payload_emulator.errors import DatasetError
 from payload_emulator.session.recipe import Recipe, Source
 from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sensor, draw_sun
 
@@ -40,23 +37,6 @@ class Shot:
     craters: dict[str, NDArray[Any]]
     pose: Pose
     sun_mcmf: FloatArray
-
-
-def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[..., Any]:
-    """The renderer of a name, called as `sim.renderer.render`; `blender_python` is the interpreter that has Blender."""
-    if name == "fast":
-        from payload_emulator.sim.render.renderer import render
-
-        return render
-    if name == "raymarch":
-        from payload_emulator.sim.render import raymarch
-
-        return raymarch.render
-    if name == "cycles":
-        from payload_emulator.sim.render import cycles
-
-        return partial(cycles.render, python=blender_python)
-    raise DatasetError(f"renderer: expected one of fast, raymarch, cycles, found {name!r}")
 
 
 def take_frame(

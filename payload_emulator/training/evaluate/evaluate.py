@@ -96,23 +96,11 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")
     }
-    classes = np.concatenate([np.full(len(part), k, np.int8) for k, part in enumerate(parts)])
-    order = np.argsort(-column["score"], kind="stable")
-    column = {name: values[order] for name, values in column.items()}
-    classes = classes[order]
-    u_px, v_px = turn_back(column["u_px"], column["v_px"], turns, *prepared.shape)
-    latitude, longitude, _ = spherical_from_mcmf(ground_points(dataset, frame, u_px, v_px))
-    scored = dataset.is_scored(frame, np.degrees(latitude), np.degrees(longitude)) | ~np.isfinite(latitude)
+    classes = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    column["u_px"], column["v_px"] = turn_back(column["u_px"], column["v_px"], turns, *prepared.shape)
     medians_m = np.array(_CLASS_DIAMETERS_M) if detector.class_medians_m is None else detector.class_medians_m
-    return FrameDetections(
-        u_px[scored],
-        v_px[scored],
-        column["diameter_px"][scored],
-        medians_m[classes[scored]],
-        column["score"][scored],
-        column["sigma_px"][scored],
-        size_class=classes[scored],
-    )
+    found = Detections(**column, size_class=classes, diameter_m=medians_m[classes])
+    return _on_ground(dataset, frame, found.select(np.argsort(-found.score, kind="stable")))
 
 
 def open_for_evaluation(model_octets: bytes) -> OnnxDetector:

@@ -24,9 +24,9 @@ from payload_emulator.training.evaluate.scoring import (
     MatchRule,
     Tally,
     average_precision,
-    bootstrap_f1,
     bootstrap_recall,
     tally,
+    with_interval,
 )
 
 LOWLAND_M = -1_000.0
@@ -57,17 +57,6 @@ class Thresholds:
     navigation: float
 
 
-def _average_precisions(
-    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], strict: Tally, fair: Tally
-) -> dict[str, Any]:
-    per_class = [average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)]
-    return {
-        "strict": average_precision(strict),
-        "ignore_aware": average_precision(fair),
-        "per_class": per_class,
-    }
-
-
 def score(
     truths: Sequence[FrameTruth],
     found: Sequence[FrameDetections],
@@ -88,12 +77,18 @@ def score(
         "threshold": threshold,
         "per_class": [_class(truths, found, k, threshold) for k in range(4)][:3],
         "class_3_to_5_km": _class(truths, found, 3, threshold),
-        "micro": _with_interval(strict, threshold),
+        "micro": with_interval(strict, threshold),
         "micro_half_radius": strict_radius.figures(threshold).to_dict(),
-        "ignore_aware": _with_interval(fair, threshold),
+        "ignore_aware": with_interval(fair, threshold),
         "strict_3_to_30_km": wide.figures(threshold).to_dict(),
         "ignore_aware_3_to_30_km": wide_fair.figures(threshold).to_dict(),
-        "average_precision_half_radius": _average_precisions(truths, found, strict_radius, fair_radius),
+        "average_precision_half_radius": {
+            "strict": average_precision(strict_radius),
+            "ignore_aware": average_precision(fair_radius),
+            "per_class": [
+                average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)
+            ],
+        },
         "balanced": _at(pair, thresholds.balanced),
         "navigation": _at(pair, thresholds.navigation),
         "recall_by_degradation": _recall_by(
@@ -136,7 +131,7 @@ def _class(
     strict = tally(truths, found, classes=(k,))
     fair = tally(truths, found, classes=(k,), ignore_aware=True)
     return {
-        **_with_interval(strict, threshold),
+        **with_interval(strict, threshold),
         "size_class": k,
         "ignore_aware": fair.figures(threshold).to_dict(),
         "paper": PAPER_TABLE_2[k] if k < 3 else None,
@@ -146,13 +141,9 @@ def _class(
 def _at(pair: tuple[Tally, Tally], threshold: float) -> dict[str, Any]:
     return {
         "threshold": threshold,
-        "strict": _with_interval(pair[0], threshold),
-        "ignore_aware": _with_interval(pair[1], threshold),
+        "strict": with_interval(pair[0], threshold),
+        "ignore_aware": with_interval(pair[1], threshold),
     }
-
-
-def _with_interval(tallied: Tally, threshold: float) -> dict[str, Any]:
-    return {**tallied.figures(threshold).to_dict(), "f1_interval_95": list(bootstrap_f1(tallied, threshold))}
 
 
 def _group(

@@ -30,7 +30,14 @@ from payload_emulator.session.picture_files import read_picture
 from payload_emulator.training.data.pictures import LabelledPicture, load_pictures
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
-from payload_emulator.training.evaluate.scoring import Tally, average_precision, bootstrap_f1
+from payload_emulator.training.evaluate.scoring import (
+    Tally,
+    average_precision,
+    crater_columns,
+    detection_columns,
+    joined,
+    with_interval,
+)
 
 DIAMETER_RANGE_PX = (8.0, 150.0)
 DIAMETER_EDGES_PX = (8.0, 12.0, 16.0, 32.0, 64.0, 150.0)
@@ -149,52 +156,13 @@ def tally_pictures(
         right = (taken >= 0) & expected[taken] if expected.size else np.zeros(len(part), bool)
         wrong = (taken < 0) & _between(part.diameter_px, limits) & ~_in_crowd(picture, part)
         outcome = np.where(right, 1, np.where(wrong, 0, -1)).astype(np.int8)
-        octant = int(np.nan_to_num(sun_azimuth_deg[number]) % 360.0 // 45.0) % 8
-
-        def of_label(values: FloatArray, right: BoolArray = right, taken: IntArray = taken) -> FloatArray:
-            chosen = np.full(right.size, np.nan)
-            chosen[right] = values[taken[right]]
-            return chosen
-
-        count, unknown = len(part), np.full(len(part), np.nan)
-        detections.append(
-            (
-                part.score,
-                outcome,
-                part.u_px - of_label(picture.u_px),
-                part.v_px - of_label(picture.v_px),
-                part.sigma_px,
-                np.full(count, number),
-                np.full(count, octant),
-                np.log(part.diameter_px / of_label(picture.diameter_px)),
-                part.u_px,
-                part.v_px,
-                np.full(count, number),
-                unknown if part.depth_ratio is None else part.depth_ratio,
-                unknown,
-                np.full(count, -1),
-            )
-        )
-        score = np.full(picture.u_px.size, np.nan)
-        score[taken[right]] = part.score[right]
         wanted = np.flatnonzero(expected)
-        craters.append(
-            (
-                score[wanted],
-                np.full(wanted.size, np.nan),
-                picture.diameter_px[wanted],
-                np.full(wanted.size, np.nan),
-                wanted,
-                np.full(wanted.size, number),
-                picture.u_px[wanted],
-                picture.v_px[wanted],
-                np.full(wanted.size, number),
-            )
-        )
-    columns = [
-        np.concatenate(column) for part_of in (detections, craters) for column in zip(*part_of, strict=True)
-    ]
-    return Tally(*columns)
+        hit = np.where(right, np.searchsorted(wanted, taken), -1)
+        truth = _truth(picture, float(np.nan_to_num(sun_azimuth_deg[number])), number)
+        every = np.arange(len(part))
+        detections.append(detection_columns(number, truth, part, wanted, every, hit, outcome))
+        craters.append(crater_columns(number, truth, part.score, wanted, hit))
+    return joined(detections, craters)
 
 
 def format_picture_figures(figures: dict[str, Any]) -> str:
@@ -293,11 +261,11 @@ def _figures(
         return tally_pictures(pictures, found, criterion, ranges, azimuths)
 
     def both(ranges: Sequence[tuple[float, float]]) -> dict[str, Any]:
-        return {c.value: _with_interval(tallied(c, ranges), threshold) for c in Criterion}
+        return {c.value: with_interval(tallied(c, ranges), threshold) for c in Criterion}
 
     whole = [options.range_px] * len(pictures)
     centre = tallied(Criterion.centre, whole)
-    truths = [_truth(p, azimuth) for p, azimuth in zip(pictures, azimuths, strict=True)]
+    truths = [_truth(p, azimuths[k], k) for k, p in enumerate(pictures)]
     octants = bias_by_octant(centre, threshold, truths) if np.isfinite(azimuths).all() else []
     rows: dict[str, Any] = both(whole)
     return {
@@ -327,11 +295,7 @@ def _per_class(
     return rows
 
 
-def _with_interval(tallied: Tally, threshold: float) -> dict[str, Any]:
-    return {**tallied.figures(threshold).to_dict(), "f1_interval_95": list(bootstrap_f1(tallied, threshold))}
-
-
-def _truth(picture: LabelledPicture, sun_azimuth_deg: float) -> FrameTruth:
+def _truth(picture: LabelledPicture, sun_azimuth_deg: float, number: int) -> FrameTruth:
     unknown = np.full(picture.u_px.size, np.nan)
     return FrameTruth(
         picture.u_px,
@@ -343,7 +307,7 @@ def _truth(picture: LabelledPicture, sun_azimuth_deg: float) -> FrameTruth:
         picture.width_px,
         picture.height_px,
         math.radians(sun_azimuth_deg),
-        0,
+        number,
     )
 
 

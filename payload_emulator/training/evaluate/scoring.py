@@ -12,7 +12,7 @@ and craters of 5-30 km whatever their class.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CLASS_LIMITS_M, size_class
+from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.training.data.truth import FrameTruth
 
 PAPER_TABLE_2 = (
@@ -65,16 +66,7 @@ class Figures:
     loc_median_px: float
 
     def to_dict(self) -> dict[str, float | int]:
-        return {
-            "expected": self.expected,
-            "detected_true": self.detected_true,
-            "false_alarms": self.false_alarms,
-            "precision": self.precision,
-            "recall": self.recall,
-            "f1": self.f1,
-            "loc_px": self.loc_px,
-            "loc_median_px": self.loc_median_px,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +75,12 @@ class MatchRule:
 
     pixels: float = MATCH_RADIUS_PX
     radii: float = 0.0
+
+    def limits_px(self, diameter_px: FloatArray) -> FloatArray:
+        """Return the largest distance (n,) from craters of some diameters (n,)."""
+        return (
+            np.full(diameter_px.shape, self.pixels) if self.radii == 0.0 else 0.5 * self.radii * diameter_px
+        )
 
 
 def match(
@@ -98,7 +96,7 @@ def match(
     found = np.full(detection_u.shape[0], -1, np.int64)
     if truth_u.shape[0] == 0:
         return found
-    limit = np.full(truth_u.shape[0], rule.pixels) if rule.radii == 0.0 else 0.5 * rule.radii * truth_diameter
+    limit = rule.limits_px(truth_diameter)
     for i in range(detection_u.shape[0]):
         distance = np.hypot(truth_u - detection_u[i], truth_v - detection_v[i])
         distance[taken | (distance > limit)] = np.inf
@@ -115,9 +113,7 @@ class Tally:
 
     Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
     crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
-    Places in the image (u, v) and numbers of the frames say where and when;
-    matched_depth_ratio and matched_id are the crater's (NaN, -1: none), detection_depth_ratio what the network says
-    (NaN: it does not).
+    matched_depth_ratio is the crater's (NaN: none), detection_depth_ratio what the network says (NaN: it does not).
     """
 
     score: FloatArray
@@ -133,15 +129,10 @@ class Tally:
     detection_frame: IntArray
     detection_depth_ratio: FloatArray
     matched_depth_ratio: FloatArray
-    matched_id: IntArray
     crater_score: FloatArray
     crater_depth_ratio: FloatArray
-    crater_diameter_px: FloatArray
-    crater_diameter_m: FloatArray
     crater_id: IntArray
     crater_block: IntArray
-    crater_u: FloatArray
-    crater_v: FloatArray
     crater_frame: IntArray
 
     def select(self, detections: BoolArray, craters: BoolArray) -> Tally:
@@ -233,9 +224,21 @@ def tally(
                 rule,
             )
             outcome[(outcome == 0) & near] = -1
-        parts.append(_detection_columns(number, truth, found, w, d, hit, outcome))
-        craters.append(_crater_columns(number, truth, found.score[d], w, hit))
-    return Tally(*_columns(parts, 14), *_columns(craters, 9))
+        parts.append(detection_columns(number, truth, found, w, d, hit, outcome))
+        craters.append(crater_columns(number, truth, found.score[d], w, hit))
+    return joined(parts, craters)
+
+
+def joined(
+    detections: Sequence[tuple[NDArray[np.generic], ...]], craters: Sequence[tuple[NDArray[np.generic], ...]]
+) -> Tally:
+    """Return the tally of frames from their `detection_columns` and `crater_columns`."""
+    if not detections:
+        empty: list[NDArray[Any]] = [np.zeros(0)] * len(fields(Tally))
+        return Tally(*empty)
+    return Tally(
+        *(np.concatenate(column) for part in (detections, craters) for column in zip(*part, strict=True))
+    )
 
 
 def _in_frame(truth: FrameTruth) -> BoolArray:
@@ -260,10 +263,10 @@ def _could_be_seen(truth: FrameTruth) -> BoolArray:
     )
 
 
-def _detection_columns(
+def detection_columns(
     number: int,
     truth: FrameTruth,
-    found: FrameDetections,
+    found: FrameDetections | Detections,
     wanted: IntArray,
     chosen: IntArray,
     hit: IntArray,
@@ -294,11 +297,10 @@ def _detection_columns(
         np.full(chosen.size, number),
         np.full(chosen.size, np.nan) if found.depth_ratio is None else found.depth_ratio[chosen],
         of_crater(truth.depth_ratio),
-        np.where(matched, truth.ids[wanted][hit] if wanted.size else -1, -1),
     )
 
 
-def _crater_columns(
+def crater_columns(
     number: int, truth: FrameTruth, scores: FloatArray, wanted: IntArray, hit: IntArray
 ) -> tuple[NDArray[np.generic], ...]:
     """Return the columns of a tally that describe the ``wanted`` craters of a frame."""
@@ -307,12 +309,8 @@ def _crater_columns(
     return (
         score,
         truth.depth_ratio[wanted],
-        truth.diameter_px[wanted],
-        truth.diameter_m[wanted],
         truth.ids[wanted],
         np.full(wanted.size, truth.block),
-        truth.u_px[wanted],
-        truth.v_px[wanted],
         np.full(wanted.size, number),
     )
 
@@ -328,7 +326,7 @@ def match_any(
     """Whether each detection lies on any of the craters by the rule; several may share one."""
     if truth_u.size == 0 or detection_u.size == 0:
         return np.zeros(detection_u.size, bool)
-    limit = np.full(truth_u.shape[0], rule.pixels) if rule.radii == 0.0 else 0.5 * rule.radii * truth_diameter
+    limit = rule.limits_px(truth_diameter)
     distance = np.hypot(detection_u[:, None] - truth_u[None, :], detection_v[:, None] - truth_v[None, :])
     return np.asarray((distance <= limit[None, :]).any(axis=1))
 
@@ -390,6 +388,11 @@ def bootstrap_f1(tallied: Tally, threshold: float) -> tuple[float, float]:
     return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
 
 
+def with_interval(tallied: Tally, threshold: float) -> dict[str, Any]:
+    """Return the figures at a threshold with the interval of F1."""
+    return {**tallied.figures(threshold).to_dict(), "f1_interval_95": list(bootstrap_f1(tallied, threshold))}
+
+
 def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray) -> FloatArray:
     """F1 (_ROUNDS,) of blocks drawn with replacement; NaN without any."""
     if blocks.size == 0:
@@ -423,9 +426,3 @@ def bootstrap_recall(found: BoolArray, block: IntArray) -> tuple[float, float]:
     drawn = np.random.default_rng(0).integers(0, total.size, (_ROUNDS, total.size))
     recall = hits[drawn].sum(axis=1) / total[drawn].sum(axis=1)
     return float(np.percentile(recall, 2.5)), float(np.percentile(recall, 97.5))
-
-
-def _columns(parts: list[tuple[NDArray[Any], ...]], count: int) -> list[NDArray[Any]]:
-    if not parts:
-        return [np.zeros(0) for _ in range(count)]
-    return [np.concatenate(column) for column in zip(*parts, strict=True)]

@@ -1,4 +1,4 @@
-"""Pictures for people: labels drawn on frames as in the paper's Fig. 5, contact sheets."""
+"""Pictures for people: labels drawn on frames as in the paper's Fig. 5, contact sheets, also of data sets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 
 from lunar.arrays import OctetArray
+from lunar.catalogue import size_class
+from payload_emulator.errors import DatasetError
 from payload_emulator.sim.render.sensor import Picture
+from payload_emulator.training.data.dataset import Dataset, Frame, in_picture, write_whole
 
 Rgb = OctetArray
 
@@ -80,6 +83,51 @@ def format_detections(item: dict[str, Any]) -> str:
     )
 
 
+def draw_sheet(dataset: Dataset, split: str = "", columns: int = 4, rows: int = 2, tile_px: int = 512) -> Rgb:
+    """Contact sheet of frames spread evenly over a split (all where not named), every labelled rim drawn.
+
+    Raises
+    ------
+    DatasetError
+        The split has no frames.
+    """
+    frames = dataset.frames(split)
+    if not frames:
+        raise DatasetError(f"{dataset.folder}: expected frames of split {split!r}, found none")
+    wanted = min(columns * rows, len(frames))
+    chosen = [frames[int((k + 0.5) * len(frames) / wanted)] for k in range(wanted)]
+    pictures = [draw_frame(dataset, frame, tile_px) for frame in chosen]
+    return contact_sheet(pictures, [_caption(frame) for frame in chosen], min(columns, wanted))
+
+
+def draw_frame(dataset: Dataset, frame: Frame, tile_px: int = 512) -> Rgb:
+    """RGB picture (tile_px, tile_px, 3) of a frame with the rims of its labelled craters."""
+    import cv2
+
+    gray, craters = dataset.gray(frame), frame.craters
+    scale = tile_px / max(gray.shape)
+    size = round(gray.shape[1] * scale), round(gray.shape[0] * scale)
+    picture = np.zeros((tile_px, tile_px, 3), np.uint8)
+    resized = gray if size == gray.shape[::-1] else cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    picture[: size[1], : size[0]] = resized[..., None]
+    classes = size_class(craters["diameter_m"].astype(np.float64))
+    inside = in_picture(craters, dataset.width_px, dataset.height_px)
+    labels = [
+        {
+            "class": int(classes[k]),
+            "inside": bool(inside[k]),
+            # Pixel centres are integers in labels; the picture's corner is half a pixel before.
+            **{name: (float(craters[name][k]) + 0.5) * scale - 0.5 for name in ("u_px", "v_px")},
+            "ellipse": {
+                **{name: float(craters[name][k]) * scale for name in ("major_px", "minor_px")},
+                "angle_deg": math.degrees(float(craters["angle_rad"][k])),
+            },
+        }
+        for k in range(classes.size)
+    ]
+    return draw_labels(picture, labels)
+
+
 def contact_sheet(pictures: Sequence[Rgb], captions: Sequence[str], columns: int) -> Rgb:
     """Pictures (H, W, 3) of one size in rows, each with a line of text under it."""
     cells = [_captioned(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
@@ -101,17 +149,15 @@ def save_png(image: Picture, path: Path) -> None:
 
     done, octets = cv2.imencode(".png", image[..., ::-1])
     assert done
-    save_octets(octets.tobytes(), path)
+    write_whole(path, octets.tobytes())
 
 
-def save_octets(octets: bytes, path: Path) -> None:
-    """Write a whole file or none of it."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_bytes(octets)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+def _caption(frame: Frame) -> str:
+    v = frame.values
+    return (
+        f"{frame.number:06d} {frame.split}  {v['latitude_deg']:+.2f} {v['longitude_deg']:.2f}E  "
+        f"{v['altitude_m'] / 1000:.1f} km  Sun {v['sun_elevation_deg']:.0f}/{v['sun_azimuth_deg']:+.0f} deg"
+    )
 
 
 def _captioned(picture: Rgb, caption: str) -> Rgb:

@@ -22,7 +22,7 @@ from payload_emulator.flight.vision.detector import (
     OnnxDetector,
 )
 from payload_emulator.flight.vision.preprocess import Preparation
-from payload_emulator.training.data.dataset import Dataset
+from payload_emulator.training.data.dataset import Dataset, write_whole
 from payload_emulator.training.model.calibrate import Calibration, calibrate, paper_threshold
 
 PARITY_LIMIT = 2e-4
@@ -39,12 +39,12 @@ OUTPUT_CONVENTION = (
 
 def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     """The averaged network of a checkpoint in evaluation mode, and the checkpoint's document."""
-    from payload_emulator.training.model.model import CraterNet, ModelConfig
+    from payload_emulator.training.model.model import CraterNet, parse_config
     from payload_emulator.training.model.restore import read_checkpoint, reading
 
     stored = read_checkpoint(path)
     with reading(path):
-        network = CraterNet(ModelConfig(**stored["config"]))
+        network = CraterNet(parse_config(stored["config"]))
         network.load_state_dict(stored["average"])
     return network.eval(), stored
 
@@ -113,7 +113,8 @@ def export(
     if test:
         tested = _test_figures(octets, datasets, paper_classes)
         octets = _with_metadata(model, metadata | {"test_figures": json.dumps(tested)})
-    _write_whole(out, octets)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(out, octets)
     return {
         "model": str(out),
         "model_bytes": len(octets),
@@ -127,14 +128,6 @@ def export(
         "validation": calibration.figures,
         "test": tested,
     }
-
-
-def _write_whole(out: Path, octets: bytes) -> None:
-    """Write a file so that it is either complete or absent."""
-    unfinished = out.with_name(f".{out.name}.unfinished")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished.write_bytes(octets)
-    unfinished.replace(out)
 
 
 def class_medians_m(datasets: Sequence[Dataset]) -> list[float]:

@@ -14,12 +14,15 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from payload_emulator.errors import ModelError
+from payload_emulator.flight.vision.detector import STRIDE_PX
 
 # kernel, expanded channels, output channels, squeeze-excite, hard-swish (else ReLU), stride
 _SMALL = (
@@ -35,27 +38,8 @@ _SMALL = (
     (5, 576, 96, True, True, 1),
     (5, 576, 96, True, True, 1),
 )
-_LARGE = (
-    (3, 16, 16, False, False, 1),
-    (3, 64, 24, False, False, 2),
-    (3, 72, 24, False, False, 1),
-    (5, 72, 40, True, False, 2),
-    (5, 120, 40, True, False, 1),
-    (5, 120, 40, True, False, 1),
-    (3, 240, 80, False, True, 2),
-    (3, 200, 80, False, True, 1),
-    (3, 184, 80, False, True, 1),
-    (3, 184, 80, False, True, 1),
-    (3, 480, 112, True, True, 1),
-    (3, 672, 112, True, True, 1),
-    (5, 672, 160, True, True, 2),
-    (5, 960, 160, True, True, 1),
-    (5, 960, 160, True, True, 1),
-)
-# Blocks, and the last of them at strides 4, 8, 16 and 32.
-_BACKBONES = {"small": (_SMALL, (0, 2, 7, 10)), "large": (_LARGE, (2, 5, 11, 14))}
+_TAPS = (0, 2, 7, 10)  # the last blocks at strides 4, 8, 16 and 32
 _STEM_CHANNELS = 16
-STRIDES_PX = (2, 4)
 _PRIOR_LOGIT = -4.0  # about one cell in fifty before training: keeps the first focal losses finite
 _INITIAL_LOG_SIGMA = 0.3
 _INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
@@ -65,8 +49,6 @@ _INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
 class ModelConfig:
     """Shape of the network. `detail_blocks` adds blocks at stride 4, where small craters live.
 
-    backbone : "small" or "large" of MobileNetV3.
-    stride_px : stride of the output maps in pixels of the network's first layer, 4 or 2.
     preparation : how a colour frame becomes the network's input, a `flight.vision.preprocess.Preparation`.
     enlarge : factor by which the network first enlarges the image, for craters of few pixels (high altitudes).
     """
@@ -76,28 +58,35 @@ class ModelConfig:
     detail_channels: int = 24
     paper_classes: bool = False
     depth: bool = False
-    backbone: str = "small"
-    stride_px: int = 4
     enlarge: int = 1
     preparation: str = "gray-then-normalise"
 
     def __post_init__(self) -> None:
-        if self.backbone not in _BACKBONES:
-            raise ModelError(f"backbone: expected one of {', '.join(_BACKBONES)}, found {self.backbone!r}")
-        if self.stride_px not in STRIDES_PX:
-            raise ModelError(f"stride: expected 2 or 4 pixels, found {self.stride_px}")
-        if self.enlarge < 1 or self.stride_px % self.enlarge:
-            raise ModelError(
-                f"enlarge: expected a divisor of the stride {self.stride_px}, found {self.enlarge}"
-            )
+        if self.enlarge < 1 or STRIDE_PX % self.enlarge:
+            raise ModelError(f"enlarge: expected a divisor of the stride {STRIDE_PX}, found {self.enlarge}")
 
     @property
     def cell_px(self) -> int:
         """Size of an output cell in pixels of the image."""
-        return self.stride_px // self.enlarge
+        return STRIDE_PX // self.enlarge
 
     def to_dict(self) -> dict[str, int | bool | str]:
         return asdict(self)
+
+
+def parse_config(document: Mapping[str, Any]) -> ModelConfig:
+    """Return the shape that a checkpoint or an exported network states; older ones also name backbone and stride.
+
+    Raises
+    ------
+    ModelError
+        Another backbone than the small one, or another stride than 4.
+    """
+    older = {"backbone": "small", "stride_px": STRIDE_PX}
+    for key, expected in older.items():
+        if document.get(key, expected) != expected:
+            raise ModelError(f"model_config: expected {key} {expected}, found {document[key]!r}")
+    return ModelConfig(**{key: value for key, value in document.items() if key not in older})
 
 
 class CraterNet(nn.Module):
@@ -106,15 +95,14 @@ class CraterNet(nn.Module):
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
         self.config = config or ModelConfig()
-        table, self._taps = _BACKBONES[self.config.backbone]
         self.stem = _conv_norm(1, _STEM_CHANNELS, 3, stride=2, activation=nn.Hardswish())
         blocks: list[nn.Module] = []
         tapped: list[int] = []
         channels = _STEM_CHANNELS
-        for index, (kernel, expanded, out, squeeze, swish, stride) in enumerate(table):
+        for index, (kernel, expanded, out, squeeze, swish, stride) in enumerate(_SMALL):
             blocks.append(_InvertedResidual(channels, expanded, out, kernel, stride, squeeze, swish))
             channels = out
-            if index in self._taps:
+            if index in _TAPS:
                 tapped.append(out)
         self.blocks = nn.ModuleList(blocks)
         detail = self.config.detail_channels
@@ -126,8 +114,6 @@ class CraterNet(nn.Module):
         )
         if self.config.detail_blocks:
             tapped[0] = detail
-        if self.config.stride_px == 2:
-            tapped.insert(0, _STEM_CHANNELS)
         width = self.config.pyramid_channels
         self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in tapped)
         self.smooth = nn.ModuleList(_separable(width, width) for _ in tapped[:-1])
@@ -159,14 +145,12 @@ class CraterNet(nn.Module):
             image = nn.functional.interpolate(
                 image, scale_factor=float(self.config.enlarge), mode="bilinear", align_corners=False
             )
-        x = stem = self.stem(image)
+        x = self.stem(image)
         for index, block in enumerate(self.blocks):
             x = block(x)
-            if index in self._taps:
+            if index in _TAPS:
                 features.append(x)
         features[0] = self.detail(features[0])
-        if self.config.stride_px == 2:
-            features.insert(0, stem)
         merged = self.lateral[-1](features[-1])
         for level in range(len(features) - 2, -1, -1):
             merged = nn.functional.interpolate(merged, scale_factor=2.0, mode="nearest")

@@ -23,7 +23,7 @@ from google.protobuf.message import DecodeError
 from torch import Tensor, nn
 
 from payload_emulator.errors import ModelError
-from payload_emulator.training.model.model import CraterNet, ModelConfig
+from payload_emulator.training.model.model import CraterNet, parse_config
 
 if TYPE_CHECKING:
     from payload_emulator.training.data.feeder import Feeder
@@ -79,7 +79,7 @@ def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
         }
         maps = int(stored["head.bias"].shape[0])
         heats = maps - (5 if config.get("depth") else 4)
-        network = CraterNet(ModelConfig(**(config | {"paper_classes": heats == 4})))
+        network = CraterNet(parse_config(config | {"paper_classes": heats == 4}))
         _fill(network, stored)
         progress = {
             "step": int(metadata.get("training_steps", 0)),

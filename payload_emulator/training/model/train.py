@@ -27,6 +27,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray, OctetArray
 from payload_emulator.errors import DatasetError, ModelError
+from payload_emulator.flight.vision.detector import STRIDE_PX
 from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
@@ -149,8 +150,6 @@ def _model_config(parameters: TrainParameters) -> ModelConfig:
         parameters.detail_channels,
         parameters.paper_classes,
         parameters.depth,
-        parameters.backbone,
-        parameters.stride_px,
         parameters.enlarge,
         str(parameters.preparation),
     )
@@ -361,7 +360,7 @@ class _Team:
                 tensors["regressed"],
                 tensors["incomplete"],
                 LossWeights(),
-                p.stride_px // p.enlarge,
+                STRIDE_PX // p.enlarge,
             )
             (terms.total * (size / count)).backward()
             values = (

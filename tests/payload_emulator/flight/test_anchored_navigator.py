@@ -29,7 +29,6 @@ from payload_emulator.flight.navigation.identification import Identification
 from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.lost_in_space import Place
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.flight.navigation.relative import RelativeParameters, without_clone
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from studies import montecarlo
@@ -837,50 +836,3 @@ def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit: Orbit, monkeypatch
     assert made == ("new",) and after.mapped is mapped
     assert after.landmarks == "both" and joined == [(("one",), navigator.setup.catalogue)]
     assert after.places is None
-
-
-def test_the_move_between_frames_is_measured_on_what_no_fix_used(
-    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    navigator = orbit.navigator(relative=RelativeParameters(enabled=True))
-    found = orbit.detections(0)
-    assert navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0)).ties == 0
-    fix, before = navigator.fix, navigator.state.previous
-    assert before is not None
-    left = np.setdiff1d(np.arange(len(found)), fix.identification.detection)
-    np.testing.assert_array_equal(before.found.u_px, found.u_px[left])
-    np.testing.assert_allclose(before.variance_px2, np.ones(left.size))
-    np.testing.assert_allclose(before.camera_from_icrf, orbit.attitude(0), atol=1e-12)
-    np.testing.assert_allclose(before.mcmf_from_icrf, orbit.rotations[0], atol=1e-7)
-    prior, later = navigator.estimate, orbit.detections(1)
-    setup, state = navigator.setup, replace(navigator.state, surface_m=123.0)
-
-    def tied(state: AnchoredState) -> tuple[AnchoredState, int]:
-        return anchored.tied(state, later, orbit.attitude(1), orbit.rotations[1], setup)
-
-    calls = recorded(monkeypatch, anchored, "tie", (prior, 4))
-    after, ties = tied(state)
-    assert after.estimate is prior and ties == 4
-    ((given, was, now, camera, surface_m, noise_rad, parameters),) = calls
-    assert given is prior and was is before and camera is orbit.case.camera and surface_m == 123.0
-    assert now.found is later and now.camera_from_icrf is not before.camera_from_icrf
-    np.testing.assert_allclose(now.variance_px2, 1.0)
-    assert noise_rad == setup.parameters.errors.attitude_noise_rad
-    assert parameters is setup.parameters.relative
-    # Each frame is compared once; without a previous one the clone of the position is dropped, too.
-    assert after.previous is None
-    bare, ties = tied(after)
-    assert len(calls) == 1 and ties == 0
-    assert bare.estimate.mean.size == prior.mean.size - 3
-    # A position too uncertain to predict pixels is not tied, and a result that is none is not used.
-    vague = replace(prior, covariance=prior.covariance + np.eye(prior.mean.size) * 1_600.0**2)
-    untied, ties = tied(replace(state, estimate=vague))
-    assert untied.estimate.mean.size == bare.estimate.mean.size and ties == 0
-    assert len(calls) == 1
-    monkeypatch.setattr(
-        anchored, "tie", lambda *_: (replace(prior, mean=np.full(prior.mean.size, np.nan)), 1)
-    )
-    np.testing.assert_array_equal(tied(state)[0].estimate.mean, bare.estimate.mean)
-    # The report of the next frame says how many were tied.
-    monkeypatch.setattr(anchored, "tie", lambda prior, *_: (without_clone(prior), 4))
-    assert navigator.step(int(orbit.ticks[1]), later, orbit.attitude(1)).ties == 4

@@ -24,7 +24,6 @@ def test_each_class_is_found_with_its_recall_and_no_other_size(rng) -> None:
         found = detector.found(np.full(COUNT, diameter_m), rng)
         # Four standard deviations of a share of 20,000.
         assert found.size / COUNT == pytest.approx(recall, abs=4.0 * np.sqrt(0.25 / COUNT))
-    assert replace(detector, recall_outside=1.0).found(np.full(9, 40e3), rng).size == 9
 
 
 def test_errors_have_their_size_and_the_lasting_part_stays(rng) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import find_data
-from payload_emulator.errors import DatasetError, RendererError
+from payload_emulator.errors import DatasetError, RendererError, ScenarioError
 from payload_emulator.session.recipe import Recipe, Source, load_recipe
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.build import _runs, build, make_shard, plan_shards
@@ -304,7 +304,7 @@ def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_ref
     np.testing.assert_array_equal(fast.position_mcmf_m, slow.position_mcmf_m)
     np.testing.assert_array_equal(fast.sun_camera, slow.sun_camera)
     assert fast.image_sha256 != slow.image_sha256
-    with pytest.raises(DatasetError, match="expected one of fast, raymarch, cycles, found 'pov'"):
+    with pytest.raises(ScenarioError, match="expected one of fast, raymarch, cycles, found 'pov'"):
         list(build(dataclasses.replace(RECIPE, renderer="pov"), tmp_path / "x", 3, find_data(None)))
 
 

@@ -13,8 +13,8 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import clipped, ellipse_polygon, polygon_area
 from payload_emulator.training.data.integrity import check, summarise
-from payload_emulator.training.data.sheet import CLASS_COLOURS, draw_frame, draw_sheet
 from payload_emulator.training.data.targets import Tier
+from payload_emulator.training.evaluate.sheets import CLASS_COLOURS, draw_frame, draw_sheet
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_a_sheet_shows_rims_in_the_papers_colours(blob_dataset):
         # The line is one pixel wide and smoothed: nearest the colour of its class somewhere across it.
         assert np.abs(top - colour).sum(axis=1).min() < 250
     sheet = draw_sheet(blob_dataset, "test", columns=2, rows=2, tile_px=128)
-    assert sheet.shape == (2 * 152 + 6, 2 * 134 + 6, 3)
+    assert sheet.shape == (2 * (128 + 22) + 3 * 4, 2 * 128 + 3 * 4, 3)  # captions of 22 px, gaps of 4
     with pytest.raises(DatasetError, match="expected frames of split 'night', found none"):
         draw_sheet(blob_dataset, "night")
 

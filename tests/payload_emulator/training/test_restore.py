@@ -8,7 +8,7 @@ from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detector import OnnxDetector, decode
 from payload_emulator.training.model.export import keep_blocked, onnx_model
-from payload_emulator.training.model.model import CraterNet, ExportedCraterNet, ModelConfig
+from payload_emulator.training.model.model import CraterNet, ExportedCraterNet, ModelConfig, parse_config
 from payload_emulator.training.model.restore import count_statistics, enlarging, network_from_onnx
 
 
@@ -88,6 +88,14 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
     np.testing.assert_allclose(heat, outputs(network, image)[0], atol=2e-4)
     with pytest.raises(ModelError, match="expected a divisor of the stride 4, found 3"):
         ModelConfig(enlarge=3)
+
+
+def test_older_networks_name_the_only_backbone_and_stride() -> None:
+    assert parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == ModelConfig(enlarge=2)
+    with pytest.raises(ModelError, match="expected backbone small, found 'large'"):
+        parse_config({"backbone": "large"})
+    with pytest.raises(ModelError, match="expected stride_px 4, found 2"):
+        parse_config({"stride_px": 2})
 
 
 def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:

@@ -141,7 +141,7 @@ share = 1.0
     for wrong, message in (
         (text, "expected one of train, val, test, found '80/15/5'"),
         (text + 'ephemeris = "orbit.oem"\nstep_s = 0.0\n', "step_s: expected more than 0"),
-        (text.replace("16", "12"), "dataset.bits: expected 8 or 16, found 12"),
+        (text.replace("16", "12").replace("80/15/5", "train"), "bits: expected one of 8, 16, found 12"),
     ):
         path.write_text(wrong)
         with pytest.raises(DatasetError, match=message):
