@@ -25,7 +25,7 @@ SEED   ?= 1
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 HASHED  := $(SHIPPED:requirements/%=requirements/hashed/%)
 
-.PHONY: demo test check openmct docs pictures page-table sbom licences package release bench bench-planning campaigns mutation up install install-dev clean
+.PHONY: demo test check openmct docs pictures page-table sbom licences package release bench campaigns mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -97,10 +97,6 @@ package: docs
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
 
-# The plans of the planner and optimal ones; OR-Tools has an environment of its own.
-bench-planning: $(VENV)/.dev $(VENV)-ortools/.stamp
-	$(BIN)/python -m benchmarks.planning
-
 mutation: $(VENV)/.mutation
 	$(BIN)/python -m benchmarks.mutation --sample $(SAMPLE) --seed $(SEED) $(if $(GROUP),--group $(GROUP))
 
@@ -140,10 +136,5 @@ else
 $(VENV)/%: ;
 endif
 
-$(VENV)-ortools/.stamp: requirements/ortools.txt
-	$(PYTHON) -m venv $(if $(BASE_PIP),--without-pip) $(VENV)-ortools
-	$(subst $(BIN)/python,$(VENV)-ortools/bin/python,$(PIP)) -r requirements/ortools.txt
-	touch $@
-
 clean:
-	rm -rf $(VENV) $(VENV)-ortools build dist *.egg-info linna-demo deploy/openmct/node_modules
+	rm -rf $(VENV) build dist *.egg-info linna-demo deploy/openmct/node_modules

@@ -1,7 +1,7 @@
 """`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
 
 Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load,
-loss, upgrade, year, capacity, campaigns) has a command of its own and is not in this list.
+loss, upgrade, campaigns) has a command of its own and is not in this list.
 """
 
 import argparse
@@ -11,7 +11,7 @@ from benchmarks._rows import measure, report
 
 NAMES = (
     "tmtc", "xtce", "downlink", "downlink_memory", "ground", "orbit", "ephemeris", "render", "detector",
-    "planning", "report_pages", "pages",
+    "report_pages", "pages",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""
 

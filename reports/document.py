@@ -44,11 +44,12 @@ class Verdict:
 
     text: str
     level: str = ""
+    subject: str = "Verdict"
 
     @property
     def word(self) -> str:
         """Heading of the sentence."""
-        return f"Verdict: {self.level}" if self.level else "Verdict"
+        return f"{self.subject}: {self.level}" if self.level else self.subject
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,8 @@ class Requirement:
     """Row of the verdict table.
 
     ``value`` must be at most (``at_most``) or at least ``limit``. ``status`` is one of `REQUIREMENT_STATUSES`. An
-    unknown value or limit is None and never "met"; a requirement without judgement is "not judged".
+    unknown value or limit is None and never "met"; a requirement without judgement is "not judged". ``question`` is
+    "operations" (is the payload healthy and within its requirements) or "experiment" (how well does it navigate alone).
     """
 
     key: str
@@ -58,6 +59,7 @@ class Requirement:
     at_most: bool
     status: str
     note: str = ""
+    question: str = "operations"
 
     @property
     def margin(self) -> float | None:
@@ -526,11 +528,13 @@ class ReportCommon:
 class PassReport(ReportCommon):
     """Content of the report of one pass.
 
-    ``verdict`` is the sentence on the table of ``requirements``. ``configuration`` maps a group ("camera") to its
-    settings.
+    ``verdict`` is the sentence on the table of ``requirements`` for operations, ``experiment`` that for the experiment;
+    empty: the pass belongs to none. ``configuration`` maps a group ("camera") to its settings.
     """
 
     pass_id: str
+    experiment: str = ""
+    experiment_level: str = ""
     requirements: tuple[Requirement, ...] = ()
     span: TimeSpan | None = None
     accounting: FrameAccounting | None = None

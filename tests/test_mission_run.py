@@ -14,25 +14,31 @@ import numpy as np
 import pytest
 
 from ground_service.client.local import local_client
+from ground_service.clock import mission_now_ns, set_mission_clock
 from ground_service.ground import open_ground
 from ground_service.http.times import UtcTime
 from ground_service.planning.request_model import PlannedCandidate, RequestPlan
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
+from payload_emulator.session.mission import live_mission_text
 from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.session.regions import observed_boxes
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.spacecraft import SPACECRAFT_ID
+from payload_emulator.session.world import open_world
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import compare_reports, largest_relative
+from studies.mission_run.disturbances import UNDISTURBED, ReferenceDisturbances, load_disturbances
+from studies.mission_run.dynamics import FlightDynamics
 from studies.mission_run.figures import Progress, missing_windows, note_plan, windows_asked
 from studies.mission_run.ground import EmbeddedGround
-from studies.mission_run.run import MissionRun, RunTerms, _read_progress, run_mission
+from studies.mission_run.run import MissionRun, RunTerms, _read_progress, _take_turns, run_fleet, run_mission
 from tests.scenarios import commanded_scenario
 
 SCENARIO = commanded_scenario("half-a-day", "[clock]\noffset_s = 0.4\ndrift_ppm = 5.0\n")
+SECOND = f'spacecraft = "Second"\nspacecraft_id = 77{SCENARIO.replace("seed = 3", "seed = 4")}'
 DRIFT_PPM = 5.0
 
 Figures = dict[str, Any]
@@ -63,7 +69,7 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
     assert figures["navigation"]["spherical"]["median_m"] == flown["median_error_m"] > 0.0
     # The clock of this scenario drifts: the time reports of the contacts tell by how much.
     with open_ground(folder / "ground") as ground, local_client(ground, "viewer") as client:
-        (line,) = [one for one in client.list_correlations(SPACECRAFT_ID) if one.in_force]
+        (line,) = [one for one in client.list_correlations(76) if one.in_force]
     assert line.points >= 3 and line.rejected == 0
     assert line.drift_ppb == pytest.approx(-1e3 * DRIFT_PPM, abs=20.0)
     assert line.residual_max_ns is not None and line.residual_max_ns < 100e3
@@ -80,6 +86,149 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
         run_mission(
             parse_scenario(SCENARIO), DataFolder(None), folder, replace(TERMS, days=0.75), said.append
         )
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
+def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(
+    tmp_path: Path,
+) -> None:
+    other = commanded_scenario("other", "[clock]\noffset_s = -2.0\n").replace(
+        "[orbit]", "[orbit]\nraan_deg = 40.0"
+    )
+    other = f'spacecraft = "Other"\nspacecraft_id = 78{other}'
+    scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND, other)]
+    terms, folder = replace(TERMS, days=0.25), tmp_path / "fleet"
+    fleet = run_fleet(scenarios, DataFolder(None), folder, terms, lambda line: None)["fleet"]
+    assert list(fleet) == ["SelenITA", "Second", "Other"]
+    for name, scenario in (("SelenITA", scenarios[0]), ("Other", scenarios[2])):
+        single = run_mission(scenario, DataFolder(None), tmp_path / name, terms, lambda line: None)
+        values, differences = compare_reports(single, fleet[name])
+        assert values > 50 and differences == []
+    assert all(one["windows"]["processed"] == 1 and one["packets_lost"] == 0 for one in fleet.values())
+    assert all(one["interventions"] == 0 for one in fleet.values())
+    assert fleet["Second"]["performance"] != fleet["SelenITA"]["performance"]
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(900)
+def test_time_that_does_not_wait_gives_reports_too(tmp_path: Path) -> None:
+    terms = replace(TERMS, days=0.25, factor=300.0)
+    scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
+    fleet = run_fleet(scenarios, DataFolder(None), tmp_path, terms, lambda line: None)["fleet"]
+    for figures in fleet.values():
+        assert figures["windows"]["processed"] == figures["reports"] == 1 and figures["packets_lost"] == 0
+        assert figures["wall_s"] > 0.25 * 86_400.0 / 300.0
+
+
+def test_a_fleet_has_a_new_folder_and_different_spacecraft(tmp_path: Path) -> None:
+    scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
+    (tmp_path / "file").touch()
+    with pytest.raises(ScenarioError, match="expected a new folder for a fleet"):
+        run_fleet(scenarios, DataFolder(None), tmp_path, TERMS, lambda line: None)
+    for second, key in ((SCENARIO, "spacecraft"), (SECOND.replace("77", "76"), "spacecraft_id")):
+        fleet = [scenarios[0], parse_scenario(second)]
+        with pytest.raises(ScenarioError, match=f"with different {key}, found"):
+            run_fleet(fleet, DataFolder(None), tmp_path / "new", TERMS, lambda line: None)
+
+
+def test_the_spacecraft_whose_time_is_the_earliest_flies_and_its_time_is_that_of_the_service(
+    tmp_path: Path,
+) -> None:
+    seen: list[tuple[str, int]] = []
+    runs: list[Any] = [SimpleNamespace(clock_file=tmp_path / name) for name in ("a", "b")]
+
+    def flight(run: Any, times: list[int]) -> Any:
+        for time in times:
+            run.clock_file.write_bytes(time.to_bytes(8, "little"))
+            seen.append((run.clock_file.name, mission_now_ns()))
+            yield time
+
+    try:
+        _take_turns(
+            runs, [flight(run, times) for run, times in zip(runs, ([5, 20, 30], [10, 15]), strict=True)]
+        )
+    finally:
+        set_mission_clock()
+    assert seen == [("a", 5), ("b", 10), ("a", 20), ("b", 15), ("a", 30)]
+
+
+DISTURBED = """
+[link]
+frame_loss = 0.25
+missed_contacts = ["madrid 6 12", "all 20 21.5"]
+clocks = ["madrid 3600"]
+[payload]
+clock_steps = ["0.5 1.0"]
+attitude_bias_deg = 0.2
+hot_pixels = 0.001
+events = ["camera_dark at 600 for 60"]
+[reference]
+late_days = [1]
+wrong_days = [2]
+wrong_by_m = 500.0
+"""
+
+
+def test_disturbances_change_the_spacecraft_and_not_what_the_ground_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "disturbed.toml"
+    path.write_text(DISTURBED)
+    scenario = parse_scenario(SCENARIO + "[link]\nstations = ['madrid', 'canberra']\n")
+    found = load_disturbances(path).apply(scenario)
+    assert found.link.frame_loss == 0.25 and found.link.clock_errors == ("madrid 3600",)
+    begin = [" ".join(one.split()[:2]).partition(".")[0] for one in found.link.missed]
+    assert begin == [
+        "madrid 2029-08-07T06:00:00",
+        "madrid 2029-08-07T20:00:00",
+        "canberra 2029-08-07T20:00:00",
+    ]
+    assert found.link.outages == scenario.link.outages
+    assert found.faults.events == ("clock_jump at 1800.0 size 1.0", "camera_dark at 600 for 60")
+    assert found.attitude.knowledge_bias_deg == 0.2 and found.sensor.hot_pixels == 0.001
+    assert UNDISTURBED.apply(scenario) == scenario
+    # The ground is told of announced outages only, and never of these.
+    assert (
+        "missed"
+        not in live_mission_text(
+            open_world(found, DataFolder(None)), DataFolder(None), "127.0.0.1", {"madrid": (1, 2)}, ""
+        ).partition("[world]")[0]
+    )
+    assert load_disturbances("month").link.clocks == ("madrid 3600",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[link]\nframe_los = 0.1", "link.frame_los: expected 'frame_loss', found an unknown key"),
+        ("[lynk]\n", "lynk: expected 'link', found an unknown key"),
+        ("[link]\nframe_loss = 'much'", "link.frame_loss: expected a number, found 'much'"),
+        ("[link", "expected a TOML file of disturbances"),
+        ("[link]\nmissed_contacts = ['madrid 6']", "link.missed_contacts: expected STATION FROM TO"),
+        ("[link]\nmissed_contacts = ['rome 6 9']", "link.outages: expected STATION START STOP"),
+        ("[link]\nclocks = ['madrid soon']", "link.clock_errors: expected STATION SECONDS"),
+        ("[payload]\nclock_steps = ['x 1']", "payload.clock_steps: expected HOURS SECONDS"),
+    ],
+)
+def test_a_wrong_file_of_disturbances_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "disturbed.toml"
+    path.write_text(text)
+    with pytest.raises(ScenarioError) as caught:
+        load_disturbances(path).apply(parse_scenario(SCENARIO))
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_orbit_determinations_are_late_and_wrong_on_their_days(tmp_path: Path) -> None:
+    world = open_world(parse_scenario(SCENARIO), DataFolder(None))
+    plain = FlightDynamics(world)
+    disturbed = FlightDynamics(world, ReferenceDisturbances((1,), (0,), 500.0))
+    assert [disturbed.is_late(day) for day in range(3)] == [False, True, False] and not plain.is_late(1)
+    start = world.scenario.epoch_utc_ns
+    at = np.array([start + 3_600 * 10**9])
+    right, wrong = (
+        load_ephemeris(one.save_reference(start, tmp_path / f"{k}.oem")).at(at)[0][0]
+        for k, one in enumerate((plain, disturbed))
+    )
+    assert 100.0 < np.linalg.norm(wrong - right) < 2_500.0  # three draws of 500 m, 1 sigma
 
 
 class Orders:

@@ -48,7 +48,14 @@ from ground_service.evaluation.navigation.drift import (
 from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
 from ground_service.evaluation.navigation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
 from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates
-from ground_service.evaluation.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
+from ground_service.evaluation.verdict import (
+    Evaluated,
+    Limits,
+    StartOrbit,
+    requirements,
+    verdict_of,
+    without_mission,
+)
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -117,8 +124,10 @@ class PassInputs:
         Declared 1-sigma error of the reference in radial, transverse and normal.
     limits
         Limits of the verdict.
-    is_experiment
-        Whether the mission description states the error of the orbit that the pass starts from.
+    experiment
+        Orbit that the pass starts from, of a stated error; None: the best known orbit.
+    clock_step_s
+        Largest step of the on-board clock since the pass before; None without a time correlation.
     no_mission
         Where the pass refers to no mission description: what is missing and the remedy.
     cpu_percent
@@ -151,7 +160,8 @@ class PassInputs:
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
     limits: Limits = field(default_factory=Limits)
-    is_experiment: bool = False
+    experiment: StartOrbit | None = None
+    clock_step_s: float | None = None
     no_mission: str = ""
     cpu_percent: float | None = None
     build: str = ""
@@ -205,17 +215,22 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
             inputs.packets,
             inputs.housekeeping,
             inputs.cpu_percent,
-            inputs.is_experiment,
+            inputs.experiment,
+            _reference_px(inputs, reference),
+            inputs.clock_step_s,
         ),
     )
     if inputs.no_mission:
         table = without_mission(table, inputs.no_mission)
     verdict, level = verdict_of(table)
+    experiment, experiment_level = verdict_of(table, "experiment") if inputs.experiment else ("", "")
     return PassReport(
         title=inputs.title,
         pass_id=inputs.pass_id,
         verdict=verdict,
         verdict_level=level,
+        experiment=experiment,
+        experiment_level=experiment_level,
         requirements=table,
         generated_for=inputs.generated_for,
         created_utc=inputs.created_utc,
@@ -244,6 +259,18 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         scenario_text=inputs.scenario_text,
         remarks=tuple(remarks),
         not_available=missing,
+    )
+
+
+def _reference_px(inputs: PassInputs, reference: TrackSeries | None) -> float:
+    """Return the declared horizontal error of the reference at the median altitude, in pixels at nadir."""
+    sigma = inputs.reference_sigma_rtn_m
+    if sigma is None or reference is None or not np.isfinite(reference.altitude_m).any():
+        return 0.0
+    return (
+        inputs.viewing.camera.focal_px
+        * float(np.hypot(*sigma[1:]))
+        / float(np.nanmedian(reference.altitude_m))
     )
 
 
@@ -293,6 +320,8 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         "instruments": {one.name: asdict(one) for one in report.instruments},
         "verdict": report.verdict,
         "verdict_level": report.verdict_level,
+        "experiment": report.experiment,
+        "experiment_level": report.experiment_level,
         "requirements": [
             {
                 "key": one.key,

@@ -20,7 +20,7 @@ from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.instruments import instrument_reports
 from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
-from ground_service.evaluation.verdict import Limits
+from ground_service.evaluation.verdict import Limits, StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import read_catalogue
 from ground_service.missions.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
@@ -29,8 +29,9 @@ from ground_service.missions.ephemerides.store import covering_ephemerides, get_
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
+from ground_service.missions.timekeeping.core import largest_step_s
 from ground_service.missions.timekeeping.model import Correlation
-from ground_service.missions.timekeeping.store import correlations_in_force
+from ground_service.missions.timekeeping.store import correlations_in_force, load_correlations
 from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
@@ -134,7 +135,8 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
             limits=Limits(**mission.requirements.model_dump()),
-            is_experiment=mission.experiment.orbit_error_m is not None,
+            experiment=_experiment(mission, manifest),
+            clock_step_s=_clock_step_s(connection, record, span),
             no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
             build=_onboard_build(connection, span),
             cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
@@ -308,6 +310,25 @@ def _no_mission(spacecraft: int) -> str:
         f"no mission description of spacecraft {spacecraft} was registered when this pass was planned or defined. "
         "Write one (linna mission write SCENARIO), enter it (linna mission add FILE), then define the pass again."
     )
+
+
+def _clock_step_s(connection: Connection, record: PassRecord, span: PassSpan) -> float | None:
+    """Return the largest step of the clock from the pass before to the end of this one; None without correlation."""
+    runs = load_correlations(connection, span.vehicle)
+    if not runs:
+        return None
+    others = passes.passes_of_vehicle(connection, record.vehicle_id, reported=False)
+    before = max((one.stop_utc_ns for one in others if one.stop_utc_ns <= record.start_utc_ns), default=0)
+    return largest_step_s(runs, before, record.stop_utc_ns)
+
+
+def _experiment(mission: Mission, manifest: Mapping[str, Any]) -> StartOrbit | None:
+    """Return the orbit that a pass of the experiment starts from; an archive belongs to it if the mission has one."""
+    if "window_id" in manifest:
+        stated = manifest.get("experiment") or {}
+    else:
+        stated = mission.experiment.model_dump(include={"orbit_error_m", "orbit_age_h"})
+    return StartOrbit(**stated) if stated.get("orbit_error_m") else None
 
 
 def start_state_of(manifest: Mapping[str, Any]) -> StartState | None:

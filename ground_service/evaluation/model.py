@@ -33,6 +33,7 @@ class ReportRequirement(Entity):
     at_most: bool
     status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
     note: str
+    question: str = Field(default="operations", description="operations or experiment")
 
 
 class ChangedFigure(Entity):
@@ -190,6 +191,10 @@ class PassFigures(Entity):
     baselines: dict[str, NavigationFigures]
     verdict: str
     verdict_level: str = Field(description="met, not met or unknown", examples=["met"])
+    experiment: str = Field(
+        default="", description="The same for navigation without help; empty: no experiment"
+    )
+    experiment_level: str = ""
     requirements: list[RequirementFigures]
     error_budget: dict[str, ErrorBudget]
     instruments: dict[str, InstrumentFigures] = Field(default_factory=dict)

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_service.evaluation.navigation.consistency import bounds_per_degree, independent_samples
+from lunar.arrays import FloatArray
+from lunar.constants import NANOSECONDS_PER_SECOND
 from reports.statistics import per_degree
 from reports.text import count_text, significant_text
 from reports.values import (
@@ -26,6 +28,8 @@ from reports.values import (
 
 FROM_START = ("propagate-only", "Kepler")
 """Baselines that propagate the start state; they are rivals where the start state was made worse for an experiment."""
+LASTING = 4
+"""Successive samples with a small error that show that an estimator has converged."""
 NEES_DEGREES = 3
 DRAW_GAP_NS = 1_800_000_000_000
 """Frames this far apart have independent errors of the position."""
@@ -56,11 +60,38 @@ class Limits:
     storage_percent: float | None = None
     temperature_max_c: float | None = None
     temperature_min_c: float | None = None
+    convergence_s: float | None = None
+    drift_percent: float | None = None
+    offset_px: float | None = None
+    clock_step_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StartOrbit:
+    """Orbit that a pass of the experiment starts from: 1-sigma error per axis, and age where stated."""
+
+    orbit_error_m: float
+    orbit_age_h: float | None = None
+
+    @property
+    def text(self) -> str:
+        age = "" if self.orbit_age_h is None else f", {self.orbit_age_h:g} h old"
+        return f"from an orbit with an error of {significant_text(self.orbit_error_m)} m per axis{age}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """Results of a pass that requirements refer to; `is_experiment`: it starts from an orbit of a stated error."""
+    """Results of a pass that requirements refer to.
+
+    Attributes
+    ----------
+    experiment
+        None: the pass starts from the best known orbit.
+    reference_px
+        Horizontal 1-sigma error of the reference in the image.
+    clock_step_s
+        Largest step of the on-board clock since the pass before; None without a time correlation.
+    """
 
     navigation: tuple[NavigationSeries, ...] = ()
     detector: DetectorScore | None = None
@@ -68,7 +99,9 @@ class Evaluated:
     packets: PacketAccounting | None = None
     housekeeping: tuple[HousekeepingParameter, ...] = ()
     cpu_percent: float | None = None
-    is_experiment: bool = False
+    experiment: StartOrbit | None = None
+    reference_px: float = 0.0
+    clock_step_s: float | None = None
 
 
 def requirements(limits: Limits, found: Evaluated) -> tuple[Requirement, ...]:
@@ -76,9 +109,12 @@ def requirements(limits: Limits, found: Evaluated) -> tuple[Requirement, ...]:
     return (
         *_accuracy(limits, found),
         *_comparisons(limits, found),
+        *_experiment(limits, found),
         *_consistency(limits, found),
         *_completeness(limits, found),
         *_detector(limits, found),
+        *_pointing(limits, found),
+        *_clock(limits, found),
         *_independence(limits, found),
         *_resources(limits, found),
     )
@@ -93,9 +129,9 @@ def without_mission(table: Sequence[Requirement], remedy: str) -> tuple[Requirem
     )
 
 
-def verdict_of(table: Sequence[Requirement]) -> tuple[str, str]:
+def verdict_of(table: Sequence[Requirement], question: str = "operations") -> tuple[str, str]:
     """Return the sentence on a verdict table, failures first, and its level: "met", "not met" or "unknown"."""
-    judged = [one for one in table if one.status != "not judged"]
+    judged = [one for one in table if one.status != "not judged" and one.question == question]
     failed = [one for one in judged if one.status == "not met"]
     unknown = [one for one in judged if one.status == "unknown"]
     met = len(judged) - len(failed) - len(unknown)
@@ -138,6 +174,7 @@ def _row(
     known: bool = True,
     judged: bool | None = None,
     note: str = "",
+    question: str = "operations",
 ) -> Requirement:
     """Return a requirement, judged if the mission states its limit unless `judged` says otherwise.
 
@@ -156,13 +193,24 @@ def _row(
         margin = limit - value if at_most else value - limit
         good = margin > 0.0 if strict else margin >= 0.0
         status = "not met" if not good else "met" if known else "unknown"
-    return Requirement(key, name, unit, value, limit, at_most, status, note)
+    return Requirement(key, name, unit, value, limit, at_most, status, note, question)
 
 
 def _declared(limits: Limits, found: Evaluated) -> NavigationSeries | None:
     return next(
         (one for one in found.navigation if one.kind == "estimate" and one.name == limits.estimator), None
     )
+
+
+def _converged_errors(series: NavigationSeries, limit_m: float | None) -> FloatArray:
+    """Return the finite 3-D errors from the sample on where the estimator states a 3-D sigma below a limit.
+
+    All errors where it never does, so that an estimator that does not converge is judged by its start.
+    """
+    errors = np.linalg.norm(series.error_rtn_m, axis=1)
+    if limit_m is not None and series.sigma_rtn_m is not None:
+        errors = errors[int(np.argmax(np.linalg.norm(series.sigma_rtn_m, axis=1) < limit_m)) :]
+    return np.asarray(errors[np.isfinite(errors)])
 
 
 def _median(series: NavigationSeries | None) -> float | None:
@@ -184,6 +232,11 @@ def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
         note = f"{limits.estimator}, {count_text(len(series.utc_ns))} samples"
     median = _median(series)
     p95 = None if median is None or series is None else series.statistics.p95_3d_m
+    if found.experiment is not None and p95 is not None and series is not None:
+        errors = _converged_errors(series, limits.p95_error_m)
+        if len(errors):
+            median, p95 = (float(one) for one in np.percentile(errors, (50.0, 95.0)))
+            note += f", {count_text(len(errors))} of them from convergence on"
     yield _row(
         "accuracy.median", "median 3-D error", "m", median, limits.median_error_m, at_most=True, note=note
     )
@@ -214,13 +267,61 @@ def _comparisons(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
             baseline,
             at_most=True,
             strict=True,
-            judged=name in wanted and (found.is_experiment or not from_start),
+            judged=name in wanted and (found.experiment is not None or not from_start),
             note="this baseline was not computed"
             if name not in others
             else "no experiment: the pass starts from the best known orbit"
-            if from_start and not found.is_experiment
+            if from_start and found.experiment is None
             else "median 3-D error",
+            question="experiment" if from_start else "operations",
         )
+
+
+def _experiment(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    """Yield convergence and drift of a pass that starts from an orbit of a stated error."""
+    if found.experiment is None:
+        return
+    series, text = _declared(limits, found), found.experiment.text
+    seconds = drift = None
+    if series is not None and limits.p95_error_m is not None:
+        seconds = _convergence_s(series, limits.p95_error_m)
+        bound = significant_text(limits.p95_error_m)
+        text += f"; until {LASTING} successive errors are at most {bound} m"
+    if series is not None:
+        drift = series.statistics.drift_percent
+        budget = series.error_budget
+        if budget is not None:
+            text += f"; reference {significant_text(budget.reference_rms_m)} m rms"
+    yield _row(
+        "experiment.convergence",
+        "time to convergence",
+        "s",
+        seconds,
+        limits.convergence_s,
+        at_most=True,
+        note=text,
+        question="experiment",
+    )
+    yield _row(
+        "experiment.drift",
+        "drift of the ground path",
+        "%",
+        drift,
+        limits.drift_percent,
+        at_most=True,
+        note="end of the pass against the reference",
+        question="experiment",
+    )
+
+
+def _convergence_s(series: NavigationSeries, limit_m: float) -> float | None:
+    """Return the time from the first sample until `LASTING` successive errors are at most a limit; None if never."""
+    good = np.linalg.norm(series.error_rtn_m, axis=1) <= limit_m
+    if len(good) < LASTING:
+        return None
+    lasting = np.asarray(np.lib.stride_tricks.sliding_window_view(good, LASTING).all(axis=1))
+    first = int(np.argmax(lasting))
+    return float(series.utc_ns[first] - series.utc_ns[0]) / NANOSECONDS_PER_SECOND if lasting[first] else None
 
 
 def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
@@ -317,6 +418,40 @@ def _detector(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     yield _row("detector.recall", "detector recall", "", recall, limits.recall, at_most=False, note=note)
     yield _row(
         "detector.precision", "detector precision", "", precision, limits.precision, at_most=False, note=note
+    )
+
+
+def _pointing(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    """Yield the offset of the images from the catalogue: an error of the camera or of the attitude."""
+    residuals = None if found.detector is None else found.detector.residuals
+    offset, note = None, ""
+    if residuals is not None and len(residuals.du_px):
+        mean = math.hypot(float(np.median(residuals.du_px)), float(np.median(residuals.dv_px)))
+        offset = max(mean - found.reference_px, 0.0)
+        note = (
+            f"camera or attitude: median of {count_text(len(residuals.du_px))} craters {mean:.2f} px, less "
+            f"{found.reference_px:.2f} px of the reference"
+        )
+    yield _row(
+        "pointing.offset",
+        "offset of the images from the catalogue",
+        "px",
+        offset,
+        limits.offset_px,
+        at_most=True,
+        note=note,
+    )
+
+
+def _clock(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    yield _row(
+        "time.step",
+        "step of the on-board clock",
+        "s",
+        found.clock_step_s,
+        limits.clock_step_s,
+        at_most=True,
+        note="largest since the pass before, by time correlation",
     )
 
 

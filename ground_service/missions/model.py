@@ -354,19 +354,32 @@ class Requirements(Section):
     storage_percent: Percent | None = None
     temperature_max_c: float | None = None
     temperature_min_c: float | None = None
+    convergence_s: Positive | None = None
+    drift_percent: Positive | None = None
+    offset_px: Positive | None = None
+    clock_step_s: Positive | None = None
 
 
 class Experiment(Section):
     """Start of the windows for measuring how well the payload navigates without help.
 
+    A window of the experiment starts from an orbit of a stated age and error. Other windows start from the best known
+    orbit, and propagating it is no rival.
+
     Attributes
     ----------
+    windows
+        Windows of the experiment: all, or the first one of each day in UTC. Not stated: all.
     orbit_error_m
-        Error of the orbit that estimators start from, 1 sigma per axis. Without it, they start from the best known
-        orbit, and propagating it is no rival.
+        Error of the position that estimators start from, 1 sigma per axis. That of the velocity is this error times the
+        mean motion. Without it, there is no experiment.
+    orbit_age_h
+        The orbit is that of an ephemeris whose arc begins so long before the window, or earlier; not stated: the best.
     """
 
+    windows: Literal["all", "first_of_day"] | None = None
     orbit_error_m: Positive | None = None
+    orbit_age_h: NotNegative | None = None
 
 
 class Uploads(Section):

@@ -325,11 +325,19 @@ class UploadedBurn(Entity):
     sigma_m_s: float
 
 
+class StartedOrbit(Entity):
+    """Orbit of the experiment that a window starts from."""
+
+    orbit_error_m: float = Field(description="1 sigma per axis")
+    orbit_age_h: float | None = Field(description="From the begin of the arc of its ephemeris to the window")
+
+
 class WindowUploads(Entity):
     """What the telecommands of a window load on board, as the manifest of a pass states it."""
 
     start_state: UploadedState | None = None
     burns: list[UploadedBurn] | None = None
+    experiment: StartedOrbit | None = None
 
 
 class WindowRecord(Window):

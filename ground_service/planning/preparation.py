@@ -56,8 +56,11 @@ def prepare_window(
     stop_utc_ns: int,
     ticks_of: TicksOf,
     transaction: int,
+    start: StartState | None = None,
 ) -> tuple[list[Activity], StartState | None]:
     """Return the activities around a window besides its observation, and the uploaded start state.
+
+    `start` is the start state of a window of the experiment; None: that of the reference.
 
     Raises
     ------
@@ -73,7 +76,7 @@ def prepare_window(
         if reference is None:
             raise Conflict(f"{needed}, found none")
         try:
-            state = start_state(reference, start_utc_ns)
+            state = start or start_state(reference, start_utc_ns)
             tables = _tables(uploads, reference, orientation, state, stop_utc_ns, ticks_of)
         except EphemerisCoverageError as error:
             raise Conflict(f"{needed}: {error}") from None
@@ -99,6 +102,30 @@ def start_state(reference: Ephemeris, utc_ns: int) -> StartState:
     """Return the state of the reference at an instant."""
     position, velocity = reference.at(np.array([utc_ns], dtype=np.int64))
     return StartState(utc_ns, position[0], velocity[0])
+
+
+def experiment_state(orbit: Ephemeris, error_m: float, utc_ns: int, spacecraft_id: int) -> StartState:
+    """Return a state of an orbit with an error that spacecraft and time determine.
+
+    The errors of the position, 1 sigma per axis, and of the velocity, this times the mean motion, are independent.
+    """
+    known = start_state(orbit, utc_ns)
+    drawn = np.random.default_rng((spacecraft_id, utc_ns)).normal(0.0, error_m, (2, 3))
+    return StartState(
+        utc_ns, known.position_icrf_m + drawn[0], known.velocity_icrf_m_s + drawn[1] * _mean_motion(known)
+    )
+
+
+def experiment_accuracy(uploads: Uploads, error_m: float, state: StartState) -> Uploads:
+    """Return uploads that declare the accuracy of a start state of the experiment."""
+    return uploads.model_copy(
+        update={"sigma_position_m": error_m, "sigma_velocity_m_s": error_m * _mean_motion(state)}
+    )
+
+
+def _mean_motion(state: StartState) -> float:
+    """Return the angular rate of a state about the Moon, in rad/s."""
+    return float(np.linalg.norm(state.velocity_icrf_m_s) / np.linalg.norm(state.position_icrf_m))
 
 
 def _tables(

@@ -83,9 +83,11 @@ def list_requests(connection: Connection, asked: Paging) -> PageOf[StandingReque
     return asked.page((_request(connection, row) for row in rows), total)
 
 
-def active_requests(connection: Connection) -> list[int]:
-    """Return the ids of the active requests, by priority, then the oldest first."""
+def active_requests(connection: Connection, vehicle_id: int | None = None) -> list[int]:
+    """Return the ids of the active requests of a vehicle, None: of all, by priority, then the oldest first."""
     query = select(_REQUESTS.c.id).where(_REQUESTS.c.state == "active")
+    if vehicle_id is not None:
+        query = query.where(_REQUESTS.c.vehicle_id == vehicle_id)
     return [
         int(key)
         for key in connection.execute(query.order_by(_REQUESTS.c.priority.desc(), _REQUESTS.c.id)).scalars()
@@ -154,11 +156,24 @@ def windows_around(connection: Connection, vehicle: int, since_utc_ns: int) -> l
     return records_where(connection, _WINDOWS.c.vehicle_id == vehicle, _WINDOWS.c.stop_utc_ns > since_utc_ns)
 
 
-def unfinished_windows(connection: Connection, until_utc_ns: int) -> list[WindowRecord]:
-    """Return the drafts of requests, and all approved windows without an uplink, that begin before a time."""
+def planned_vehicles(connection: Connection) -> list[int]:
+    """Return the ids of the vehicles with an active request or an unfinished window."""
+    active = select(_REQUESTS.c.vehicle_id).where(_REQUESTS.c.state == "active")
+    windows = {one.vehicle_id for one in unfinished_windows(connection, 2**62)}
+    return sorted({*connection.execute(active).scalars(), *windows})
+
+
+def unfinished_windows(
+    connection: Connection, until_utc_ns: int, vehicle_id: int | None = None
+) -> list[WindowRecord]:
+    """Return the drafts of requests, and all approved windows without an uplink, that begin before a time.
+
+    Those of a vehicle; None: of all.
+    """
     return records_where(
         connection,
         _WINDOWS.c.start_utc_ns <= until_utc_ns,
+        *(() if vehicle_id is None else (_WINDOWS.c.vehicle_id == vehicle_id,)),
         (_WINDOWS.c.state == "approved")
         | ((_WINDOWS.c.state == "draft") & _WINDOWS.c.request_id.is_not(None)),
     )

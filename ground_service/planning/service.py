@@ -51,7 +51,15 @@ from ground_service.planning.model import (
     WindowRecord,
     WindowSearch,
 )
-from ground_service.planning.preparation import MARGIN_NS, Activity, TicksOf, gap_ns, prepare_window
+from ground_service.planning.preparation import (
+    MARGIN_NS,
+    Activity,
+    TicksOf,
+    experiment_accuracy,
+    experiment_state,
+    gap_ns,
+    prepare_window,
+)
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
@@ -353,14 +361,25 @@ def _preparation(
         one for one in found if one.start.utc_ns <= start - MARGIN_NS and stop + MARGIN_NS <= one.stop.utc_ns
     ]
     orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
+    uploads, begin, experiment = mission.uploads, None, None
+    error_m, age_h = mission.experiment.orbit_error_m, mission.experiment.orbit_age_h
+    if error_m is not None and whole and _is_of_experiment(connection, window, mission):
+        old = [one for one in whole if one.start.utc_ns <= start - round((age_h or 0.0) * 3600 * NS)]
+        # Without an ephemeris of that age, the oldest arc: its age is recorded.
+        orbit = old[0] if old else min(whole, key=lambda one: one.start.utc_ns)
+        begin = experiment_state(open_ephemeris(ground, orbit), error_m, start, window.spacecraft_id)
+        uploads = experiment_accuracy(uploads, error_m, begin)
+        age = None if age_h is None else round((start - orbit.start.utc_ns) / (3600 * NS), 2)
+        experiment = model.StartedOrbit(orbit_error_m=error_m, orbit_age_h=age)
     activities, state = prepare_window(
-        mission.uploads,
+        uploads,
         open_ephemeris(ground, whole[0]) if whole else None,
         orientation,
         start,
         stop,
         ticks_of,
         8 * window.id,
+        begin,
     )
     if state is not None:
         uploaded = model.UploadedState(
@@ -368,8 +387,21 @@ def _preparation(
             position_icrf_m=tuple(state.position_icrf_m.tolist()),
             velocity_icrf_m_s=tuple(state.velocity_icrf_m_s.tolist()),
         )
-        store.note_uploads(connection, window.id, model.WindowUploads(start_state=uploaded))
+        noted = model.WindowUploads(start_state=uploaded, experiment=experiment)
+        store.note_uploads(connection, window.id, noted)
     return activities
+
+
+def _is_of_experiment(connection: Connection, window: WindowRecord, mission: Mission) -> bool:
+    """Return whether a window belongs to the experiment of its mission description, which needs a start state."""
+    if mission.uploads is None or "initial_state" not in mission.uploads.tables:
+        return False
+    if mission.experiment.windows != "first_of_day":
+        return True
+    start = window.start.utc_ns
+    day = start - start % (86_400 * NS)
+    before = store.windows_between(connection, window.spacecraft_id, window.instance, day, start)
+    return not any(one.start.utc_ns >= day for one in before)
 
 
 def _assessed(

@@ -20,7 +20,7 @@ from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import store as commands
 from ground_service.contacts.links import service as links
-from ground_service.errors import PASSING, GroundError, InvalidInput, PlanConflicts, StateConflict
+from ground_service.errors import PASSING, GroundError, InvalidInput, NotFound, PlanConflicts, StateConflict
 from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -45,7 +45,7 @@ from ground_service.planning.request_model import (
 from ground_service.planning.request_store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.counters import lock_spacecraft
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store.vehicles import get_vehicle, vehicle_id
 from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)
@@ -124,8 +124,10 @@ def delete_request(ground: Ground, request_id: int, *, actor: str) -> None:
         _note(connection, actor, "delete", request_id, "deleted")
 
 
-def plan_tick(ground: Ground, now_utc_ns: int | None = None) -> dict[str, int]:
+def plan_tick(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | None = None) -> dict[str, int]:
     """Bring the plan up to date: fail windows that can no longer begin, fill the coming days, approve and release.
+
+    The plan is that of a vehicle; None: of all.
 
     Returns
     -------
@@ -133,9 +135,9 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None) -> dict[str, int]:
         Numbers of windows `failed`, `added`, `approved` and `released`.
     """
     now = mission_now_ns() if now_utc_ns is None else now_utc_ns
-    done = {"failed": _fail_late(ground, now), "added": 0, "approved": 0, "released": 0}
+    done = {"failed": _fail_late(ground, now, vehicle_id), "added": 0, "approved": 0, "released": 0}
     with ground.database.reading() as connection:
-        requests = store.active_requests(connection)
+        requests = store.active_requests(connection, vehicle_id)
     for request_id in requests:
         ground.check_stopping()
         try:
@@ -144,7 +146,7 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None) -> dict[str, int]:
             raise
         except (GroundError, LunarError) as error:  # the windows of other requests are still planned and sent
             log.warning("standing request %d: %s", request_id, error)
-    approved, released = _advance(ground, now)
+    approved, released = _advance(ground, now, vehicle_id)
     return done | {"approved": approved, "released": released}
 
 
@@ -154,10 +156,26 @@ def needs_plan(ground: Ground) -> bool:
         return bool(store.active_requests(connection) or store.unfinished_windows(connection, 2**62))
 
 
-def _fail_late(ground: Ground, now: int) -> int:
+def planned_with(ground: Ground, ephemeris_id: int) -> list[int]:
+    """Return the planned vehicles of whose spacecraft an ephemeris is; all of them if it was withdrawn."""
+    with ground.database.reading() as connection:
+        vehicles = store.planned_vehicles(connection)
+        try:
+            name = ephemerides.get_ephemeris(connection, ephemeris_id).object_name
+        except NotFound:
+            return vehicles
+        numbers = {one: get_vehicle(connection, one).ccsds_id for one in vehicles}
+        return [
+            one
+            for one, number in numbers.items()
+            if planning.mission_of(connection, number).spacecraft.is_object(name)
+        ]
+
+
+def _fail_late(ground: Ground, now: int, vehicle_id: int | None) -> int:
     """Fail windows that began without their telecommands being sent, or without approval."""
     with ground.database.reading() as connection:
-        late = store.unfinished_windows(connection, now)
+        late = store.unfinished_windows(connection, now, vehicle_id)
         waiting = [
             one
             for one in late
@@ -172,12 +190,12 @@ def _fail_late(ground: Ground, now: int) -> int:
     return failed
 
 
-def _advance(ground: Ground, now: int) -> tuple[int, int]:
+def _advance(ground: Ground, now: int, vehicle_id: int | None) -> tuple[int, int]:
     """Approve drafts where the mission description permits it, and release the telecommands of approved windows."""
     with ground.database.reading() as connection:
         soon = [
             one
-            for one in store.unfinished_windows(connection, now + RELEASE_AHEAD_NS)
+            for one in store.unfinished_windows(connection, now + RELEASE_AHEAD_NS, vehicle_id)
             if one.request_id is not None and one.start.utc_ns > now
         ]
         automatic = {

@@ -14,11 +14,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
-from ground_service.errors import PASSING, public_text
+from ground_service.errors import PASSING, NotFound, public_text
 from ground_service.events import (
     AutomationChanged,
     CommandsSent,
@@ -45,7 +46,8 @@ from ground_service.passes.alarms.service import examine_packets
 from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
-from ground_service.planning.standing import needs_plan
+from ground_service.planning.standing import needs_plan, planned_with
+from ground_service.planning.store import get_record
 from ground_service.store import events
 from ground_service.store.events import LoggedEvent
 from ground_service.worker.automation.service import OCCURRENCES, has_actions, record_actions
@@ -96,7 +98,8 @@ def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
         yield "recorrelate", vehicle
     for pass_id in passes:
         yield "re-evaluate", pass_id
-    yield "plan", 0
+    for vehicle in planned_with(ground, event.id):
+        yield "plan", vehicle
 
 
 def _after_uplink(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -123,12 +126,19 @@ def _after_decision(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
         yield "notify", event.event
 
 
-def _after_window(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    if WindowChanged.of(logged).state == "failed":
-        yield "plan", 0
+def _after_window(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = WindowChanged.of(logged)
+    if event.state == "failed":
+        with suppress(NotFound):
+            yield "plan", ground.read(get_record, event.id).vehicle_id
 
 
-def _after_change_of_plan(_ground: Ground, _logged: LoggedEvent) -> Iterator[Work]:
+def _after_contact(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    # The plan of another spacecraft does not depend on this contact.
+    yield "plan", int(logged.payload["vehicle_id"])
+
+
+def _after_request(_ground: Ground, _logged: LoggedEvent) -> Iterator[Work]:
     yield "plan", 0
 
 
@@ -142,9 +152,9 @@ FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
     MissionAdded.event_kind: _after_mission,
     AutomationChanged.event_kind: _after_decision,
     WindowChanged.event_kind: _after_window,
-    ContactEnded.event_kind: _after_change_of_plan,
-    ContactMissed.event_kind: _after_change_of_plan,
-    RequestChanged.event_kind: _after_change_of_plan,
+    ContactEnded.event_kind: _after_contact,
+    ContactMissed.event_kind: _after_contact,
+    RequestChanged.event_kind: _after_request,
 }
 """The work that keeps derived data up to date after an event, by its kind."""
 
@@ -211,12 +221,13 @@ def _notify(ground: Ground, number: int, event: int) -> str:
         return add_job(connection, "notification", {"event": number}, job_id=identity)
 
 
-def _plan(ground: Ground, _key: int, event: int) -> str | None:
-    """Add the job that brings the plan of standing requests up to date, if there is anything to plan."""
+def _plan(ground: Ground, vehicle: int, event: int) -> str | None:
+    """Add the job that brings the plan of a vehicle up to date, 0: of all, if there is anything to plan."""
     if not needs_plan(ground):
         return None
     with ground.database.writing() as connection:
-        return add_job(connection, "plan", {}, job_id=_job_id("plan", 0, event))
+        arguments = {"vehicle_id": vehicle} if vehicle else {}
+        return add_job(connection, "plan", arguments, job_id=_job_id("plan", vehicle, event))
 
 
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {

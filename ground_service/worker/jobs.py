@@ -65,9 +65,9 @@ def _reevaluate(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> di
     return {"report_id": None if made is None else made.report_id, "pass_id": pass_id, "event": event}
 
 
-def _plan(ground: Ground, _arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+def _plan(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
     """Bring the plan of standing requests up to date."""
-    return dict(plan_tick(ground))
+    return dict(plan_tick(ground, vehicle_id=arguments.get("vehicle_id")))
 
 
 def _ingest(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:

@@ -41,11 +41,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(showing, "revision REVISION", str, "the hash or its first eight digits")
     showing.set_defaults(handler=show)
     running = actions.add_parser("run", help="run payload, stations, ground service and automation for days")
-    option(running, "scenario SCENARIO", str, "scenario file or name")
+    option(running, "scenario SCENARIO", str, "scenario file or name; several are a fleet", nargs="+")
     option(running, "--days D", float, "simulated days", required=True)
     option(running, "--speed X|max", str, "simulated seconds per second", "max")
     option(running, "--observe-hours-a-day H", float, "observation a day", 0.4)
     option(running, "--window-min M", float, "window (default: 12 min)", 12.0)
+    option(
+        running,
+        "--real-time-factor F",
+        float,
+        "simulated seconds per second that do not wait for the ground, instead of --speed",
+        0.0,
+    )
+    option(running, "--disturbances FILE", str, "faults of spacecraft, stations and flight dynamics")
     option(running, "--folder DIR", Path, "folder of the run (default: run-SCENARIO)")
     option(
         running,
@@ -164,7 +172,7 @@ def run_mission(arguments: argparse.Namespace) -> int:
     from payload_emulator.session.scenario import load_scenario
     from studies.mission_run import run
     from studies.mission_run.distributed import Servers
-    from studies.mission_run.figures import UNKNOWN
+    from studies.mission_run.disturbances import UNDISTURBED, load_disturbances
 
     try:
         rate = 0.0 if arguments.speed == "max" else float(arguments.speed)
@@ -189,7 +197,13 @@ def run_mission(arguments: argparse.Namespace) -> int:
         raise UsageError("--kills: expected --kill SEED with it, found none")
     if kills < 0 or (arguments.kill or 0) < 0:
         raise UsageError("--kill, --kills: expected numbers from 0")
-    scenario = load_scenario(arguments.scenario)
+    factor = arguments.real_time_factor
+    if not factor >= 0.0 or (factor and (rate or kills)):
+        raise UsageError("--real-time-factor: expected a number above 0 without --speed and --kill")
+    disturbances = UNDISTURBED
+    if arguments.disturbances is not None:
+        disturbances = load_disturbances(arguments.disturbances)
+    scenarios = [load_scenario(one) for one in arguments.scenario]
     terms = run.RunTerms(
         arguments.days,
         rate,
@@ -198,24 +212,44 @@ def run_mission(arguments: argparse.Namespace) -> int:
         arguments.distributed,
         arguments.kill,
         kills,
+        factor,
+        disturbances,
     )
+    folder = arguments.folder or Path(f"run-{'-'.join(one.name for one in scenarios)}")
+    if len(scenarios) > 1:
+        if arguments.distributed:
+            raise UsageError("--distributed: expected one scenario, found a fleet")
+        fleet = run.run_fleet(scenarios, data_folder(), folder, terms, log)
+        found = list(fleet["fleet"].values())
+        emit(arguments, fleet, text="\n".join(_closing_text(one, folder) for one in found))
+        return 0 if all(map(_went_well, found)) else 1
     servers = Servers(arguments.database, arguments.broker)
-    folder = arguments.folder or Path(f"run-{scenario.name}")
-    figures = run.run_mission(scenario, data_folder(), folder, terms, log, servers)
+    figures = run.run_mission(scenarios[0], data_folder(), folder, terms, log, servers)
+    emit(arguments, figures, text=_closing_text(figures, folder))
+    return 0 if _went_well(figures) else 1
+
+
+def _closing_text(figures: Mapping[str, Any], folder: Path) -> str:
     windows, missing = figures["windows"], figures["missing_windows"]
-    text = (
-        f"{figures['days']:g} days in {figures['wall_s']:.0f} s: {windows['requested']} windows requested, "
-        f"{windows['flown']} flown, {windows['processed']} processed, {windows['failed']} failed; "
-        f"{figures['packets_lost']} packets lost, {figures['reports']} reports, {figures['alerts']} alerts, "
-        f"{figures['interventions']} interventions\n"
+    return (
+        f"{figures['spacecraft']}, {figures['days']:g} days in {figures['wall_s']:.0f} s: "
+        f"{windows['requested']} windows requested, {windows['flown']} flown, {windows['processed']} processed, "
+        f"{windows['failed']} failed; {figures['packets_lost']} packets lost, {figures['reports']} reports, "
+        f"{figures['alerts']} alerts, {figures['interventions']} interventions\n"
         + "\n".join(
             [f"day {one['day']}: {one['missing']} windows missing: {one['reason']}" for one in missing]
             + [*figures["monthly_reports"], str(folder / "report.json")]
         )
     )
-    emit(arguments, figures, text=text)
-    explained = all(one["reason"] != UNKNOWN for one in missing)
-    return 0 if explained and windows["processed"] == windows["flown"] and not figures["packets_lost"] else 1
+
+
+def _went_well(figures: Mapping[str, Any]) -> bool:
+    """Return whether each window flown is processed, each missing one explained, and no packet lost."""
+    from studies.mission_run.figures import UNKNOWN
+
+    windows = figures["windows"]
+    explained = all(one["reason"] != UNKNOWN for one in figures["missing_windows"])
+    return explained and windows["processed"] == windows["flown"] and not figures["packets_lost"]
 
 
 def compare(arguments: argparse.Namespace) -> int:

@@ -41,7 +41,6 @@ from payload_emulator.session.schedule import fly_scenario, timeline
 from payload_emulator.session.scoring import judge_session, score_navigation
 from payload_emulator.session.spacecraft import (
     PLAYBACK_CHANNEL,
-    SPACECRAFT_ID,
     Spacecraft,
     Turn,
     new_spacecraft,
@@ -130,7 +129,7 @@ class Sender:
     _light_s: float = LIGHT_S
 
     def __post_init__(self) -> None:
-        self.transmitter = Transmitter(SPACECRAFT_ID, self.settings)
+        self.transmitter = Transmitter(self.world.scenario.spacecraft_id, self.settings)
 
     def take(self, turn: Turn) -> None:
         """Take the packets of a turn, and send what is complete."""
@@ -260,7 +259,7 @@ def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, An
     return {
         "schema_version": 1,
         "pass_name": f"{scenario.name}-{format_utc(int(world.frame_utc_ns[0]), 0)}",
-        "spacecraft_id": SPACECRAFT_ID,
+        "spacecraft_id": scenario.spacecraft_id,
         "scenario": scenario.name,
         "scenario_toml": format_scenario(scenario),
         "seed": scenario.seed,

@@ -42,7 +42,7 @@ from payload_emulator.session.live_ports import Server
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.schedule import Operator, timeline
-from payload_emulator.session.spacecraft import SPACECRAFT_ID, Moment, Spacecraft, Turn, fly, new_spacecraft
+from payload_emulator.session.spacecraft import Moment, Spacecraft, Turn, fly, new_spacecraft
 from payload_emulator.session.state import load_state, save_state
 from payload_emulator.session.station_ports import (
     KEPT_LIMIT_OCTETS,
@@ -61,7 +61,7 @@ from payload_emulator.session.world import (
     frame_utc_ns,
     sample_truth,
 )
-from payload_emulator.sim.board.contact_plan import StationContact, plan_contacts
+from payload_emulator.sim.board.contact_plan import StationContact, parse_clock_error, plan_contacts
 from payload_emulator.sim.board.link import Transmitter, light_to_earth_s, transmit
 from payload_emulator.sim.orbit.truth import Spliced, Truth
 from tmtc.dictionary import DICTIONARY
@@ -197,7 +197,7 @@ class LiveSession:
 
     def __post_init__(self) -> None:
         world, scenario = self.world, self.world.scenario
-        self._transmitter = Transmitter(SPACECRAFT_ID, LinkSettings(coding=scenario.link.coding))
+        self._transmitter = Transmitter(scenario.spacecraft_id, LinkSettings(coding=scenario.link.coding))
         self.utc_ns = self._planned_until_ns = world.truth.start_utc_ns
         if scenario.orbit.oem:
             self.stop_utc_ns = min(self.stop_utc_ns or world.truth.stop_utc_ns, world.truth.stop_utc_ns)
@@ -356,8 +356,8 @@ class LiveSession:
         )
 
     def _finish(self, selector: selectors.BaseSelector) -> None:
-        """Say that the end is reached and wait for `run` where time holds, also to a console that connects later."""
-        self._held = self.holds
+        """Say that the end is reached; wait for `run` where time holds or a console, which may come later, ends it."""
+        self._held = self.holds or self.ends_with_console
         message = {**self._contact_message(), "kind": "finished"}
         self._send_message(message)
         told = set(self.console.clients)
@@ -574,7 +574,8 @@ class LiveSession:
             account.frames_sent += reception.account["frames_sent"]
         else:
             octets = transmitter.idle(turn.clcw)
-        received_ns = self.utc_ns + round(light_s * _NS)
+        stated = dict(map(parse_clock_error, scenario.link.clock_errors))
+        received_ns = self.utc_ns + round(light_s * _NS) + stated.get(contact.station, 0)
         self.stations[contact.station].send(received_ns, octets, transmitter.settings.cadu_length)
 
     # Ports

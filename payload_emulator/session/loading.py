@@ -249,10 +249,13 @@ def _attitude_errors(scenario: Scenario) -> CommonErrors:
     noise_deg = attitude.declared_noise_deg
     if noise_deg < 0.0:
         noise_deg = attitude.knowledge_noise_deg
+    bias_deg = attitude.declared_bias_deg
+    if bias_deg < 0.0:
+        bias_deg = attitude.knowledge_bias_deg
     return replace(
         errors,
         attitude_noise_rad=max(errors.attitude_noise_rad, float(np.radians(noise_deg))),
-        attitude_bias_rad=max(errors.attitude_bias_rad, float(np.radians(attitude.knowledge_bias_deg))),
+        attitude_bias_rad=max(errors.attitude_bias_rad, float(np.radians(bias_deg))),
     )
 
 

@@ -26,8 +26,14 @@ from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.loading import detector_parameters, filter_field, network_octets
 from payload_emulator.session.recipe import Source, inside_box, load_recipe
 from payload_emulator.session.recording import StepInput
-from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario, format_scenario
-from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL, SPACECRAFT_ID
+from payload_emulator.session.scenario import (
+    SHIPPED,
+    SPACECRAFT_ID,
+    RequirementsSection,
+    Scenario,
+    format_scenario,
+)
+from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import World, build_world, open_world
 from payload_emulator.sim.board.contact_plan import parse_outage
@@ -64,11 +70,16 @@ one_person_for = ["uplink_first", "uplink_middle", "uplink_last", "perform_funct
 """
 """Automation and approval of a simulated spacecraft: windows that the ground plans are flown without a person."""
 
+CLOCK_STEP_S = 0.1
+"""Limit of a step of the on-board clock where stations measure it: 170 m along the track."""
+
+ORBIT_AGE_H = 24.0
+"""Age of the orbit that windows of a simulated spacecraft start from: that of the day before."""
+
 _TRACK_STEP_S = 60.0
 _ALTITUDE_MARGIN = 1.3
 """Altitudes of the mission beside those of the flight so far."""
 
-SPACECRAFT_NAME = "SelenITA"
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
 
 Value = bool | int | float | str | Sequence[float] | Sequence[str] | None
@@ -93,16 +104,16 @@ def default_ports(
     return {name: (telemetry + k, telecommand + k) for k, name in enumerate(stations)}
 
 
-def mission_text(world: World, data: DataFolder, experiment: bool = True) -> str:
+def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = None) -> str:
     """Return the mission description of a world as TOML; unknown values are left out.
 
-    In an `experiment`, the estimators start from an orbit with the error of the scenario.
+    The estimators start from an orbit with the error of the scenario; the ground takes one of the age `orbit_age_h`.
     """
     scenario, camera = world.scenario, world.scenario.camera
     link = LinkSettings(coding=scenario.link.coding)
     flown_field = filter_field(scenario.navigation.filter_gravity, scenario.navigation.filter_degree, data)
     sections: dict[str, dict[str, Value]] = {
-        "spacecraft": {"id": SPACECRAFT_ID, "name": SPACECRAFT_NAME},
+        "spacecraft": {"id": scenario.spacecraft_id, "name": scenario.spacecraft},
         "dictionary": {"version": DICTIONARY.version, "hash": DICTIONARY.hash},
         "link": {
             "frame_length": link.frame_length,
@@ -156,7 +167,8 @@ def mission_text(world: World, data: DataFolder, experiment: bool = True) -> str
         },
         "requirements": _requirements(scenario),
         "experiment": {
-            "orbit_error_m": (scenario.navigation.initial_position_error_m if experiment else 0.0) or None
+            "orbit_error_m": scenario.navigation.initial_position_error_m or None,
+            "orbit_age_h": orbit_age_h,
         },
     }
     lines = ["schema_version = 1", f"name = {_toml(scenario.name)}"]
@@ -241,7 +253,10 @@ def live_mission_text(
         latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
         low_deg, high_deg = scenario.window.latitude_band_deg
         band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
-        lines = [mission_text(replace(world, frame_utc_ns=band), data, experiment=False).rstrip()]
+        if scenario.requirements.clock_step_s < 0.0:
+            timed = replace(scenario.requirements, clock_step_s=CLOCK_STEP_S)
+            world = replace(world, scenario=replace(scenario, requirements=timed))
+        lines = [mission_text(replace(world, frame_utc_ns=band), data, ORBIT_AGE_H).rstrip()]
         lines += [
             "",
             "[uploads]",
@@ -257,7 +272,7 @@ def live_mission_text(
     for name, (telemetry, telecommand) in ports.items():
         lines += ["", *_section(f"[link.stations.{name}]", _station(name, link))]
         connection: dict[str, Value] = {
-            "name": name,
+            "name": name if scenario.spacecraft_id == SPACECRAFT_ID else f"{name}-{scenario.spacecraft_id}",
             "kind": "tcp",
             "station": name,
             "downlink": f"{host}:{telemetry}",

@@ -17,11 +17,14 @@ from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import Record, TableFault, read_table, toml_text
-from payload_emulator.sim.board.contact_plan import parse_outage
+from payload_emulator.sim.board.contact_plan import parse_clock_error, parse_outage
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
 from payload_emulator.sim.instruments import simulated_instruments
 from payload_emulator.sim.render.sensor import SensorModel
+
+SPACECRAFT_ID = 76
+"""Spacecraft of a scenario that states none."""
 
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -205,13 +208,14 @@ class NavigationSection:
 class AttitudeSection:
     """Pointing of the camera and what the ADCS knows of it, 1 sigma per axis.
 
-    `declared_noise_deg` is what its data sheet states; negative: the true noise.
+    `declared_noise_deg` and `declared_bias_deg` are what its data sheet states; negative: the true ones.
     """
 
     pointing_error_deg: float = 0.0
     knowledge_noise_deg: float = 0.0
     knowledge_bias_deg: float = 0.0
     declared_noise_deg: float = -1.0
+    declared_bias_deg: float = -1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,6 +306,10 @@ class RequirementsSection:
     memory_mib: float = -1.0
     storage_percent: float = 80.0
     temperature_max_c: float = 60.0
+    convergence_s: float = -1.0
+    drift_percent: float = -1.0
+    offset_px: float = -1.0
+    clock_step_s: float = -1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,6 +319,8 @@ class Scenario:
     name: str
     title: str = ""
     seed: int = 1
+    spacecraft: str = "SelenITA"
+    spacecraft_id: int = SPACECRAFT_ID
     orbit: OrbitSection = field(default_factory=OrbitSection)
     dynamics: DynamicsSection = field(default_factory=DynamicsSection)
     maneuvers: ManeuverSection = field(default_factory=ManeuverSection)
@@ -525,8 +535,11 @@ def _check(scenario: Scenario, source: str) -> None:
         check(scenario, require)
     for text in scenario.faults.events:
         parse_fault(text)
-    for text in scenario.link.outages:
+    for text in (*scenario.link.outages, *scenario.link.missed):
         parse_outage(text)
+    for text in scenario.link.clock_errors:
+        parse_clock_error(text)
+    require(0 <= scenario.spacecraft_id < 1024, "spacecraft_id", "from 0 to 1023", scenario.spacecraft_id)
 
 
 _ANY = math.inf

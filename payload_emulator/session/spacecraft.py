@@ -31,7 +31,6 @@ from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
 from payload_emulator.sim.orbit.truth import ReadCount, counted_reads
 from tmtc.cuc import TICKS_PER_SECOND
 
-SPACECRAFT_ID = 0x4C
 PLAYBACK_CHANNEL = 1
 """Virtual channel of packets that are sent long after they were made."""
 
@@ -165,9 +164,9 @@ class Spacecraft:
     board: SimulatedBoard
     camera: Camera
     first_utc_ns: int
+    receiver: Receiver
     faults: Sequence[Fault] = ()
     detector: Detector | None = None
-    receiver: Receiver = field(default_factory=lambda: Receiver(SPACECRAFT_ID))
     resets: list[int] = field(default_factory=list)
     payload: Payload = field(init=False)
     given: Given | None = None
@@ -371,6 +370,7 @@ def new_spacecraft(world: World, loaded: LoadedPayload, first_utc_ns: int | None
         new_board(scenario.seed),
         Camera(InstrumentBench(world)),
         int(world.frame_utc_ns[0]) if first_utc_ns is None else first_utc_ns,
+        Receiver(scenario.spacecraft_id),
         tuple(parse_fault(text) for text in scenario.faults.events),
         CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
     )

@@ -22,7 +22,7 @@ from payload_emulator.session.world import (
 def load_scenario_payload(world: World, data: DataFolder) -> tuple[LoadedPayload, Ephemeris, CraterCatalogue]:
     """The payload loaded for a world, with the reference and the catalogue that the ground made its tables of."""
     scenario = world.scenario
-    truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns)
+    truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns, scenario.spacecraft.upper())
     reference = with_reference_error(truth_ephemeris, scenario.reference, scenario.seed)
     catalogue = catalogue_near_track(world)
     loaded = load_payload(

@@ -439,7 +439,7 @@ def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth
     return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation)
 
 
-def sample_truth(truth: Truth, frame_utc_ns: IntArray) -> Ephemeris:
+def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELENITA") -> Ephemeris:
     """The true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
     start = max(int(frame_utc_ns[0]) - _EPHEMERIS_MARGIN_NS, truth.start_utc_ns)
     stop = min(int(frame_utc_ns[-1]) + _EPHEMERIS_MARGIN_NS, truth.stop_utc_ns)
@@ -458,8 +458,8 @@ def sample_truth(truth: Truth, frame_utc_ns: IntArray) -> Ephemeris:
                 times,
                 position,
                 velocity,
-                object_name="SELENITA",
-                object_id="SELENITA",
+                object_name=object_name,
+                object_id=object_name,
                 degree=min(7, 2 * times.size - 1),
             )
         )

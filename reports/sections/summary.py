@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from reports.document import Block, Cell, Column, Heading, Picture, Table
+from reports.document import Block, Cell, Column, Heading, Picture, Table, Verdict
 from reports.figures import navigation
 from reports.figures.canvas import TimeScale
 from reports.sections.common import PassView, arc_words, role_of
@@ -17,7 +17,11 @@ NO_BREAK_SPACE = "\u00a0"
 
 def summary(view: PassView) -> list[Block]:
     """Verdict and figures, errors at a glance, what is missing."""
-    blocks: list[Block] = [*judgement(view.report), *requirements_table(view), Heading("At a glance")]
+    report = view.report
+    blocks = judgement(report)
+    if report.experiment:
+        blocks.insert(1, Verdict(report.experiment, report.experiment_level, "Experiment"))
+    blocks += [*requirements_table(view), Heading("At a glance")]
     if view.with_error:
         blocks.append(error_picture(view, "glance", 2.75, view.time))
         blocks.append(_statistics_table(view))

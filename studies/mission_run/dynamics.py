@@ -6,7 +6,7 @@ Each day's orbit determination has errors of its own; the burns that it knows of
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from payload_emulator.session.live import pruned, station_names
 from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
 from payload_emulator.session.regions import observed_boxes, observed_craters
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from payload_emulator.session.world import (
     CHUNK_S,
     World,
@@ -30,15 +29,13 @@ from payload_emulator.session.world import (
     sample_truth,
     with_reference_error,
 )
+from studies.mission_run.disturbances import ReferenceDisturbances
 
 DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
 AHEAD_NS = 54 * 3600 * NS
 LAST_NS = 4 * 3600 * NS
 """No windows so long before the end of a run, so that the data of the last one are down and evaluated."""
-
-ORBIT_S = 6_672.0
-"""Orbital period of the scenarios of this project, for the latitudes of windows of a given length."""
 
 ARCS_KEPT = 4
 """Days of the flight that are kept: more than an orbit determination spans."""
@@ -49,11 +46,11 @@ class FlightDynamics:
     """The orbit of a scenario as far as it has been asked for."""
 
     world: World
+    disturbed: ReferenceDisturbances = field(default_factory=ReferenceDisturbances)
 
-    @classmethod
-    def of(cls, scenario: Scenario, data: DataFolder) -> FlightDynamics:
-        """Return the flight dynamics of a scenario from its epoch on."""
-        return cls(open_world(scenario, data))
+    def is_late(self, day: int) -> bool:
+        """Return whether the orbit determination of a day is not delivered on that day."""
+        return day in self.disturbed.late_days
 
     def save_reference(self, now_utc_ns: int, path: Path) -> Path:
         """Write the orbit determination of a day: from some hours ago to two days ahead."""
@@ -64,14 +61,18 @@ class FlightDynamics:
             truth, burns = extended_flight(self.world, CHUNK_S)
             flown = pruned(truth, ARCS_KEPT)
             self.world = replace(self.world, truth=flown, burns=(*self.world.burns, *burns))
-        arc = sample_truth(self.world.truth, np.array([start, stop], dtype=np.int64))
+        span = np.array([start, stop], dtype=np.int64)
+        arc = sample_truth(self.world.truth, span, scenario.spacecraft.upper())
         day = (now_utc_ns - scenario.epoch_utc_ns) // DAY_NS
-        save_oem(with_reference_error(arc, scenario.reference, scenario.seed + 1_000 * (1 + day)), path)
+        errors = scenario.reference
+        if day in self.disturbed.wrong_days:
+            errors = replace(errors, position_error_m=errors.position_error_m + self.disturbed.wrong_by_m)
+        save_oem(with_reference_error(arc, errors, scenario.seed + 1_000 * (1 + day)), path)
         return path
 
     def save_craters(self, window_s: float, path: Path) -> int:
         """Write the craters around the places of the windows with their rim heights; their number."""
-        catalogue = observed_craters(self.world, _latitude_limit_deg(window_s))
+        catalogue = observed_craters(self.world, self._latitude_limit_deg(window_s))
         save_catalogue(catalogue, path)
         return len(catalogue)
 
@@ -84,7 +85,7 @@ class FlightDynamics:
         start = scenario.epoch_utc_ns
         return {
             "name": "observations",
-            "spacecraft_id": SPACECRAFT_ID,
+            "spacecraft_id": scenario.spacecraft_id,
             "windows": windows_per_day,
             "period_days": 1.0,
             "horizon_days": 1.0,
@@ -96,12 +97,18 @@ class FlightDynamics:
                     "west_deg": one.west_deg,
                     "east_deg": one.east_deg,
                 }
-                for one in observed_boxes(self.world.terrain, _latitude_limit_deg(window_s))
+                for one in observed_boxes(self.world.terrain, self._latitude_limit_deg(window_s))
             ],
             "minimum_duration_s": 0.8 * window_s,
             "maximum_duration_s": 1.25 * window_s,
             "cadence_s": scenario.camera.frame_interval_s,
         }
+
+    def _latitude_limit_deg(self, window_s: float) -> float:
+        """Return half the band of latitudes that a pass crosses within about the duration of a window."""
+        position, velocity = self.world.truth.states(self.world.truth.start_utc_ns)
+        rate_deg_s = np.degrees(np.linalg.norm(velocity) / np.linalg.norm(position))
+        return min(0.5 * float(rate_deg_s) * window_s, 60.0)
 
 
 def write_flight(
@@ -111,7 +118,7 @@ def write_flight(
 
     The files are `craters.csv`, `reference.oem` and `request.json`.
     """
-    dynamics, folder = FlightDynamics.of(scenario, data), mission.parent
+    dynamics, folder = FlightDynamics(open_world(scenario, data)), mission.parent
     craters = folder / "craters.csv"
     dynamics.save_craters(window_s, craters)
     dynamics.save_reference(scenario.epoch_utc_ns, folder / "reference.oem")
@@ -119,8 +126,3 @@ def write_flight(
     (folder / "request.json").write_text(json.dumps(request, indent=2) + "\n", encoding="utf-8")
     ports = default_ports(station_names(scenario, has_operator=False))
     return live_mission_text(dynamics.world, data, "127.0.0.1", ports, OPERATIONS, catalogue=craters)
-
-
-def _latitude_limit_deg(window_s: float) -> float:
-    """Return half the band of latitudes that a pass crosses within about the duration of a window."""
-    return min(180.0 * window_s / ORBIT_S, 60.0)

@@ -13,7 +13,6 @@ import numpy as np
 from ground_service.evaluation.performance.model import PassPerformance
 from ground_service.planning.request_model import RequestPlan
 from lunar.constants import NANOSECONDS_PER_SECOND
-from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from studies.mission_run.ground import MissionGround
 
 UNKNOWN = "not known"
@@ -84,16 +83,16 @@ def missing_windows(
 
 
 def closing_figures(
-    ground: MissionGround, progress: Progress, asked: int, per_day: int, start_utc_ns: int
+    ground: MissionGround, progress: Progress, asked: int, per_day: int, start_utc_ns: int, spacecraft_id: int
 ) -> dict[str, Any]:
     """Return the figures of the closing report; what is not known is None."""
-    windows = ground.windows()
+    windows = ground.windows(spacecraft_id)
     kept = [one.start.utc_ns for one in windows if one.state != "failed"]
-    performance = ground.client.get_performance(SPACECRAFT_ID)
+    performance = ground.client.get_performance(spacecraft_id)
     passes = performance.passes
-    alarms = [one.model_dump(mode="json") for one in ground.client.list_alarms()]
+    alarms = [one.model_dump(mode="json") for one in ground.client.list_alarms(spacecraft_id=spacecraft_id)]
     interventions = ground.interventions(progress.posts)
-    received = ground.packets_received()
+    received = ground.packets_received(spacecraft_id)
     return {
         "end": progress.utc,
         "windows": {

@@ -75,11 +75,12 @@ class MissionGround:
             "upload of " + name,
         )
 
-    def wait_sent(self, station: str) -> None:
-        """Wait until the station of a contact has every telecommand that can be sent now."""
+    def wait_sent(self, station: str, spacecraft_id: int) -> None:
+        """Wait until the station of a contact has every telecommand of a spacecraft that can be sent now."""
 
         def is_sent() -> bool:
-            declared = links.declared_links(self.ground).values()
+            links_of_all = links.declared_links(self.ground).values()
+            declared = [one for one in links_of_all if one.spacecraft_id == spacecraft_id]
             vehicles = {(one.spacecraft_id, one.link.instance) for one in declared if one.station == station}
             # A link whose contact has ended may have taken some, which it gives to the link in contact.
             return not any(
@@ -101,13 +102,11 @@ class MissionGround:
     def wait_settled(self) -> None:
         """Wait until contacts that were silent for too long have ended, and the work that follows is done."""
         self._wait(
-            lambda: (
-                not links.silent_contacts(self.ground) and self._is_idle() and not self._repeats_actions()
-            ),
+            lambda: not links.silent_contacts(self.ground) and self._is_idle() and not self.repeat_actions(),
             "contacts ended",
         )
 
-    def _repeats_actions(self) -> bool:
+    def repeat_actions(self) -> bool:
         """Return whether failed actions are to be repeated."""
         return has_repetitions(self.ground)
 
@@ -123,9 +122,11 @@ class MissionGround:
             position = position_of(connection, CONSUMER)
             return not (read_events(connection, position, 1, KINDS) or unfinished(connection))
 
-    def windows(self) -> list[Window]:
-        """Return all windows, the earliest first."""
-        return sorted(self.read(lambda client: list(client.list_windows())), key=lambda one: one.start.utc_ns)
+    def windows(self, spacecraft_id: int) -> list[Window]:
+        """Return all windows of a spacecraft, the earliest first."""
+        found = self.read(lambda client: list(client.list_windows()))
+        own = [one for one in found if one.spacecraft_id == spacecraft_id]
+        return sorted(own, key=lambda one: one.start.utc_ns)
 
     def read(self, ask: Callable[[Client], Answer]) -> Answer:
         """Return an answer of the API, also while parts of the service start again."""
@@ -138,10 +139,14 @@ class MissionGround:
         self._wait(is_read, "answer of the API")
         return found[0]
 
-    def packets_received(self) -> int:
-        """Return the number of packets in the archive."""
+    def packets_received(self, spacecraft_id: int) -> int:
+        """Return the number of packets of a spacecraft in the archive."""
         with self.ground.database.reading() as connection:
-            return sum(len(packet_headers(connection, one.id)["apid"]) for one in all_vehicles(connection))
+            return sum(
+                len(packet_headers(connection, one.id)["apid"])
+                for one in all_vehicles(connection)
+                if one.ccsds_id == spacecraft_id
+            )
 
     def audit_head(self) -> int:
         """Return the number of the newest entry of the audit log."""
@@ -193,7 +198,7 @@ class EmbeddedGround(MissionGround):
         opened.links.start()
         return opened
 
-    def _repeats_actions(self) -> bool:
+    def repeat_actions(self) -> bool:
         """Repeat the failed actions that are due; return whether any are to be repeated later."""
         for job_id in repeat_due(self.ground):
             run_job(self.ground, job_id)

@@ -5,22 +5,26 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ground_service.clock import ClockFile, set_mission_clock
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
-from payload_emulator.session.spacecraft import SPACECRAFT_ID
+from payload_emulator.session.world import open_world
 from studies.harness.kills import SPACECRAFT, Keeper, plan_kills
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.comparison import REPORT
 from studies.mission_run.distributed import DistributedGround, Servers
+from studies.mission_run.disturbances import UNDISTURBED, Disturbances
 from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics
 from studies.mission_run.figures import Progress, closing_figures, months, note_plan, windows_asked
 from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround
@@ -31,6 +35,10 @@ DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 
 SETTLE_NS = (round(SILENCE_S) + 5) * NS
 """Mission time after a contact at which the ground notices its end."""
+
+TURN_NS = 1_500 * NS
+"""Mission time for which one spacecraft of a fleet flies at a time: below the silence that ends a contact, and whole
+steps of a minute, so that it adds none."""
 
 CHECKPOINT_S = 60.0
 """Wall time between two checkpoints."""
@@ -52,6 +60,8 @@ class RunTerms:
     ----------
     kills
         Number of kills of processes at points of `kill_seed`, in the distributed form.
+    factor
+        Simulated seconds per second that pass without waiting for the ground; 0: time waits.
     """
 
     days: float
@@ -61,6 +71,8 @@ class RunTerms:
     distributed: bool = False
     kill_seed: int | None = None
     kills: int = 0
+    factor: float = 0.0
+    disturbances: Disturbances = UNDISTURBED
 
 
 def run_mission(
@@ -80,14 +92,76 @@ def run_mission(
     GroundError, LinkError
         A part did not do what is expected of it; the run can be taken up again.
     """
-    run = MissionRun(_prepared(scenario), data, folder, terms, say, servers)
+    run = MissionRun(_prepared(scenario, terms), data, folder, terms, say, servers)
     return run.run()
 
 
-def _prepared(scenario: Scenario) -> Scenario:
-    if scenario.link.stations:
-        return scenario
-    return replace(scenario, link=replace(scenario.link, stations=DEFAULT_STATIONS))
+def run_fleet(
+    scenarios: Sequence[Scenario], data: DataFolder, folder: Path, terms: RunTerms, say: Say
+) -> dict[str, Any]:
+    """Run several spacecraft with one ground service; the closing figures of each by its name.
+
+    One spacecraft at a time flies for at most `TURN_NS`, and the mission time of the service is that of its work. With
+    a factor they fly at the same time.
+
+    Raises
+    ------
+    ScenarioError
+        Two spacecraft have the same name or number, or the folder is not empty.
+    GroundError, LinkError
+        A part did not do what is expected of it.
+    """
+    names, numbers = [one.spacecraft for one in scenarios], [one.spacecraft_id for one in scenarios]
+    for key, values in (("spacecraft", names), ("spacecraft_id", numbers)):
+        if len({str(one).casefold() for one in values}) < len(values):
+            raise ScenarioError(f"fleet: expected scenarios with different {key}, found {values}")
+    if folder.exists() and any(folder.iterdir()):
+        raise ScenarioError(f"{folder}: expected a new folder for a fleet, found one with files")
+    runs = [
+        MissionRun(_prepared(one, terms), data, folder / one.spacecraft, terms, say, is_of_fleet=True)
+        for one in scenarios
+    ]
+    posts: list[tuple[int, int]] = []
+    with ExitStack() as started:
+        ground = EmbeddedGround.open(folder / "ground", data, runs[0].clock_file)
+        started.callback(ground.close)
+        flights = []
+        for one in runs:
+            spacecraft, dynamics = one.begin(posts)
+            started.callback(spacecraft.stop)
+            set_mission_clock(ClockFile(one.clock_file).read)
+            flights.append(one.flight(spacecraft, ground, dynamics))
+        if terms.factor:
+            set_mission_clock(ClockFile(runs[0].clock_file).read)
+            with ThreadPoolExecutor(len(flights)) as threads:
+                list(threads.map(_fly_whole, flights))
+        else:
+            _take_turns(runs, flights)
+        figures = {name: one.close(ground) for name, one in zip(names, runs, strict=True)}
+    (folder / REPORT).write_text(json.dumps({"fleet": figures}, indent=2) + "\n")
+    return {"fleet": figures}
+
+
+def _take_turns(runs: Sequence[MissionRun], flights: Sequence[Iterator[int]]) -> None:
+    """Let the spacecraft whose time is the earliest fly, until all have ended."""
+    due, clocks = [(0, k) for k in range(len(runs))], [ClockFile(one.clock_file) for one in runs]
+    while due:
+        _, k = due.pop(due.index(min(due)))
+        set_mission_clock(clocks[k].read)
+        utc_ns = next(flights[k], None)
+        if utc_ns is not None:
+            due.append((utc_ns, k))
+
+
+def _fly_whole(flight: Iterator[int]) -> None:
+    for _ in flight:
+        pass
+
+
+def _prepared(scenario: Scenario, terms: RunTerms) -> Scenario:
+    if not scenario.link.stations:
+        scenario = replace(scenario, link=replace(scenario.link, stations=DEFAULT_STATIONS))
+    return terms.disturbances.apply(scenario)
 
 
 class MissionRun:
@@ -101,7 +175,10 @@ class MissionRun:
         terms: RunTerms,
         say: Say,
         servers: Servers = OWN_SERVERS,
+        is_of_fleet: bool = False,
     ) -> None:
+        self._is_of_fleet = is_of_fleet
+        self._settle_ns: int | None = None
         self._scenario, self._data, self._folder, self._terms, self._say = scenario, data, folder, terms, say
         self._servers = servers
         self._keeper: Keeper | None = None
@@ -120,6 +197,26 @@ class MissionRun:
         self._begun_s = self._kept_s = time.monotonic()
         self._wall_before_s = 0.0
 
+    @property
+    def clock_file(self) -> Path:
+        """File of the mission time."""
+        return self._files.clock
+
+    def begin(self, posts: list[tuple[int, int]]) -> tuple[SpacecraftProcess, FlightDynamics]:
+        """Start the spacecraft of a fleet, whose posts are those of all; return it with its flight dynamics."""
+        self._folder.mkdir(mode=0o700, parents=True)
+        self._load()
+        self._progress.posts = posts
+        return self._started()
+
+    def flight(
+        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
+    ) -> Iterator[int]:
+        """Post what a user posts; return the flight, which gives way at each yield, of its mission time."""
+        self._post(spacecraft, ground, dynamics)
+        follow = self._accompany if self._terms.factor else self._follow
+        return follow(spacecraft, ground, dynamics)
+
     def run(self) -> dict[str, Any]:
         """Run until the days are over; after an interruption the next call continues from the last checkpoint."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -127,7 +224,21 @@ class MissionRun:
         if self._progress.finished:
             self._say(f"{self._folder}: this run has ended; its figures are in {self._folder / REPORT}")
             return dict(json.loads((self._folder / REPORT).read_text()))
-        dynamics = FlightDynamics.of(self._scenario, self._data)
+        spacecraft, dynamics = self._started()
+        try:
+            ground = self._open_ground()
+            try:
+                self._operate(spacecraft, ground, dynamics)
+                return self.close(ground)
+            finally:
+                ground.close(is_finished=self._progress.finished)
+        finally:
+            spacecraft.stop()
+            self._save()
+
+    def _started(self) -> tuple[SpacecraftProcess, FlightDynamics]:
+        world = open_world(self._scenario, self._data)
+        dynamics = FlightDynamics(world, self._terms.disturbances.reference)
         if not self._files.craters.exists():
             count = dynamics.save_craters(self._terms.window_s, self._files.craters)
             self._say(f"catalogue: {count} craters with rim heights")
@@ -136,19 +247,11 @@ class MissionRun:
             self._files,
             self._scenario.link.stations,
             self._terms.days,
-            self._terms.rate,
+            self._terms.factor or self._terms.rate,
             self._data.root,
+            holds=not self._terms.factor,
         )
-        try:
-            ground = self._open_ground()
-            try:
-                self._operate(spacecraft, ground, dynamics)
-                return self._close(ground)
-            finally:
-                ground.close(is_finished=self._progress.finished)
-        finally:
-            spacecraft.stop()
-            self._save()
+        return spacecraft, dynamics
 
     def _open_ground(self) -> EmbeddedGround | DistributedGround:
         if self._terms.distributed:
@@ -158,7 +261,7 @@ class MissionRun:
     def _operate(
         self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
     ) -> None:
-        self._post(spacecraft, ground, dynamics)
+        flight = self.flight(spacecraft, ground, dynamics)
         self._save()
         if isinstance(ground, DistributedGround):
             self._keeper = self._made_keeper(spacecraft, ground)
@@ -168,7 +271,7 @@ class MissionRun:
         try:
             while True:
                 try:
-                    self._follow(spacecraft, ground, dynamics)
+                    _fly_whole(flight)
                     return
                 except SpacecraftKilled:
                     if self._keeper is None:
@@ -176,54 +279,102 @@ class MissionRun:
                     self._go_back()
                     spacecraft.restart()
                     self._keeper.recovered()
+                    flight = self._follow(spacecraft, ground, dynamics)
         finally:
             if self._keeper is not None:
                 self._keeper.stop()
 
-    def _follow(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
-        """Let time pass from contact to contact until the end of the run."""
+    def _go(self, spacecraft: SpacecraftProcess, now: int) -> None:
+        """Let time go on, to the time after a contact, or to the end of a turn of the fleet."""
+        stops = [] if self._settle_ns is None else [self._settle_ns]
+        if self._is_of_fleet:
+            epoch = self._scenario.epoch_utc_ns
+            stops.append(epoch + ((now - epoch) // TURN_NS + 1) * TURN_NS)
+        spacecraft.order(f"until {format_utc(min(stops))}" if stops else "run")
+
+    def _accompany(
+        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
+    ) -> Iterator[int]:
+        """Watch the flight, whose time does not wait, until the end of the run."""
         messages = spacecraft.messages()
         spacecraft.order("run")
         for message in messages:
+            if message["kind"] == "error":
+                raise LinkError(f"spacecraft: {message['text']}")
+            if message["kind"] not in ("contact", "finished"):
+                continue
+            self._note(message)
+            if message["kind"] == "finished":
+                self._wait_acknowledged(spacecraft, messages)
+                ground.wait_ingested()
+                ground.wait_settled()
+                self._watch(ground, message)
+                return
+            ground.repeat_actions()
+            if message["state"] == "started":
+                self._deliver_reference(ground, dynamics, parse_utc(message["utc"]))
+            else:
+                self._watch(ground, message)
+            yield parse_utc(message["utc"])
+        raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
+
+    def _follow(
+        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
+    ) -> Iterator[int]:
+        """Let time pass from contact to contact until the end of the run."""
+        messages = spacecraft.messages()
+        now = parse_utc(self._progress.utc) if self._progress.utc else self._scenario.epoch_utc_ns
+        self._settle_ns = None
+        self._go(spacecraft, now)
+        for message in messages:
             kind = message["kind"]
+            now = parse_utc(message["utc"]) if "utc" in message else now
             if kind == "contact":
                 self._note(message)
-                now = parse_utc(message["utc"])
                 self._stop_for_kill(message["state"], now)
                 if message["state"] == "started":
                     self._deliver_reference(ground, dynamics, now)
                     # The links have begun the contact; they ingest its first frame with the next ones.
                     self._wait_acknowledged(spacecraft, messages)
                     ground.wait_idle()
-                    ground.wait_sent(message["station"])
-                    spacecraft.order("run")
+                    ground.wait_sent(message["station"], self._scenario.spacecraft_id)
                 else:
                     # The ground has everything before time goes on, so that a run gives the same at any speed.
                     self._wait_acknowledged(spacecraft, messages)
                     ground.wait_ingested()
-                    spacecraft.order(f"until {format_utc(now + SETTLE_NS)}")
+                    self._settle_ns = now + SETTLE_NS
+                self._go(spacecraft, now)
+            elif kind == "paused" and (self._settle_ns is None or now < self._settle_ns):
+                self._wait_acknowledged(spacecraft, messages)
+                ground.wait_ingested()
+                yield now
+                self._go(spacecraft, now)
             elif kind == "paused":
+                self._settle_ns = None
                 spacecraft.order("state")
             elif kind in ("state", "finished"):
                 self._note({**message, "state": kind})
-                self._stop_for_kill("settled", parse_utc(message["utc"]))
+                self._stop_for_kill("settled", now)
                 self._wait_acknowledged(spacecraft, messages)
                 ground.wait_ingested()
                 ground.wait_settled()
                 if message["station"]:
-                    ground.wait_sent(message["station"])
+                    ground.wait_sent(message["station"], self._scenario.spacecraft_id)
                 self._watch(ground, message)
                 if kind == "finished":
                     if self._keeper is not None and not self._keeper.wait():
                         continue  # the spacecraft was killed: its console has ended
                     return
-                due = time.monotonic() - self._kept_s >= CHECKPOINT_S
-                spacecraft.order("save" if due or self._terms.kills else "run")
+                due = time.monotonic() - self._kept_s >= CHECKPOINT_S and not self._is_of_fleet
+                if due or self._terms.kills:
+                    spacecraft.order("save")
+                else:
+                    self._go(spacecraft, now)
             elif kind == "saved":
                 if message["saved"]:
                     self._checkpoints.keep(self._progress_file)
                     self._kept_s = time.monotonic()
-                spacecraft.order("run")
+                self._go(spacecraft, now)
             elif kind == "error":
                 raise LinkError(f"spacecraft: {message['text']}")
         raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
@@ -290,7 +441,7 @@ class MissionRun:
     def _deliver_reference(self, ground: MissionGround, dynamics: FlightDynamics, now: int) -> None:
         """Give the ground the orbit determination of the day."""
         day = (now - self._scenario.epoch_utc_ns) // DAY_NS
-        if day > self._progress.reference_day:
+        if day > self._progress.reference_day and not dynamics.is_late(day):
             ground.deliver_reference(dynamics.save_reference(now, self._folder / "reference.oem"), day)
             self._progress.reference_day = day
 
@@ -309,29 +460,36 @@ class MissionRun:
         plan = ground.read(lambda client: client.get_request_plan(progress.request_id or 0))
         note_plan(progress, plan, self._scenario.epoch_utc_ns)
         self._save()
-        counts = Counter(one.state for one in ground.windows())
+        counts = Counter(one.state for one in ground.windows(self._scenario.spacecraft_id))
         states = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
         self._say(
-            f"day {days:6.2f} of {self._terms.days:g}, {progress.wall_s:6.0f} s: {progress.contacts} contacts, "
-            f"{progress.frames} frames, {progress.packets} packets, windows: {states or 'none'}"
+            f"{self._scenario.spacecraft}: day {days:6.2f} of {self._terms.days:g}, {progress.wall_s:6.0f} s: "
+            f"{progress.contacts} contacts, {progress.frames} frames, {progress.packets} packets, "
+            f"windows: {states or 'none'}"
         )
 
-    def _close(self, ground: MissionGround) -> dict[str, Any]:
+    def close(self, ground: MissionGround) -> dict[str, Any]:
         """Write the figures of the run, and the reports that the service makes of its months."""
         self._save()
         terms = self._terms
         asked = windows_asked(terms.days, terms.windows_per_day, LAST_NS / DAY_NS)
         figures = {
             "scenario": self._scenario.name,
+            "spacecraft": self._scenario.spacecraft,
             "days": terms.days,
             "form": "distributed" if terms.distributed else "embedded",
             **closing_figures(
-                ground, self._progress, asked, terms.windows_per_day, self._scenario.epoch_utc_ns
+                ground,
+                self._progress,
+                asked,
+                terms.windows_per_day,
+                self._scenario.epoch_utc_ns,
+                self._scenario.spacecraft_id,
             ),
             "monthly_reports": [],
         }
         for month in months(one["start"] for one in figures["performance"]["passes"]):
-            made = ground.client.add_monthly_report(SPACECRAFT_ID, month)
+            made = ground.client.add_monthly_report(self._scenario.spacecraft_id, month)
             path = self._folder / f"report-{month}.html"
             ground.client.get_monthly_report(made.id, path)
             figures["monthly_reports"].append(str(path))

@@ -47,11 +47,19 @@ class SpacecraftProcess:
     """The emulated spacecraft and its stations in a process; `messages` of its console in order."""
 
     def __init__(
-        self, files: SpacecraftFiles, stations: tuple[str, ...], days: float, rate: float, data: Path | None
+        self,
+        files: SpacecraftFiles,
+        stations: tuple[str, ...],
+        days: float,
+        rate: float,
+        data: Path | None,
+        *,
+        holds: bool = True,
     ) -> None:
         self._log, self._console_port, self._mission_port = files.log, free_port(), free_port()
         words = ["emulate", files.scenario, "--live", "--no-operator", "--days", days, "--rate", rate]
-        words += ["--hold-contacts", "--keep-unacknowledged", "--paused", "--end-with-console", "--json"]
+        words += ["--keep-unacknowledged", "--paused", "--end-with-console", "--json"]
+        words += ["--hold-contacts"] * holds
         words += ["--console-port", self._console_port, "--mission-port", self._mission_port]
         words += ["--state", files.state, "--journal", files.journal]
         words += ["--clock-file", files.clock, "--craters", files.craters]

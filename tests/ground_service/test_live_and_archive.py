@@ -28,7 +28,6 @@ from lunar.timescales import format_utc, parse_utc
 from payload_emulator.session.live import LiveSession
 from payload_emulator.session.mission import OPERATIONS, live_mission_text
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.spacecraft import SPACECRAFT_ID
 from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import build_world
@@ -122,7 +121,7 @@ def write_archive(
     manifest = {
         "schema_version": 1,
         "pass_name": window.name,
-        "spacecraft_id": SPACECRAFT_ID,
+        "spacecraft_id": 76,
         "start_utc": format_utc(FIRST),
         "stop_utc": format_utc(LAST),
         "cadence_s": window.cadence_s,
@@ -178,7 +177,7 @@ def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
                     "name": "both",
                     "start": format_utc(FIRST),
                     "stop": format_utc(LAST),
-                    "spacecraft_id": SPACECRAFT_ID,
+                    "spacecraft_id": 76,
                 }
             ).id
             api.change_window(window, {"state": "approved"})

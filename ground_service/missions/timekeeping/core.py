@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
 from lunar.arrays import IntArray
+from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.timescales import (
     tai_ns_from_utc_ns,
     ticks_from_utc_ns,
@@ -80,6 +82,17 @@ def utc_ns_of_ticks(ticks: IntArray, correlations: Sequence[TimeCorrelation]) ->
         here = chosen == number
         utc[here] = correlations[number].utc_ns(ticks[here])
     return utc, np.array([c.id for c in correlations], dtype=np.int64)[chosen]
+
+
+def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc_ns: int) -> float:
+    """Return the largest difference in s between successive lines, where a run begins after a time until another."""
+    largest_ns = 0
+    for last, run in pairwise(sorted(runs, key=lambda one: one.start_ticks)):
+        begin = np.array([run.start_ticks], dtype=np.int64)
+        utc_ns, shown_ns = int(run.utc_ns(begin)[0]), int(last.utc_ns(begin)[0])
+        if after_utc_ns < utc_ns <= until_utc_ns:
+            largest_ns = max(largest_ns, abs(utc_ns - shown_ns))
+    return largest_ns / NANOSECONDS_PER_SECOND
 
 
 def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int:

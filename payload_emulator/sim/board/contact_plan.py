@@ -35,6 +35,8 @@ class Geometry(Protocol):
     def minimum_elevation_deg(self) -> float: ...
     @property
     def outages(self) -> tuple[str, ...]: ...
+    @property
+    def missed(self) -> tuple[str, ...]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +90,31 @@ def parse_outage(text: str) -> Outage:
     return Outage(words[0], start, stop)
 
 
+def parse_clock_error(text: str) -> tuple[str, int]:
+    """Return station and error in ns of the clock written as `STATION SECONDS`.
+
+    Raises
+    ------
+    ScenarioError
+        The text has another form, or names no known station.
+    """
+    name, _, seconds = text.partition(" ")
+    try:
+        error_ns = round(float(seconds) * _NS)
+    except (ValueError, OverflowError):
+        error_ns = None
+    if error_ns is None or name not in STATIONS:
+        raise ScenarioError(
+            f"link.clock_errors: expected STATION SECONDS with one of {', '.join(STATIONS)}, found {text!r}"
+        )
+    return name, error_ns
+
+
 def plan_contacts(
     ephemeris: Ephemeris, section: Geometry, start_utc_ns: int, stop_utc_ns: int
 ) -> list[StationContact]:
     """Return the contacts between two instants in order of time, one station at a time."""
-    outages = [parse_outage(text) for text in section.outages]
+    outages = [parse_outage(text) for text in (*section.outages, *section.missed)]
     seen: list[tuple[int, int, GroundStation]] = []
     for name in section.stations:
         place = station(name, section.minimum_elevation_deg)

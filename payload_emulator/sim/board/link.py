@@ -51,7 +51,8 @@ class LinkSection:
     `stations` are those that listen (one of `STATIONS`), behind the limb of the Moon or not;
     without any the link never ends. `rate_bps` counts the bits of packets, `uplink_bps` those of telecommands. With
     `playback` the first half of each contact's packets is asked for again in the next one. `outages` are spans in which
-    a station does not listen: `STATION START STOP`, UTC.
+    a station does not listen: `STATION START STOP`, UTC; `missed` are more of them, which the ground does not know.
+    `clock_errors` are those of the clocks of stations: `STATION SECONDS`.
     """
 
     coding: Literal["rs", "none"] = "rs"
@@ -69,6 +70,8 @@ class LinkSection:
     playback: bool = False
     uplink_bps: float = 4_000.0
     outages: tuple[str, ...] = ()
+    missed: tuple[str, ...] = ()
+    clock_errors: tuple[str, ...] = ()
 
 
 @dataclass(slots=True, eq=False)

@@ -108,8 +108,9 @@ def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
         "resources.temperature_max": "not met",
     }
     assert report.verdict_level == "not met"
-    assert report.verdict.startswith("3 of 12 requirements not met: median 3-D error 130 m (at most 129);")
-    assert report.verdict.endswith("1 unknown: CPU load. 8 of 12 requirements met.")
+    assert report.verdict.startswith("2 of 11 requirements not met: median 3-D error 130 m (at most 129);")
+    assert report.verdict.endswith("1 unknown: CPU load. 8 of 11 requirements met.")
+    assert report.experiment.startswith("1 of 1 requirement not met: better than propagate-only 130 m")
     assert report.evidence_level.startswith("3s (real terrain seen in training; 25 %")
     budget = next(s for s in report.navigation if s.name == "spherical").error_budget
     assert budget is not None

@@ -779,7 +779,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
     named = {
         "pass_id": "7", "frames": 11, "packets": 1900, "packets_lost": 100, "packets_expected": 2000,
         "smoothed": {}, "baselines": {}, "verdict": report.verdict, "verdict_level": "met",
-        "evidence_level": "", "data": [],
+        "evidence_level": "", "data": [], "experiment": "", "experiment_level": "",
     }  # fmt: skip
     assert {name: summary[name] for name in named} == named
     assert set(summary) == {

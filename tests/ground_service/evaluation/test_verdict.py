@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
-from ground_service.evaluation.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
+from ground_service.evaluation.verdict import (
+    Evaluated,
+    Limits,
+    StartOrbit,
+    requirements,
+    verdict_of,
+    without_mission,
+)
 from ground_service.missions.model import Requirements
 from reports.values import (
     ClassScore,
@@ -17,6 +24,7 @@ from reports.values import (
     NavigationStatistics,
     PacketAccounting,
     Requirement,
+    ResidualSeries,
 )
 
 N = 10
@@ -51,7 +59,11 @@ def test_the_limits_are_those_of_the_mission_description() -> None:
     assert {field.name for field in fields(Limits)} == set(Requirements.model_fields)
 
 
-DETECTOR = DetectorScore(micro=ClassScore(-1, "5–30 km", 200, 60, 20, 0.75, 0.3, 1.0))
+PLACES = np.zeros(3)
+DETECTOR = DetectorScore(
+    micro=ClassScore(-1, "5–30 km", 200, 60, 20, 0.75, 0.3, 1.0),
+    residuals=ResidualSeries(PLACES, PLACES, np.array([0.3, 9.0, -5.0]), np.array([0.4, 0.4, 7.0])),
+)
 HOUSEKEEPING = tuple(
     HousekeepingParameter(name, "", np.arange(3), np.array(values))
     for name, values in (
@@ -159,7 +171,43 @@ def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
     rival = replace(limits, better_than=("Kepler",))
     assert row("better_than.Kepler", rival, evaluated).status == "not judged"  # from the best known orbit
-    assert row("better_than.Kepler", rival, replace(evaluated, is_experiment=True)).status == "not met"
+    assert (
+        row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
+    )
+
+
+def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() -> None:
+    """Errors of 900 m, and 30 m from the fourth sample on, where the filter states it."""
+    size = np.array([900.0] * 3 + [30.0, 31.0, 500.0] + [30.0, 31.0, 32.0, 33.0])
+    flown = replace(
+        series("anchored", median=32.0, p95=900.0),
+        utc_ns=np.arange(N, dtype=np.int64) * 15 * 10**9,
+        error_rtn_m=np.column_stack([size, 0 * size, 0 * size]),
+        sigma_rtn_m=np.column_stack([np.where(np.arange(N) < 3, 100.0, 20.0)] * 3),
+    )
+    limits = Limits("anchored", 60.0, 100.0, ("Kepler",), convergence_s=80.0)
+    evaluated = replace(found(flown, series("Kepler", "baseline", 10.0)), experiment=StartOrbit(1e3, 24.0))
+    table = {one.key: one for one in requirements(limits, evaluated)}
+    # Seven samples, of which the 95th percentile is 0.3 of the way back from 500 m to 33 m.
+    assert table["accuracy.p95"].value == pytest.approx(500.0 - 0.3 * 467.0)
+    assert table["accuracy.median"].value == 31.0 and table["accuracy.median"].note.endswith(
+        "7 of them from convergence on"
+    )
+    assert table["experiment.convergence"].value == 90.0  # 500 m interrupt the first two small errors
+    assert table["experiment.convergence"].note.startswith(
+        "from an orbit with an error of 1\u202f000 m per axis, 24 h old; until 4 successive errors"
+    )
+    judged = list(table.values())
+    assert verdict_of(judged)[0].startswith("1 of 2 requirements not met: 95th percentile")
+    assert verdict_of(judged, "experiment") == (
+        "2 of 2 requirements not met: better than Kepler 32.0 m (at most 10.0); time to convergence 90.0 s "
+        "(at most 80.0). 0 of 2 requirements met.",
+        "not met",
+    )
+    never = replace(flown, sigma_rtn_m=np.full((N, 3), 100.0), error_rtn_m=np.full((N, 3), 200.0))
+    table = {one.key: one for one in requirements(limits, replace(evaluated, navigation=(never,)))}
+    assert table["experiment.convergence"].status == "unknown"
+    assert table["accuracy.median"].value == pytest.approx(200.0 * 3**0.5)
 
 
 def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete() -> None:
@@ -252,6 +300,8 @@ EVERY_LIMIT = Limits(
     storage_percent=20.0,
     temperature_max_c=45.0,
     temperature_min_c=5.0,
+    offset_px=0.3,
+    clock_step_s=0.1,
 )
 
 
@@ -262,7 +312,7 @@ def test_the_table_of_a_pass_in_full() -> None:
          series("snapshot", "baseline", 70.0), series("smoothed", "smoothed", 30.0),
          series("paper", reset_trigger=("none", "time_gap", "none"))),
         DETECTOR, FrameAccounting(40, 30, processed=10), PacketAccounting(1500, lost=400, lost_at_edges=100),
-        HOUSEKEEPING, 40.0,
+        HOUSEKEEPING, 40.0, reference_px=0.2, clock_step_s=1.0,
     )  # fmt: skip
     cpu = "processor time of a step over the cadence, largest mean between two reports"
     assert requirements(EVERY_LIMIT, evaluated) == tuple(
@@ -290,6 +340,10 @@ def test_the_table_of_a_pass_in_full() -> None:
             ("detector.recall", "detector recall", "", 0.3, 0.25, False, "met", "200 craters of 5–30 km expected"),
             ("detector.precision", "detector precision", "", 0.75, 0.8, False, "not met",
              "200 craters of 5–30 km expected"),
+            ("pointing.offset", "offset of the images from the catalogue", "px", pytest.approx(0.3), 0.3, True, "met",
+             "camera or attitude: median of 3 craters 0.50 px, less 0.20 px of the reference"),
+            ("time.step", "step of the on-board clock", "s", 1.0, 0.1, True, "not met",
+             "largest since the pass before, by time correlation"),
             ("anchor_reads", "anchor reads after the start", "", 3, 3.0, True, "met", ""),
             ("resets", "resets after the start", "", 2.0, 1.0, True, "not met", ""),
             ("resets.paper", "resets of paper after the start", "", 1.0, None, True, "not judged", ""),
@@ -313,6 +367,7 @@ def test_the_table_of_a_pass_of_which_nothing_is_known() -> None:
         "consistency.nis": "image innovations",
         "completeness.frames": "no plan of the frames",
         "completeness.images": "no plan of the frames",
+        "time.step": "largest since the pass before, by time correlation",
         "resources.cpu": "processor time of a step over the cadence, largest mean between two reports",
     }
     assert {one.status for one in requirements(Limits(), Evaluated())} == {"not judged"}

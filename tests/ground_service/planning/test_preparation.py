@@ -9,7 +9,7 @@ import pytest
 
 from ground_service.errors import Conflict
 from ground_service.missions.model import Uploads
-from ground_service.planning.preparation import prepare_window
+from ground_service.planning.preparation import experiment_accuracy, experiment_state, prepare_window
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
@@ -73,6 +73,28 @@ def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris) -
     np.testing.assert_allclose(anchor.position_mcmf_m[k], expected, atol=0.01)
     orientation = unpack_orientation_table(tables[8])
     assert orientation.ticks[0] < ticks_of(START) < ticks_of(STOP) < orientation.ticks[-1]
+
+
+def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declared_accuracy(
+    reference: Ephemeris,
+) -> None:
+    made = [experiment_state(reference, 1_000.0, START + k * NS, 76) for k in range(400)]
+    known = [reference.at(np.array([one.utc_ns])) for one in made]
+    position = np.array([a.position_icrf_m - b[0][0] for a, b in zip(made, known, strict=True)])
+    velocity = np.array([a.velocity_icrf_m_s - b[1][0] for a, b in zip(made, known, strict=True)])
+    # 400 draws: the standard deviation of each axis is known to 3.5 %, its mean to 5 %.
+    np.testing.assert_allclose(position.std(axis=0), 1_000.0, rtol=0.12)
+    np.testing.assert_allclose(position.mean(axis=0), 0.0, atol=180.0)
+    np.testing.assert_allclose(velocity.std(axis=0), 1_000.0 * 2.0 * np.pi / 6_672.0, rtol=0.12)
+    again = experiment_state(reference, 1_000.0, START, 76)
+    np.testing.assert_array_equal(again.position_icrf_m, made[0].position_icrf_m)
+    assert (experiment_state(reference, 1e3, START, 77).position_icrf_m != again.position_icrf_m).all()
+    stated = experiment_accuracy(ALL, 1_000.0, again)
+    activities, state = prepare_window(stated, reference, IauOrientation(), START, STOP, ticks_of, 8, again)
+    initial = unpack_initial_state(loaded(activities)[9])
+    assert state is again and initial.sigma_position_m == 1_000.0
+    assert initial.sigma_velocity_m_s == pytest.approx(0.9417, rel=5e-3)
+    np.testing.assert_allclose(initial.position_icrf_m, again.position_icrf_m, atol=1e-3)
 
 
 def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(
