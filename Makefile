@@ -59,8 +59,11 @@ deploy/openmct/node_modules/.package-lock.json: deploy/openmct/package.json depl
 	npm ci --prefix deploy/openmct --ignore-scripts --no-audit --no-fund
 	touch $@
 
-# Pictures of the pages in the documentation, taken by tests.
+# Pictures of the README, from a demo without data, and of the pages in the documentation, taken by tests.
 pictures: $(VENV)/.dev
+	rm -rf build/tour && mkdir -p build/tour
+	cd build/tour && LINNA_DATA= XDG_DATA_HOME=none ../../$(BIN)/linna demo --out linna-demo > demo.txt
+	$(BIN)/python docs_site.py tour build/tour
 	LINNA_PICTURES=docs/pictures $(BIN)/python -m pytest -q tests/ground_service/web/test_shift.py \
 	  tests/ground_service/web/test_flight.py tests/ground_service/web/test_page_state.py -k "shift or flight or planner_opens or map_of_a_pass"
 

@@ -3,23 +3,32 @@
 `python docs_site.py notebooks FOLDER` flies the passes of the notebooks, executes the notebooks and saves them with
 their outputs in FOLDER. A build of the site with `NOTEBOOK_OUTPUTS=FOLDER` shows these outputs; without it, text and
 code only.
+
+`python docs_site.py tour FOLDER` takes the pictures of the README from `linna-demo` and `demo.txt` in FOLDER, which are
+the output folder and the printed text of `linna demo`: PNG files, and `tour.gif`, whose comment is the text it shows.
+
+`python docs_site.py figures` writes the generated blocks of the pages again.
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
+import csv
 import dataclasses
 import html
 import importlib
 import inspect
+import io
 import json
 import os
 import re
+import subprocess
 import sys
 import tempfile
 import tomllib
 from collections.abc import Iterator
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -126,11 +135,64 @@ def executed_notebooks(home: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def main(arguments: list[str]) -> int:
     """Run the command."""
-    if len(arguments) != 2 or arguments[0] != "notebooks":
-        print("docs_site.py: expected 'notebooks FOLDER'", file=sys.stderr)
-        return 2
-    save_executed_notebooks(Path(arguments[1]))
+    match arguments:
+        case ["notebooks", folder]:
+            save_executed_notebooks(Path(folder))
+        case ["tour", folder]:
+            save_tour(Path(folder), ROOT / "docs" / "pictures")
+        case ["figures"]:
+            write_figures()
+        case _:
+            print("docs_site.py: expected 'notebooks FOLDER', 'tour FOLDER' or 'figures'", file=sys.stderr)
+            return 2
     return 0
+
+
+def save_tour(folder: Path, out: Path) -> None:
+    """Save the pass and the report of a demo as PNG files, and with its text and the overview as an animation."""
+    from PIL import Image
+
+    from benchmarks.pages import open_chromium, served
+
+    text = tour_text((folder / "demo.txt").read_text(encoding="utf-8"))
+    home = folder / "linna-demo" / "ground"
+    (report,) = (folder / "linna-demo").rglob("report.html")
+    terminal = (
+        "<body style='margin:0;background:#1d2529;color:#e8eef0;padding:28px;font:19px/1.45 DejaVu Sans Mono'>"
+        f"<pre style='margin:0;white-space:pre-wrap'><b>$ linna demo --out linna-demo</b>\n{html.escape(text)}</pre>"
+    )
+    frames = []
+    with served(home) as url, open_chromium() as browser:
+        page = browser.new_page(viewport={"width": 1200, "height": 800}, color_scheme="light")
+        for name, address in (
+            ("", "about:blank"),
+            ("overview", f"{url}/"),
+            ("pass", f"{url}/passes/1"),
+            ("report", report.resolve().as_uri()),
+        ):
+            page.goto(address, wait_until="networkidle")
+            if not name:
+                page.set_content(terminal)
+            page.wait_for_timeout(1500)
+            picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+            if name in ("pass", "report"):
+                picture.quantize(128).save(out / f"{name}.png", optimize=True)
+            frames.append(picture.resize((900, 600), Image.Resampling.LANCZOS).quantize(96))
+    frames[0].save(
+        out / "tour.gif", save_all=True, append_images=frames[1:], duration=[6000, 4000, 4000, 4000], loop=0,
+        optimize=True, comment=text.encode(),
+    )  # fmt: skip
+
+
+def tour_text(printed: str) -> str:
+    """Return the lines of a demo from its pass to its evidence level, without those of single requirements.
+
+    No machine changes these lines; the processor load among the requirements depends on it.
+    """
+    lines = printed.splitlines()
+    first = next(number for number, line in enumerate(lines) if line.startswith("pass "))
+    last = next(number for number, line in enumerate(lines) if line.startswith("evidence: "))
+    return re.sub(r"(?m)^  \S.*\n", "", "\n".join(lines[first : last + 1])).replace("\n\n\n", "\n\n")
 
 
 def save_executed_notebooks(out: Path) -> None:
@@ -197,7 +259,7 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
         needed = (
             " (required)" if action.required and action.option_strings and "(required)" not in text else ""
         )
-        rows.append(f"| `{_cell(name)}` | {_cell(text + needed)} |")
+        rows.append(f"| {_code(name)} | {_cell(text + needed)} |")
     return ["| argument | meaning |", "|---|---|", *rows] if rows else []
 
 
@@ -271,6 +333,10 @@ def scenario_page() -> str:
 
 
 def _keys(heading: str, kind: Any, text: str) -> list[str]:
+    text, _, attributes = text.partition("\nAttributes\n----------\n")
+    meanings: dict[str, str] = {}
+    for names, meaning in re.findall(r"^(\S[^\n]*)\n((?:    [^\n]*\n?)+)", attributes, re.MULTILINE):
+        meanings |= dict.fromkeys(names.split(", "), " ".join(meaning.split()))
     rows = []
     for key in dataclasses.fields(kind):
         if key.default_factory is not dataclasses.MISSING:
@@ -278,14 +344,19 @@ def _keys(heading: str, kind: Any, text: str) -> list[str]:
         default = "required" if key.default is dataclasses.MISSING else f"`{json.dumps(key.default)}`"
         # Types are texts where annotations are deferred.
         stated = key.type if isinstance(key.type, str) else getattr(key.type, "__name__", str(key.type))
-        rows.append(f"| `{key.name}` | {_cell(stated.replace('Literal', 'one of '))} | {default} |")
+        if choices := re.fullmatch(r"Literal\[(.*)\]", stated):
+            stated = ", ".join(choices[1].replace("'", '"').split(", "))
+        elif repeated := re.fullmatch(r"tuple\[(\w+), \.\.\.\]", stated):
+            stated = f"list of {repeated[1]}"
+        meaning = f" {_cell(meanings.get(key.name, ''))} |" if meanings else ""
+        rows.append(f"| `{key.name}` | {_cell(stated)} | {default} |{meaning}")
     return [
         "",
         f"## {heading}",
-        *(["", text] if text else []),
+        *(["", text.strip()] if text.strip() else []),
         "",
-        "| key | type | default |",
-        "|---|---|---|",
+        "| key | type or values | default |" + (" meaning |" if meanings else ""),
+        "|---|---|---|" + ("---|" if meanings else ""),
         *rows,
     ]
 
@@ -321,19 +392,76 @@ def layers_svg(container: str) -> str:
     )
 
 
+BLOCK = re.compile(r"(<!-- generated: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+"""A block of a page that is generated: start, name, text and end."""
+
+
 def generated_figures() -> dict[str, str]:
-    """Return the sentences with figures that pages contain, by the name of their block."""
+    """Return the text of the generated blocks of pages by the name of the block."""
     from tmtc.xtce.export import format_xtce
 
     def sizes(unrolled: bool) -> str:
         text = format_xtce(unrolled=unrolled)
         return f"{text.count('<SequenceContainer '):,} containers, {len(text.encode()) / 1e6:.2f} MB"
 
-    return {"xtce": f"`linna tm xtce` writes {sizes(False)}; with `--unrolled` {sizes(True)}."}
+    return {
+        "xtce": f"`linna tm xtce` writes {sizes(False)}; with `--unrolled` {sizes(True)}.",
+        "mutation": mutation_table((ROOT / "docs" / "mutation.csv").read_text(encoding="utf-8")),
+    }
+
+
+def mutation_table(samples: str) -> str:
+    """Return the scores of samples of mutants as a table; the interval is Wilson's at 95 %.
+
+    Raises
+    ------
+    ValueError
+        A group has no sample of the 60 days before the newest commit.
+    """
+    from scipy.stats import binomtest
+
+    from benchmarks.mutation import GROUPS
+
+    log = ["git", "-C", str(ROOT), "log", "-1", "--format=%cs"]
+    now = date.fromisoformat(subprocess.run(log, capture_output=True, text=True, check=True).stdout.strip())
+    rows = list(csv.DictReader(io.StringIO(samples)))
+    fresh = {row["group"] for row in rows if (now - date.fromisoformat(row["date"])).days <= 60}
+    if stale := GROUPS.keys() - fresh:
+        raise ValueError(
+            f"docs/mutation.csv: expected a sample of the last 60 days, found none: {sorted(stale)}"
+        )
+
+    lines = [
+        "| group | commit, date | seed | tested | killed | score | interval |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        killed, tested = int(row["killed"]), int(row["tested"])
+        interval = binomtest(killed, tested).proportion_ci(method="wilson")
+        lines.append(
+            f"| {row['group']} | {row['commit']}, {row['date']} | {row['seed']} | {tested} | {killed} "
+            f"| {killed / tested:.2f} | {interval.low:.2f} to {interval.high:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def write_figures() -> None:
+    """Write the generated blocks of all pages again."""
+    figures = generated_figures()
+    for page in (ROOT / "docs").rglob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        renewed = BLOCK.sub(lambda block: f"{block[1]}\n{figures[block[2]]}\n\n{block[4]}", text)
+        if renewed != text:
+            page.write_text(renewed, encoding="utf-8")
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    return " ".join(text.split()).replace("|", "&#124;")
+
+
+def _code(text: str) -> str:
+    # In a span of backquotes the table would end at "|", and an entity would be shown as it is.
+    return f"<code>{_cell(html.escape(text, quote=False))}</code>" if "|" in text else f"`{_cell(text)}`"
 
 
 if __name__ == "__main__":

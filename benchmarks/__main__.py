@@ -10,8 +10,7 @@ import sys
 from benchmarks._rows import measure, report
 
 NAMES = (
-    "tmtc", "xtce", "downlink", "downlink_memory", "ground", "orbit", "ephemeris", "render", "detector",
-    "report_pages", "pages",
+    "tmtc", "xtce", "downlink", "ground", "orbit", "ephemeris", "render", "detector", "pages",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""
 

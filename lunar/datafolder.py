@@ -1,6 +1,7 @@
 """Public data products present in a data folder, and the default models for them.
 
-A folder is laid out as ``gravity/ kernels/ craters/ dem/ albedo/ photometry/``; any part may be absent.
+A folder is laid out as ``gravity/ kernels/ craters/ dem/ albedo/ photometry/``; any part may be absent. Heights and
+craters of a user are ``dem/own*.tif`` and ``craters/own*.csv``.
 """
 
 from __future__ import annotations
@@ -35,6 +36,12 @@ class DataFolder:
     albedo_tiles: tuple[Path, ...] = ()
     photometry: Path | None = None
 
+    @property
+    def own_heights(self) -> str:
+        """Name of height rasters of the user; empty without them."""
+        own = [path.name for path in self.dem_tiles if path.name.startswith("own")]
+        return f"own heights {', '.join(own)}" if own else ""
+
     def names(self) -> tuple[str, ...]:
         """Return the names of the products present, for the ``data`` field of outputs."""
         present = (
@@ -46,8 +53,11 @@ class DataFolder:
                 self.catalogue_composite,
                 "crater catalogue composite (LU1319381; Robbins 2019; Povilaitis et al. 2018)",
             ),
-            (self.catalogue_robbins, "crater catalogue Robbins 2019"),
-            (self.dem_tiles or None, "height model LROC WAC GLD100 (Scholten et al. 2012)"),
+            (self.catalogue_robbins, f"crater catalogue {_catalogue_name(self.catalogue_robbins)}"),
+            (
+                self.dem_tiles or None,
+                self.own_heights or "height model LROC WAC GLD100 (Scholten et al. 2012)",
+            ),
             (self.dem_global, "height model LROC WAC GLD100, 16 px/deg"),
             (self.dem_sldem or None, "height model SLDEM2015 (Barker et al. 2016)"),
             (self.albedo, "albedo map"),
@@ -82,8 +92,10 @@ def find_data(path: Path | str | None) -> DataFolder:
         orientation_tf=_first(root, "kernels/moon_080317.tf", "kernels/moon*.tf"),
         catalogue_lu=_first(root, "craters/lu1319381*.csv.gz", "craters/lu1319381*.csv"),
         catalogue_composite=_first(root, "craters/composite*.csv.gz", "craters/composite*.csv"),
-        catalogue_robbins=_first(root, "craters/*robbins*.csv*", "craters/lunar_craters_ge20km.csv"),
-        dem_tiles=tiles,
+        catalogue_robbins=_first(
+            root, "craters/own*.csv", "craters/*robbins*.csv*", "craters/lunar_craters_ge20km.csv"
+        ),
+        dem_tiles=_all(root, "dem/own*.tif") + tiles,
         dem_global=global_dem,
         dem_sldem=_all(root, "dem/SLDEM2015*.LBL", "dem/sldem2015*.lbl", "dem/SLDEM2015*.tif"),
         albedo=_first(root, "albedo/moon_albedo*.jpg", "albedo/*.jpg"),
@@ -118,6 +130,10 @@ def _first(root: Path, *patterns: str) -> Path | None:
         if found:
             return found[0]
     return None
+
+
+def _catalogue_name(path: Path | None) -> str:
+    return path.name if path is not None and path.name.startswith("own") else "Robbins 2019"
 
 
 def _stem(path: Path | None) -> str:

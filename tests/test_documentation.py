@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from PIL import Image
 
 import docs_site
 from ground_service.web import documentation, pages
@@ -18,6 +19,7 @@ from linna.parser import all_commands
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+README = (ROOT / "README.md").read_text()
 TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
 MARK = re.compile(
     r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n"
@@ -92,7 +94,7 @@ def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:
         for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text())
         if m["kind"] == "tour"
     ]
-    assert tour in (ROOT / "README.md").read_text()
+    assert tour in README
 
 
 def environment(home: Path) -> dict[str, str]:
@@ -175,6 +177,15 @@ def _check_first_spacecraft(folder: Path) -> None:
     assert "first" in (folder / "report.html").read_text()
 
 
+def test_the_table_of_changes_names_files_that_exist() -> None:
+    table = (DOCS / "contributing.md").read_text().split("## Where do I change")[1].split("\n## ")[0]
+    named = re.findall(
+        r"`([\w./]+)`", " ".join(row.split("|")[2] for row in re.findall(r"^\| .*\|$", table, re.M))
+    )
+    found = {name for name in named if (ROOT / name).exists() or [*ROOT.glob(f"ground_service/**/{name}")]}
+    assert len(named) > 20 and {*named} - found == {"Command", "PAGES"}
+
+
 def test_the_walks_name_functions_that_exist() -> None:
     steps = re.findall(r"`([\w/]+\.py): (\w+)`", (DOCS / "explanation" / "walks.md").read_text())
     gone = [
@@ -192,9 +203,17 @@ def test_the_page_of_scenario_keys_states_types_and_defaults() -> None:
 
 
 def test_figures_of_pages_are_those_of_the_program() -> None:
-    blocks = [
-        (name, line)
-        for page in DOCS.rglob("*.md")
-        for name, line in re.findall(r"<!-- generated: (\w+) -->\n(.*)", page.read_text())
-    ]
-    assert dict(blocks) == docs_site.generated_figures()
+    blocks = [block for page in DOCS.rglob("*.md") for block in docs_site.BLOCK.findall(page.read_text())]
+    assert {name: text.strip() for _, name, text, _ in blocks} == docs_site.generated_figures()
+
+
+def test_the_animation_of_the_readme_shows_the_figures_of_the_text() -> None:
+    with Image.open(DOCS / "pictures" / "tour.gif") as picture:
+        shown = picture.info["comment"].decode()
+    told = (DOCS / "tutorials" / "first-pass.md").read_text().split("```text\n")[1].split("```")[0].strip()
+    assert shown == told
+    assert (DOCS / "pictures" / "tour.gif").stat().st_size < 1e6 and "pictures/tour.gif" in README
+
+
+def test_the_release_notes_are_one_page() -> None:
+    assert len((ROOT / "CHANGELOG.md").read_bytes()) <= 8_000

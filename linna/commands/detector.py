@@ -126,7 +126,7 @@ def _add_bench_and_info(verbs: Any) -> None:
     option(bench, "--frames", int, "", 100)
     finish(bench, _bench)
 
-    info = verbs.add_parser("info", help="what a model says of itself")
+    info = verbs.add_parser("info", help="what a model says of itself, and files of the shipped networks")
     add_model(info)
     finish(info, _info)
 
@@ -250,6 +250,7 @@ def _info(arguments: argparse.Namespace) -> int:
     import json
 
     from linna.output import emit
+    from payload_emulator.flight.models import describe_networks
     from payload_emulator.flight.vision.detector import OnnxDetector
 
     octets = model_octets(arguments.model)
@@ -257,4 +258,10 @@ def _info(arguments: argparse.Namespace) -> int:
     metadata = {
         key: json.loads(text) if text[:1] in ("{", "[") else text for key, text in detector.metadata.items()
     }
-    return emit(arguments, {"sha256": detector.sha256, "model_bytes": len(octets), **metadata})
+    figures = {"sha256": detector.sha256, "model_bytes": len(octets), **metadata}
+    shipped = describe_networks()
+    lines = [f"{key}: {value}" for key, value in figures.items()] + [
+        f"shipped network {name}: {one['file']}, SHA-256 {one['sha256']}, {one['purpose']}"
+        for name, one in shipped.items()
+    ]
+    return emit(arguments, figures | {"shipped": shipped}, "\n".join(lines))

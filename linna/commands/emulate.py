@@ -277,7 +277,6 @@ def _station_ports(texts: list[str], stations: tuple[str, ...]) -> dict[str, tup
 def describe(summary: dict[str, Any], out: Path) -> str:
     """A few lines about an emulated window, for people."""
     altitude, link = summary["altitude_km"], summary["link"]
-    outcomes = ", ".join(f"{name} {count}" for name, count in summary["outcomes"].items() if count)
     return "\n".join(
         [
             f"{summary['frames']} frames, {summary['start_utc']} to {summary['stop_utc']}, altitude "
@@ -286,8 +285,18 @@ def describe(summary: dict[str, Any], out: Path) -> str:
             f"link: {link['frames_sent']} frames sent, {link['frames_lost_on_link']} lost, "
             f"{link['frames_bad']} came beyond repair; of {link['packets_made']} packets "
             f"{link['packets_lost']} lost, {link['duplicates']} came again",
-            f"outcomes: {outcomes}",
+            outcomes_line(summary),
+            *(f"warning: {text}" for text in summary["warnings"]),
             f"data: {'; '.join(summary['data'])}",
             f"archive: {out}",
         ]
     )
+
+
+def outcomes_line(summary: dict[str, Any]) -> str:
+    """Count the outcomes of frames, with the reasons of those without a usable image."""
+    outcomes, reasons = (
+        ", ".join(f"{name} {count}" for name, count in summary[key].items() if count)
+        for key in ("outcomes", "no_image_reasons")
+    )
+    return f"outcomes: {outcomes}" + (f"; no image: {reasons}" if reasons else "")

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from linna.commands.emulate import outcomes_line
 from linna.output import emit, finish, progress
 from linna.parser import option
 
@@ -114,12 +115,11 @@ def _bar(items: Iterable[Any], total: int) -> Any:
 
 
 def _describe(summary: dict[str, Any], out: Path) -> str:
-    outcomes = ", ".join(f"{name} {count}" for name, count in summary["outcomes"].items() if count)
     return "\n".join(
         [
             f"{summary['frames']} frames flown again, {summary['packets']} packets, "
             f"{summary['downlink_octets']} octets of downlink",
-            f"outcomes: {outcomes}",
+            outcomes_line(summary),
             f"CPU time: {summary['cpu_ms_per_frame']:.1f} ms per frame",
             f"downlink: {out / 'downlink.cadu'}",
         ]

@@ -46,6 +46,7 @@ from payload_emulator.session.spacecraft import (
     new_spacecraft,
 )
 from payload_emulator.session.starting import load_scenario_payload
+from payload_emulator.session.sun_check import sun_warnings
 from payload_emulator.session.world import (
     World,
     build_world,
@@ -163,6 +164,7 @@ def _emulate_into(
 ) -> dict[str, Any]:
     scenario = world.scenario
     loaded, reference, catalogue = load_scenario_payload(world, data)
+    warnings = [] if world.external is None else sun_warnings(world, loaded.detector)
     total = int(world.frame_utc_ns.size)
     kept = (
         set(range(total))
@@ -205,7 +207,7 @@ def _emulate_into(
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
-    summary |= score_navigation(world, judged)
+    summary |= score_navigation(world, judged) | {"warnings": warnings}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     (folder / "manifest.json").write_text(json.dumps(_manifest(world, loaded, folder), indent=2) + "\n")
     return summary

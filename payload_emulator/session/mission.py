@@ -410,6 +410,8 @@ def _evidence(world: World) -> dict[str, Value]:
     if world.scenario.terrain.source == "photograph":
         return {"world": "photographs", "seed": world.scenario.seed}
     if world.terrain.is_real:
+        if world.terrain.name.startswith("own "):
+            return {"world": None}
         share = unseen_share(world)
         return {"world": "real-terrain", "seed": world.scenario.seed, "unseen_share": share}
     return {"world": "procedural", "seed": world.scenario.seed}

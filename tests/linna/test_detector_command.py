@@ -1,10 +1,13 @@
 """`linna detector` and `linna dataset` from the outside: keys of their JSON, words of their refusals."""
 
+import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import linna
 from linna.cli import run
 from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 
@@ -31,6 +34,10 @@ def test_info_tells_the_hash_and_the_thresholds(capsys):
     figures = json.loads(capsys.readouterr().out)
     assert len(figures["sha256"]) == 64
     assert 0.1 <= float(figures["score_threshold"]) <= float(figures["navigation_threshold"])
+    assert figures["shipped"]["craters"]["sha256"] == figures["sha256"]
+    for network in figures["shipped"].values():
+        octets = Path(linna.__file__).parents[1].joinpath(network["file"]).read_bytes()
+        assert hashlib.sha256(octets).hexdigest() == network["sha256"] and "altitudes" in network["purpose"]
 
 
 @pytest.mark.parametrize(

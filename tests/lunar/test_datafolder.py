@@ -35,3 +35,10 @@ def test_the_whole_data_folder_is_recognised(data_path):
     assert len(data.names()) == 10
     assert default_orientation(data).name == "DE421"
     assert len(data.dem_tiles) == len(list((data_path / "dem").glob("*ppd_*E_*.jp2")))
+
+
+def test_heights_and_craters_of_a_user_are_named_by_their_files(tmp_path):
+    for name in ("dem/own-pole.tif", "craters/own.csv"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    assert find_data(tmp_path).names() == ("crater catalogue own.csv", "own heights own-pole.tif")

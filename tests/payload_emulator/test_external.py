@@ -1,9 +1,11 @@
 """Frames that others took: a flown pass given back as a folder of images, orbit and attitudes."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,10 +13,15 @@ from lunar.datafolder import DataFolder
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.session import sun_check
 from payload_emulator.session.emulator import emulate
 from payload_emulator.session.external import load_external
 from payload_emulator.session.replay import FlightBuild, replay_archive
 from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.sun_check import sun_warnings
+from payload_emulator.session.world import build_world
 
 TEXT = """
 name = "given"
@@ -35,6 +42,8 @@ tilt_deg = 4.0
 pointing_error_deg = 0.5
 knowledge_noise_deg = 0.0
 knowledge_bias_deg = 0.0
+[light]
+mode = "real"
 [terrain]
 source = "procedural"
 [navigation]
@@ -92,7 +101,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     assert run(command) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == summary["frames_kept"] == 3
-    assert "external images given" in summary["data"]
+    assert "external images given" in summary["data"] and summary["warnings"] == []
     first = [item for item in inputs(flown / "pass") if item["frame"] >= 0]
     again = [item for item in inputs(out) if item["frame"] >= 0]
     assert [item["pixels_sha256"] for item in again] == [item["pixels_sha256"] for item in first]
@@ -104,6 +113,23 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     # Nothing outside the archive is needed to fly it again.
     replayed = replay_archive(out, FlightBuild(), tmp_path / "replayed")
     assert replayed["frames"] == 3
+
+
+def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimuths(
+    flown, tmp_path, monkeypatch
+):
+    folder, data, scenario = copied(flown, tmp_path / "given"), DataFolder(), parse_scenario(TEXT)
+    detector = OnnxDetector(load_shipped_model())
+    for image in sorted(folder.glob("*.png"))[1:]:
+        cv2.imwrite(str(image), np.rot90(cv2.imread(str(image)), 2))
+    world = build_world(scenario, data, load_external(folder, scenario))
+    warnings = sun_warnings(world, detector)
+    assert [text[9:].split("Z: ")[0] for text in warnings] == ["2029-08-08T02:58:20", "2029-08-08T02:58:40"]
+    for text in warnings:
+        seen, known = (float(azimuth) for azimuth in re.findall(r"(?:azimuth|at) (\d+) deg", text))
+        assert abs(seen - known) == pytest.approx(180.0, abs=20.0)  # of a few craters
+    monkeypatch.setattr(sun_check, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
+    assert len(sun_warnings(world, detector)) == 3 and "elevation -" in sun_warnings(world, detector)[0]
 
 
 def test_without_attitudes_the_camera_points_as_the_scenario_says(flown, tmp_path):

@@ -87,6 +87,7 @@ class Observer:
         self.detector_ms = 0.0
         self.detector_failed = False
         self.counts: Counter[str] = Counter()
+        self._no_image: Counter[str] = Counter()
         self.reacquisitions = 0
         self.manual_step = False
         self._altitude_m = _NAN
@@ -163,8 +164,10 @@ class Observer:
         self._measure(readings)
         for mode in self._parameters.modes:
             if mode is Mode.anchored:
-                usable = found if quality is ImageQuality.OK and not self.detector_failed else None
-                below_m = self._anchored_frame(usable, readings.attitude)
+                reason = "detector failed" if self.detector_failed else quality.name.lower()
+                if reason != "ok":
+                    self._no_image[reason] += 1
+                below_m = self._anchored_frame(found if reason == "ok" else None, readings.attitude)
             else:
                 below_m = self._odometry_frame(mode, found)
             altitude_m = below_m if np.isfinite(below_m) else altitude_m
@@ -188,6 +191,7 @@ class Observer:
             "fixes": {**estimators["anchored"]["outcomes"], "reacquired": self.reacquisitions}
             if "anchored" in estimators
             else {},
+            "no_image_reasons": dict(self._no_image),
             "anchor_reads_after_start": chosen.get("anchor_reads_after_start", 0),
             "frames_processed": self.counts["frames"],
             "frames_bad": self.counts["frames_bad"],

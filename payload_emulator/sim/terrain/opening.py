@@ -72,7 +72,7 @@ def open_terrain(
     from payload_emulator.sim.terrain.registering import find_registration
 
     assert catalogue_path is not None
-    chosen: dict[str, Any] = {"name": "LROC WAC GLD100"}
+    chosen: dict[str, Any] = {"name": data.own_heights or "LROC WAC GLD100"}
     if data.dem_sldem:
         # The smoothing is GLD100's; nothing is known against SLDEM2015 as it stands.
         chosen = {
@@ -134,7 +134,7 @@ def _open_photograph(
             *(
                 name
                 for name in _names(data)
-                if not heights or not name.startswith("height model LROC WAC GLD100 (")
+                if not heights or not name.startswith(("height model LROC WAC GLD100 (", "own heights"))
             ),
         ),
         **shift,
@@ -155,7 +155,7 @@ def _found(name: str, data: DataFolder, what: str) -> Path:
 
 def _names(data: DataFolder) -> tuple[str, ...]:
     """Which products of the folder a raster terrain is made of."""
-    heights = "height model SLDEM2015" if data.dem_sldem else "height model LROC"
+    heights = "height model SLDEM2015" if data.dem_sldem else data.own_heights or "height model LROC"
     coarse = "height model LROC WAC GLD100, 16" if data.dem_global else "-"
     catalogue = "crater catalogue LU" if data.catalogue_lu else "crater catalogue"
     return tuple(name for name in data.names() if name.startswith((heights, coarse, catalogue, "albedo")))

@@ -92,7 +92,7 @@ class Navigator:
             raise np.linalg.LinAlgError
         return self.state, AnchoredReport(
             self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
-            self.lost, 0, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad,
+            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad,
         )  # fmt: skip
 
     def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
@@ -201,6 +201,7 @@ def test_a_bad_image_is_counted_reported_and_kept_from_the_filter(rig: SimpleNam
     assert rig.navigator.given[0][1] is None
     assert rig.observer.counts["frames_bad"] == 1 and rig.observer.last_quality is ImageQuality.DARK
     assert ("image_dark" in rig.telemetry.names()) is not quiet
+    assert rig.observer.summary()["no_image_reasons"] == {"dark": 1}
 
 
 def test_a_detector_that_fails_or_is_late_gives_no_detections(rig: SimpleNamespace) -> None:
@@ -215,6 +216,7 @@ def test_a_detector_that_fails_or_is_late_gives_no_detections(rig: SimpleNamespa
     rig.clock.detector_ns = 999_999_999
     look(rig)
     assert not rig.observer.detector_failed and len(rig.navigator.given[-1][1]) == 6
+    assert rig.observer.summary()["no_image_reasons"] == {"detector failed": 2}
 
 
 @pytest.mark.parametrize(
