@@ -243,6 +243,15 @@ class AlarmChanged(Event):
     state: str
 
 
+class HandoverChanged(Event):
+    """The note of a shift or the hold of a spacecraft was changed."""
+
+    event_kind = "handover"
+    spacecraft_id: int
+    instance: str
+    held_by: str | None = None
+
+
 class DisplayChanged(Event):
     """An object of the telemetry displays was stored, or deleted if `version` is None."""
 

@@ -401,7 +401,9 @@ class Operations(Connection):
         """Search candidate windows by constraints over a reference ephemeris."""
 
     @operation("GET /windows", reads="planning.store.list_windows")
-    def list_windows(self, *, state: planning.WindowState | None = None) -> Listing[planning.Window]:
+    def list_windows(
+        self, *, state: Sequence[planning.WindowState] | None = None
+    ) -> Listing[planning.Window]:
         """List the planned windows, newest first."""
 
     @operation("POST /windows", body="window")
@@ -492,7 +494,10 @@ class Operations(Connection):
 
     @operation("GET /telecommands", reads="contacts.commanding.service.list_telecommands")
     def list_telecommands(
-        self, *, state: Literal["queued", "carried", "released", "rejected", "sent"] | None = None
+        self,
+        *,
+        state: Literal["queued", "carried", "released", "rejected", "sent"] | None = None,
+        window_id: Sequence[int] | None = None,
     ) -> Listing[commanding.Telecommand]:
         """List the telecommands with their verification, newest first."""
 
@@ -524,6 +529,28 @@ class Operations(Connection):
     @operation("GET /spacecraft/{spacecraft_id}/uplink")
     def get_uplink_state(self, spacecraft_id: int, *, instance: str = "flight") -> commanding.UplinkState:
         """Return the state of a telecommand receiver, from the control words of the newest telemetry."""
+
+    @operation("GET /handovers", reads="contacts.commanding.store.list_handovers")
+    def list_handovers(
+        self, *, spacecraft_id: int | None = None, instance: str | None = None
+    ) -> Listing[commanding.Handover]:
+        """List the notes of the last shift and the holds, by spacecraft."""
+
+    @operation("PUT /spacecraft/{spacecraft_id}/handover", body=("note",))
+    def note_handover(
+        self, spacecraft_id: int, note: str, *, instance: str = "flight"
+    ) -> commanding.Handover:
+        """Write the note for the next shift."""
+
+    @operation("POST /spacecraft/{spacecraft_id}/hold", body=("reason",))
+    def hold_spacecraft(
+        self, spacecraft_id: int, reason: str, *, instance: str = "flight"
+    ) -> commanding.Handover:
+        """Stop the release and the transmission of telecommands of a spacecraft at once, automatic ones included."""
+
+    @operation("DELETE /spacecraft/{spacecraft_id}/hold")
+    def resume_spacecraft(self, spacecraft_id: int, *, instance: str = "flight") -> commanding.Handover:
+        """End the hold of a spacecraft."""
 
     # alarms
 

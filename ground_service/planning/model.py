@@ -306,6 +306,7 @@ class Window(Entity):
     version: int
     created_by: str
     created: UtcTime
+    decided_by: str | None = Field(description="Who approved it, made it a draft again or declared it failed")
     changed: UtcTime
 
 
@@ -349,7 +350,6 @@ class WindowRecord(Window):
     uploads: WindowUploads | None
     decision: Decision
     edited_by: str
-    decided_by: str | None
 
     def entry(self) -> WindowEntry:
         """Return the request of the window."""
@@ -360,4 +360,4 @@ class WindowRecord(Window):
 class WindowFilter(Paging):
     """Windows to list."""
 
-    state: WindowState | None = None
+    state: list[WindowState] | None = Field(default=None, description="Default: any state")

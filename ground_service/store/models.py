@@ -753,6 +753,20 @@ One that is inside another (an activity of the on-board schedule) names that one
 """
 
 
+HANDOVERS = Table(
+    "handovers",
+    METADATA,
+    key("vehicle_id", ForeignKey("vehicles.id"), autoincrement=False),
+    column("note", Text),
+    optional("noted_by", String(64)),
+    optional("noted_utc_ns", BigInteger),
+    optional("held_by", String(64)),
+    optional("held_utc_ns", BigInteger),
+    column("hold_reason", Text),
+)
+"""Note of the last shift about a vehicle; while `held_by` is given, none of its telecommands is released or sent."""
+
+
 LINKS = Table(
     "links",
     METADATA,

@@ -56,7 +56,7 @@ MEDIA = {
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page: its address, its template and script, its name in the navigation ('' for none).
+    """A page: its address, its template and script, its area and its name in the navigation ('' for none).
 
     `section` is the page whose name the navigation marks as current; "" for its own. `needs` is the lowest role that
     can use the page; "" for every role.
@@ -65,36 +65,37 @@ class Page:
     path: str
     name: str
     title: str
-    entry: str
+    area: str
+    entry: str = ""
     section: str = ""
     needs: str = ""
 
 
-DISPLAYS = Page("/mct", "mct", "Telemetry displays", "Displays")
+DISPLAYS = Page("/mct", "mct", "Telemetry displays", "Payload", "Displays")
 """Page that `web.displays` serves."""
 
 PAGES = (
-    Page("/", "overview", "Overview", "Overview"),
-    Page("/planner", "planner", "Planner", "Planner"),
-    Page("/passes", "passes", "Passes", "Passes"),
-    Page("/passes/{pass_id}", "pass", "Pass", "", "passes"),
-    Page("/comparison", "comparison", "Comparison of passes", "", "passes"),
-    Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
+    Page("/", "shift", "Shift", "Shift", "Shift"),
+    Page("/planner", "planner", "Planner", "Plan", "Planner"),
+    Page("/missions", "missions", "Missions", "Plan", "Missions"),
+    Page("/missions/{revision}", "mission", "Mission", "Plan", section="missions"),
+    Page("/automation", "automation", "Automation", "Plan", "Automation"),
+    Page("/passes", "passes", "Passes", "Passes", "Passes"),
+    Page("/passes/{pass_id}", "pass", "Pass", "Passes", section="passes"),
+    Page("/comparison", "comparison", "Comparison of passes", "Passes", section="passes"),
+    Page("/regression", "regression", "Regression", "Passes", "Regression"),
+    Page("/landmarks", "landmarks", "Landmarks learned from flight", "Passes", "Landmarks"),
+    Page("/telemetry", "telemetry", "Telemetry", "Payload", "Telemetry"),
     DISPLAYS,
-    Page("/events", "events", "Events", "Events"),
-    Page("/alarms", "alarms", "Alarms", "Alarms"),
-    Page("/commands", "commands", "Commands", "Commands"),
-    Page("/regression", "regression", "Regression", "Regression"),
-    Page("/landmarks", "landmarks", "Landmarks learned from flight", "Landmarks"),
-    Page("/live", "live", "Live", "Live"),
-    Page("/missions", "missions", "Missions", "Missions"),
-    Page("/missions/{revision}", "mission", "Mission", "", "missions"),
-    Page("/automation", "automation", "Automation", "Automation"),
-    Page("/audit", "audit", "Audit log", "Audit", needs="operator"),
-    Page("/status", "status", "Status of the service", ""),
-    Page("/users", "users", "Users and tokens", ""),
-    Page("/docs", "docs", "HTTP API", ""),
-    Page("/licences", "licences", "Licences", ""),
+    Page("/events", "events", "Events", "Payload", "Events"),
+    Page("/alarms", "alarms", "Alarms", "Payload", "Alarms"),
+    Page("/commands", "commands", "Commands", "Payload", "Commands"),
+    Page("/live", "live", "Live", "Payload", "Live"),
+    Page("/status", "status", "Status of the service", "System", "Status"),
+    Page("/audit", "audit", "Audit log", "System", "Audit", needs="operator"),
+    Page("/users", "users", "Users and tokens", "System", "Users", needs="admin"),
+    Page("/docs", "docs", "HTTP API", "System", "HTTP API"),
+    Page("/licences", "licences", "Licences", "System", "Licences"),
 )
 
 pages = APIRouter(include_in_schema=False)
@@ -224,7 +225,8 @@ def rendered(page: Page, template: str = "", openmct: str = "", *, provider: boo
             openmct=openmct,
             provider=provider,
             help=bool(files_of(HELP)),
-            pages=[one for one in PAGES if one.entry],
+            areas={one.area: one.path for one in reversed(PAGES) if one.entry},
+            pages=[one for one in PAGES if one.entry and one.area == page.area],
             version=_version(),
             dictionary=_dictionary(),
             state_values=STATE_VALUES,

@@ -1,4 +1,4 @@
-"""`linna command enter | list | show | release | reject | uplink | receiver`: telecommands of the ground service."""
+"""`linna command …`: telecommands of the ground service, holds and notes of shifts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from linna.parser import option
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.contacts.commanding.model import Telecommand, UplinkChannel, UplinkState
+    from ground_service.contacts.commanding.model import Handover, Telecommand, UplinkChannel, UplinkState
     from linna.parser import LinnaParser
 
 SHOWN = {"id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by", "remark"}
@@ -122,6 +122,11 @@ def _channel(channel: UplinkChannel) -> str:
     )
 
 
+def _handover(one: Handover) -> str:
+    hold = f"on hold by {one.held_by} since {one.held}: {one.hold_reason}" if one.held_by else "not on hold"
+    return f"spacecraft {one.spacecraft_id} ({one.instance}): {hold}; {one.note or 'no note'}"
+
+
 COMMANDS: Commands = {
     "enter": Command(
         _enter,
@@ -150,6 +155,32 @@ COMMANDS: Commands = {
     "release": Command("release_telecommand", "release a queued telecommand", _text, figures=_figures),
     "reject": Command(
         "reject_telecommand", "remove a queued telecommand from the queue", _text, figures=_figures
+    ),
+    "hold": Command(
+        "hold_spacecraft",
+        "stop release and transmission of telecommands of a spacecraft at once",
+        lambda one: (
+            f"spacecraft {one.spacecraft_id} ({one.instance}): on hold by {one.held_by} since {one.held}"
+        ),
+        options={"reason": "why, for the other operators"},
+    ),
+    "resume": Command(
+        "resume_spacecraft",
+        "end the hold of a spacecraft",
+        _handover,
+    ),
+    "note": Command(
+        "note_handover",
+        "write the note for the next shift",
+        _handover,
+        options={"note": "replaces the one before"},
+    ),
+    "handovers": Command(
+        "list_handovers",
+        "list notes of the last shift and holds",
+        _handover,
+        "handovers",
+        "no notes, no holds",
     ),
     "uplink": Hand(
         "take the released telecommands and write or send them; they count as sent from then on",

@@ -172,6 +172,34 @@ class CommandView:
         )
 
 
+class Handover(Entity):
+    """What a shift hands over to the next one about a spacecraft: a note, and the hold of its telecommands."""
+
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+    note: str = ""
+    noted_by: str | None = None
+    noted: UtcTime | None = None
+    held_by: str | None = Field(
+        default=None, description="Who stopped release and transmission; null: nobody"
+    )
+    held: UtcTime | None = Field(default=None, description="Since when")
+    hold_reason: str = ""
+
+
+class HandoverNote(Given):
+    """Note for the next shift; replaces the one before, which the audit log keeps."""
+
+    note: str = Field(max_length=2000, examples=["Camera warm since orbit 12, see alarm 3."])
+
+
+class HandoverFilter(Paging):
+    """Notes and holds to list."""
+
+    spacecraft_id: SpacecraftNumber | None = None
+    instance: InstanceName | None = None
+
+
 class UplinkChannel(ControlWords):
     """A telecommand channel as the newest reception shows it."""
 
@@ -193,3 +221,4 @@ class TelecommandFilter(Paging):
     state: Literal["queued", "carried", "released", "rejected", "sent"] | None = Field(
         default=None, description="Stored state"
     )
+    window_id: list[int] | None = Field(default=None, description="Telecommands of these planned windows")

@@ -10,8 +10,11 @@ from fastapi import Query, Response
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.contacts.commanding import service as commanding
+from ground_service.contacts.commanding import store
 from ground_service.contacts.commanding.model import (
     CommandEntry,
+    Handover,
+    HandoverNote,
     Rejection,
     Telecommand,
     UplinkState,
@@ -89,6 +92,41 @@ def get_uplink_state(
 ) -> UplinkState:
     """Return the state of a telecommand receiver, from the control words of the newest telemetry."""
     return commanding.uplink_state(ground, spacecraft_id, instance)
+
+
+add_list(telecommands, "/handovers", store.list_handovers)
+
+
+@telecommands.put("/spacecraft/{spacecraft_id}/handover")
+def note_handover(
+    ground: GroundOf,
+    caller: Operator,
+    spacecraft_id: SpacecraftId,
+    given: HandoverNote,
+    instance: Instance = FLOWN,
+) -> Handover:
+    """Write the note for the next shift."""
+    return commanding.note_handover(ground, spacecraft_id, instance, given.note, actor=caller.name)
+
+
+@telecommands.post("/spacecraft/{spacecraft_id}/hold", responses=problems(409))
+def hold_spacecraft(
+    ground: GroundOf,
+    caller: Operator,
+    spacecraft_id: SpacecraftId,
+    given: Rejection,
+    instance: Instance = FLOWN,
+) -> Handover:
+    """Stop the release and the transmission of telecommands of a spacecraft at once, automatic ones included."""
+    return commanding.hold_spacecraft(ground, spacecraft_id, instance, reason=given.reason, actor=caller.name)
+
+
+@telecommands.delete("/spacecraft/{spacecraft_id}/hold", responses=problems(409))
+def resume_spacecraft(
+    ground: GroundOf, caller: Operator, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> Handover:
+    """End the hold of a spacecraft."""
+    return commanding.resume_spacecraft(ground, spacecraft_id, instance, actor=caller.name)
 
 
 @telecommands.post(

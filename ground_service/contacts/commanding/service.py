@@ -22,12 +22,14 @@ from ground_service.contacts.commanding.model import (
     CommandOctets,
     CommandRecord,
     CommandView,
+    Handover,
+    HandoverFilter,
     Telecommand,
     TelecommandFilter,
     UplinkState,
 )
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.events import CommandsSent, CommandStateChanged, publish
+from ground_service.events import CommandsSent, CommandStateChanged, HandoverChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.missions.store import approval_in_force, in_force
@@ -181,6 +183,7 @@ def take_uplink(
     """
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, spacecraft_id, instance)
+        _require_not_held(connection, vehicle)
         return take_released(connection, vehicle, spacecraft_id, framed=framed, actor=actor)
 
 
@@ -189,9 +192,11 @@ def take_released(
 ) -> tuple[bytes, list[int]]:
     """Do what `take_uplink` does, within the caller's transaction.
 
-    Commands whose time for transmission has passed stay released.
+    Commands whose time for transmission has passed stay released, and all commands of a spacecraft on hold.
     """
     lock_spacecraft(connection, vehicle)
+    if store.handover_of(connection, vehicle).held_by is not None:
+        return b"", []
     records = store.send_released(connection, vehicle, utc_now_ns(), mission_now_ns())
     ids = [record.id for record in records]
     for command_id in ids:
@@ -201,6 +206,80 @@ def take_released(
     packets = [record.octets for record in records if record.octets is not None]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
     return stream, ids
+
+
+def hold_spacecraft(
+    ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str
+) -> Handover:
+    """Stop the release and the transmission of all telecommands of a spacecraft until `resume_spacecraft`.
+
+    A transmission that a station has begun is not recalled.
+
+    Raises
+    ------
+    Conflict
+        If it is on hold already.
+    """
+    require_line(reason, "hold", "reason", REASON_LIMIT)
+    return _change_hold(ground, spacecraft_id, instance, actor=actor, reason=reason)
+
+
+def resume_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> Handover:
+    """End the hold of a spacecraft.
+
+    Raises
+    ------
+    Conflict
+        If it is not on hold.
+    """
+    return _change_hold(ground, spacecraft_id, instance, actor=actor, reason=None)
+
+
+def _change_hold(
+    ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None
+) -> Handover:
+    with ground.database.writing() as connection:
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        lock_spacecraft(connection, vehicle)  # what is being released or taken now comes before the hold
+        if reason is None:
+            changed = store.set_hold(connection, vehicle, actor=None)
+        else:
+            changed = store.set_hold(connection, vehicle, actor=actor, reason=reason, now_utc_ns=utc_now_ns())
+        if not changed:
+            _require_not_held(connection, vehicle)
+            raise Conflict(f"spacecraft {spacecraft_id} ({instance}): expected a hold, found none")
+        return _handed_over(connection, vehicle, "resume" if reason is None else "hold", actor)
+
+
+def note_handover(ground: Ground, spacecraft_id: int, instance: str, note: str, *, actor: str) -> Handover:
+    """Replace the note for the next shift."""
+    with ground.database.writing() as connection:
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        store.note_handover(connection, vehicle, note, actor=actor, now_utc_ns=utc_now_ns())
+        return _handed_over(connection, vehicle, "note", actor)
+
+
+def _handed_over(connection: Connection, vehicle: int, action: str, actor: str) -> Handover:
+    found = store.handover_of(connection, vehicle)
+    detail = {"note": found.note} if action == "note" else {"reason": found.hold_reason}
+    audit(connection, actor, f"{action} spacecraft", f"{found.spacecraft_id} {found.instance}", detail)
+    publish(connection, HandoverChanged(**found.model_dump(include=set(HandoverChanged.model_fields))))
+    return found
+
+
+def is_held(connection: Connection, spacecraft_id: int, instance: str) -> bool:
+    """Return whether the telecommands of a spacecraft are on hold."""
+    asked = HandoverFilter(spacecraft_id=spacecraft_id, instance=instance)
+    return any(one.held_by is not None for one in store.list_handovers(connection, asked).items)
+
+
+def _require_not_held(connection: Connection, vehicle: int) -> None:
+    found = store.handover_of(connection, vehicle)
+    if found.held_by is not None:
+        raise Conflict(
+            f"spacecraft {found.spacecraft_id} ({found.instance}): on hold by {found.held_by} since {found.held}"
+            f"{f': {found.hold_reason}' if found.hold_reason else ''}"
+        )
 
 
 def are_unreported(connection: Connection, ids: Sequence[int]) -> bool:
@@ -299,6 +378,7 @@ def _release(connection: Connection, record: CommandRecord, actor: str) -> None:
 def _issued(connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]) -> CommandOctets:
     """Return the octets of a telecommand with the next sequence count of its spacecraft."""
     count = next_telecommand(connection, vehicle) % SEQUENCE_COUNT_LIMIT
+    _require_not_held(connection, vehicle)
     return CommandOctets(count, _packed(name, arguments, count))
 
 

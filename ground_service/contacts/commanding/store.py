@@ -13,9 +13,12 @@ from ground_service.contacts.commanding.model import (
     CommandOctets,
     CommandRecord,
     CommandView,
+    Handover,
+    HandoverFilter,
     TelecommandFilter,
     UplinkChannel,
 )
+from ground_service.http.model import PageOf
 from ground_service.ingest.redecode import readable_version
 from ground_service.store import repository
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
@@ -23,6 +26,7 @@ from ground_service.store.vehicles import get_vehicle
 from lunar.constants import NANOSECONDS_PER_SECOND
 
 TELECOMMANDS, VERIFICATIONS = TELECOMMAND.table, repository.SAMPLES["verifications"]
+HANDOVERS = repository.HANDOVERS
 
 SEARCHED_INGESTS = 200
 """Number of newest ingests that are searched for channels: some contain no frames of a channel."""
@@ -75,6 +79,47 @@ def release(
     """
     values = _issued(issued, actor, now_utc_ns)
     move(connection, TELECOMMAND, command_id, "released", expected=("queued",), **values)
+
+
+def list_handovers(connection: Connection, asked: HandoverFilter) -> PageOf[Handover]:
+    """List the notes of the last shift and the holds, by spacecraft."""
+    vehicles = repository.VEHICLES
+    query = select(HANDOVERS, vehicles.c.ccsds_id, vehicles.c.instance).join(vehicles)
+    if asked.spacecraft_id is not None:
+        query = query.where(vehicles.c.ccsds_id == asked.spacecraft_id)
+    if asked.instance is not None:
+        query = query.where(vehicles.c.instance == asked.instance)
+    rows, total = repository.page(connection, query, asked, vehicles.c.ccsds_id, vehicles.c.instance)
+    return asked.page((Handover.of(row, spacecraft_id=row["ccsds_id"]) for row in rows), total)
+
+
+def handover_of(connection: Connection, vehicle: int) -> Handover:
+    """Return note and hold of a vehicle."""
+    one = get_vehicle(connection, vehicle)
+    row = repository.find(connection, HANDOVERS, vehicle_id=vehicle) or {}
+    return Handover.of(row, spacecraft_id=one.ccsds_id, instance=one.instance)
+
+
+def note_handover(connection: Connection, vehicle: int, note: str, *, actor: str, now_utc_ns: int) -> None:
+    """Replace the note of a vehicle."""
+    repository.add_new(connection, HANDOVERS, vehicle_id=vehicle, note="", hold_reason="")
+    repository.change(connection, HANDOVERS, vehicle, note=note, noted_by=actor, noted_utc_ns=now_utc_ns)
+
+
+def set_hold(
+    connection: Connection,
+    vehicle: int,
+    *,
+    actor: str | None,
+    reason: str = "",
+    now_utc_ns: int | None = None,
+) -> bool:
+    """Hold a vehicle, or end its hold if `actor` is None; return whether this has changed anything."""
+    repository.add_new(connection, HANDOVERS, vehicle_id=vehicle, note="", hold_reason="")
+    before = HANDOVERS.c.held_by.is_not(None) if actor is None else HANDOVERS.c.held_by.is_(None)
+    values = {"held_by": actor, "held_utc_ns": now_utc_ns, "hold_reason": reason}
+    changed = update(HANDOVERS).where(HANDOVERS.c.vehicle_id == vehicle, before).values(**values)
+    return connection.execute(changed).rowcount == 1
 
 
 def reject(connection: Connection, command_id: int, *, actor: str, reason: str, now_utc_ns: int) -> None:

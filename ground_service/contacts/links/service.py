@@ -103,7 +103,7 @@ def request_send(ground: Ground, name: str, *, actor: str) -> LinkStatus:
     NotFound
         There is no such link.
     Conflict
-        It has no uplink, or no process operates it.
+        It has no uplink, no process operates it, or its spacecraft is on hold.
     """
     with ground.database.writing() as connection:
         declared = _find(connection, name)
@@ -114,6 +114,8 @@ def request_send(ground: Ground, name: str, *, actor: str) -> LinkStatus:
             raise Conflict(
                 f"link {name}: expected a process that operates it ('linna serve' or 'linna link run'), found none"
             )
+        if commanding.is_held(connection, declared.spacecraft_id, declared.link.instance):
+            raise Conflict(f"link {name}: spacecraft {declared.spacecraft_id} is on hold")
         store.request_send(connection, name)
         audit(connection, actor, "send link", name, {})
         return _link(connection, declared)
@@ -367,7 +369,8 @@ def send_due(ground: Ground, name: str) -> SendDue:
     with ground.database.reading() as connection:
         found = store.find_link(connection, name)
         pending = bool(store.pending_transmissions(connection, name))
-    if found is None:
+        held = found is not None and commanding.is_held(connection, found.ccsds_id, found.instance)
+    if found is None or held:
         return SendDue(requested=False, request=0, pending=pending)
     return SendDue(found.send_requested > found.send_done, found.send_requested, pending)
 
@@ -390,6 +393,8 @@ def take_transmissions(ground: Ground, declared: DeclaredLink, owner: str) -> li
     """Take the released telecommands for a link that `owner` has; return all its pending transmissions, in order."""
     name = declared.link.name
     with ground.database.reading() as connection:
+        if commanding.is_held(connection, declared.spacecraft_id, declared.link.instance):
+            return []
         if not _unsent(connection, declared):
             return store.pending_transmissions(connection, name)
     with ground.database.writing() as connection:

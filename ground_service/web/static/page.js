@@ -100,6 +100,17 @@ export function notice(text, kind = "good") {
   if (kind === "good") setTimeout(() => shown.remove(), 8000);
 }
 
+// Ask before something leaves the service: the lines say what. True if the person confirms.
+export function confirmed(title, lines, deed) {
+  const dialog = byId("confirm");
+  byId("confirm-title").textContent = title;
+  byId("confirm-deed").textContent = deed;
+  show("confirm-text", lines.map((line) => element("p", {}, line)));
+  dialog.returnValue = "";
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "confirmed"), { once: true }));
+}
+
 export const trouble = (error) => notice(error.message, "bad");
 
 // A listener whose failure is told, and which keeps its button from being pressed twice. A disabled button loses the focus.

@@ -255,7 +255,7 @@ function showChosen() {
   const path = `windows/${row.id}`;
   const deeds = {
     draft: [deed("Approve", () => send("PATCH", path, { state: "approved" }), "primary"), deed("Delete", () => send("DELETE", path))],
-    approved: [deed("Uplink", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
+    approved: [row.telecommands.length ? element("span", {}, "Its telecommands are released. ", element("a", { href: "/" }, "Send them")) : deed("Uplink", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
   }[row.state] ?? [];
   const span = (value, unit) => (value ? `${figure(value.min)} to ${figure(value.max)} ${unit}` : "–");
   const predicted = row.predicted ?? {};

@@ -296,6 +296,7 @@ def test_a_telecommand_that_the_dictionary_refuses_is_told(page):
 
 def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     settled(page, "/")
+    page.get_by_text("Upload a downlink or an ephemeris").click()
     page.locator("#file").set_input_files(day_of_orbits)
     page.locator("#kind").select_option("ephemerides")
     page.get_by_role("button", name="Upload").click()
@@ -315,8 +316,19 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
 
     page.get_by_role("button", name="Approve").click()
     expect(page.locator("#selected")).to_contain_text("approved")
-    page.get_by_role("button", name="Uplink").click()
+    settled(page, "/")
+    row = page.locator(".craft tbody tr", has=page.get_by_role("button", name=re.compile("^Release ")))
+    expect(row).to_contain_text("waits for the release of its telecommands")
+    row.get_by_role("button").click()
+    question = page.get_by_role("dialog", name=re.compile("^Release the telecommands of"))
+    question.get_by_role("button", name="Cancel").click()
+    row.get_by_role("button").click()
+    question.get_by_role("button", name="Release", exact=True).click()
     expect(page.locator("#notices")).to_contain_text("telecommands released")
+    settled(page, "/planner")
+    page.locator("#timeline .window.approved").click()
+    expect(page.locator("#selected")).to_contain_text("Its telecommands are released.")
+    expect(page.get_by_role("button", name="Uplink")).to_be_hidden()
     settled(page, "/commands")
     expect(page.locator("#commands tbody tr", has_text="insert activity").first).to_contain_text("released")
 

@@ -33,14 +33,14 @@ def test_the_navigation_of_a_telephone_is_one_button_until_it_is_opened(page):
     page.set_viewport_size({"width": 390, "height": 844})
     settled(page, "/planner")
     assert page.locator("header").bounding_box()["height"] < 100.0
-    link = page.get_by_role("link", name="Telemetry")
+    link = page.get_by_role("link", name="Payload")
     expect(link).to_be_hidden()
     page.get_by_role("button", name="Menu").press("Enter")
     link.click()
     expect(page).to_have_url(re.compile("/telemetry"))
     page.set_viewport_size({"width": 1280, "height": 844})
     expect(page.get_by_role("button", name="Menu")).to_be_hidden()
-    expect(page.get_by_role("link", name="Planner")).to_be_visible()
+    expect(page.get_by_role("link", name="Plan", exact=True)).to_be_visible()
 
 
 def test_zoom_and_charts_are_in_the_address(page):
@@ -243,6 +243,9 @@ def test_no_button_that_a_viewer_sees_is_refused(signed_in):
         assert page.evaluate("window.refused") == [], (path, pressed)
         total += len(pressed)
     assert total > 20
+    page.goto("/status")
+    expect(page.locator("#user")).to_have_text("viewer, viewer")
+    expect(page.get_by_role("link", name="Licences")).to_be_visible()
     expect(page.get_by_role("link", name="Audit")).to_be_hidden()
     expect(page.get_by_role("link", name="Users")).to_be_hidden()
     page.goto("/users")

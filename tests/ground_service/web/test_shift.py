@@ -275,18 +275,37 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     dismiss_notices(page)
     pictures.take(page, "planner")
 
-    # Approve and release.
-    page.locator("#selected").get_by_role("button", name="Approve").click()
-    page.locator("#selected").get_by_role("button", name="Uplink").click()
-    expect(page.locator("#notices")).to_contain_text("telecommands released")
-
-    # Send, and follow the verification.
+    # Nothing is released while the spacecraft is on hold, not even by the planner.
     spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=21.5)
+    page.goto("/")
+    craft = page.get_by_role("region", name="Spacecraft 76 flight")
+    craft.get_by_label("Reason of the hold").fill("antenna is being repaired")
+    craft.get_by_role("button", name="Hold").click()
+    expect(craft).to_contain_text("On hold by ann since")
+    window = craft.locator("tbody tr", has_text="low Sun").first
+    expect(window).to_contain_text("waits for approval")
+    window.get_by_role("button", name=re.compile("^Approve")).click()
+    expect(window).to_contain_text("waits for the release of its telecommands")
+    page.reload()
+    expect(craft).to_contain_text("On hold by ann since")
+    craft.get_by_role("button", name="Resume").click()
+
+    # The page says what is released and what is sent before it does so.
+    window.get_by_role("button", name=re.compile("^Release")).click()
+    page.get_by_role("dialog", name=re.compile("^Release")).get_by_role("button", name="Release").click()
+    expect(window).to_contain_text("waits for transmission")
     page.goto("/commands")
-    row = page.locator("#links tbody tr", has_text="madrid")
-    expect(row.get_by_role("button", name="Send now")).to_be_enabled()
     pictures.take(page, "links", "section[aria-labelledby=links-title]")
-    row.get_by_role("button", name="Send now").click()
+    page.goto("/")
+    window.get_by_role("button", name=re.compile("^Send")).click()
+    question = page.get_by_role(
+        "dialog", name=re.compile(r"^Send \d+ telecommands over (madrid|canberra) now\?$")
+    )
+    expect(question).to_contain_text("insert activity")
+    question.get_by_role("button", name="Send").click()
+    expect(window.locator(".chain .now")).to_have_text("executed")  # all telecommands are verified
+    expect(window).to_contain_text("begins in")
+    page.goto("/commands")
     # The planner uplinks approved windows that begin soon: the page has the name that the service recorded.
     recorded = json.loads(page.request.get("/api/v1/telecommands?limit=100").body())["items"]
     (decider,) = {one["decided_by"] for one in recorded if one["name"] == "insert_activity"}
@@ -371,10 +390,15 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     expect(verdict.locator(".reasons li").first).to_contain_text("exit")
     pictures.take(page, "regression")
 
-    # The state of everything at a glance.
+    # Hand over: one page shows windows, alarms, verdicts and the note.
     page.goto("/")
-    expect(page.locator("#alarms tbody tr, #alarms .hint").first).to_be_visible()
+    craft.get_by_label("Note for the next shift").fill("Camera fault acknowledged; watch the temperature.")
+    craft.get_by_role("button", name="Keep the note").click()
+    expect(craft).to_contain_text("by ann")
+    expect(craft.locator("section", has_text="Last verdicts")).to_contain_text("synthetic pass")
+    expect(craft.locator("section", has_text="Open alarms")).to_contain_text("temperature")
     expect(page.locator("#feed-light")).to_have_class("light on")
+    dismiss_notices(page)
     pictures.take(page, "overview")
 
     # Sign out: the next request needs a sign-in.

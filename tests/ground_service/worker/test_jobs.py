@@ -93,7 +93,7 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
     job, other = (enter_job(either, kind, {"pass_id": 1, "ingest_id": 1}) for kind in ("ingest", "report"))
     scheduler = Scheduler(either, InlineDispatcher(either), lambda: None, {"retention_days": 90})
     assert run_job(either, other).state == run_job(either, job).state == "failed"
-    assert "1 ingests have failed; repeat them on the overview." in complaints(read_condition(either, None))
+    assert "1 ingests have failed; repeat them on the page Shift." in complaints(read_condition(either, None))
     for attempt, minutes in enumerate(waits_min, start=1):
         for passed_min, attempts in ((minutes - 0.5, attempt), (minutes, attempt + 1)):
             since = utc_now_ns() - int(passed_min * 60e9)

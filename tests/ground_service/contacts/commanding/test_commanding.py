@@ -11,16 +11,21 @@ from sqlalchemy import select, update
 
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.core import SentCommand, VerificationReport, fate_of
-from ground_service.contacts.commanding.model import TelecommandFilter
+from ground_service.contacts.commanding.model import HandoverFilter, TelecommandFilter
 from ground_service.contacts.commanding.service import (
     enter_command,
     get_command,
+    hold_spacecraft,
     list_telecommands,
+    note_handover,
     note_timeouts,
     reject_command,
     release_command,
+    resume_spacecraft,
+    take_released,
     take_uplink,
 )
+from ground_service.contacts.commanding.store import list_handovers
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import read_events
 from ground_service.ground import Ground
@@ -670,3 +675,42 @@ def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
     row = get_command(ground, command).record
     assert row.sequence_count == 0
     assert row.octets == DICTIONARY.pack_command("test_connection", {}, sequence_count=0)
+
+
+def test_nothing_is_released_or_sent_while_a_spacecraft_is_on_hold(either: Ground) -> None:
+    released, queued = entered(either), entered(either)
+    release_command(either, released, actor="ann")
+    held = hold_spacecraft(either, SPACECRAFT, "flight", reason="antenna", actor="bob")
+    assert (held.held_by, held.hold_reason) == ("bob", "antenna")
+    with pytest.raises(Conflict, match=r"spacecraft 76 \(flight\): on hold by bob since .*: antenna"):
+        release_command(either, queued, actor="ann")
+    with pytest.raises(Conflict, match="on hold by bob"):
+        take_uplink(either, spacecraft_id=SPACECRAFT, actor="ann")
+    with either.database.writing() as connection:
+        vehicle = get_command(either, released).record.vehicle_id
+        assert take_released(connection, vehicle, SPACECRAFT, framed=True, actor="link") == (b"", [])
+    with pytest.raises(Conflict, match="on hold by bob"):
+        hold_spacecraft(either, SPACECRAFT, "flight", reason="again", actor="ann")
+    assert resume_spacecraft(either, SPACECRAFT, "flight", actor="ann").held_by is None
+    release_command(either, queued, actor="ann")
+    assert take_uplink(either, spacecraft_id=SPACECRAFT, actor="ann")[1] == [released, queued]
+    with pytest.raises(Conflict, match="expected a hold, found none"):
+        resume_spacecraft(either, SPACECRAFT, "flight", actor="ann")
+
+
+def test_a_hold_keeps_the_note_and_a_note_keeps_the_hold(ground: Ground) -> None:
+    entered(ground)
+    note_handover(ground, SPACECRAFT, "flight", "camera warm", actor="ann")
+    hold_spacecraft(ground, SPACECRAFT, "flight", reason="antenna", actor="bob")
+    note_handover(ground, SPACECRAFT, "flight", "camera cold", actor="eva")
+    (found,) = ground.read(list_handovers, HandoverFilter(spacecraft_id=SPACECRAFT)).items
+    assert (found.note, found.noted_by, found.held_by, found.hold_reason) == (
+        "camera cold", "eva", "bob", "antenna",
+    )  # fmt: skip
+    assert ground.read(list_handovers, HandoverFilter(spacecraft_id=77)).items == []
+
+
+def test_telecommands_of_windows_are_listed(ground: Ground) -> None:
+    entered(ground)
+    assert ground.read(list_telecommands, TelecommandFilter(window_id=[1, 2])).items == []
+    assert len(ground.read(list_telecommands, TelecommandFilter()).items) == 1

@@ -15,7 +15,13 @@ import pytest
 from sqlalchemy import select
 
 from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.contacts.commanding.service import enter_command, get_command, release_command
+from ground_service.contacts.commanding.service import (
+    enter_command,
+    get_command,
+    hold_spacecraft,
+    release_command,
+    resume_spacecraft,
+)
 from ground_service.contacts.links import service, store
 from ground_service.contacts.links.runner import LinkRunner
 from ground_service.contacts.links.store import TransmissionRow
@@ -226,6 +232,29 @@ def test_manual_links_send_on_request_only(ground: Ground, station: Station, str
         assert get_command(ground, later[0]).state == "released"
     with pytest.raises(NotFound):
         service.request_send(ground, "other", actor="ann")
+
+
+def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(
+    either: Ground, station: Station, stream: bytes
+) -> None:
+    declare(either, station.link())
+    keys = released(either, 2)
+    declared = service.declared_links(either)["lab"]
+    assert service.acquire(either, declared, "dead", 1)
+    assert len(service.take_transmissions(either, declared, "dead")) == 1  # taken, and not on the wire
+    hold_spacecraft(either, 76, "flight", reason="antenna", actor="ann")
+    assert service.take_transmissions(either, declared, "dead") == []
+    with operated(either) as runner:
+        station.accept().sendall(stream[: 3 * CADU])
+        wait_for(lambda: service.get_link(either, "lab").state == "contact", "the contact")
+        steps(runner)
+        assert not station.telecommands
+        with pytest.raises(Conflict, match="link lab: spacecraft 76 is on hold"):
+            service.request_send(either, "lab", actor="ann")
+        resume_spacecraft(either, 76, "flight", actor="ann")
+        wait_for(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
+        )
 
 
 def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(

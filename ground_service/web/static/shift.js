@@ -1,0 +1,287 @@
+// The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
+import { finished, get, request, send } from "./api.js";
+import { chainOf, inTime } from "./chain.js";
+import { acting, byId, confirmed, element, figure, lengthText, missionNow, notice, parameterName, seconds, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+
+const OPEN = ["draft", "approved", "uplinked", "executing", "executed", "downlinked"];
+const SHOWN = 5;
+const DAY_S = 86400;
+
+const alarmName = (alarm) => parameterName(alarm.name, alarm.unit);
+const keyOf = (one) => `${one.spacecraft_id} ${one.instance}`;
+const mine = (list, craft) => list.filter((one) => one.spacecraft_id === craft.spacecraft_id && (one.instance ?? "flight") === craft.instance);
+const query = (craft) => `spacecraft/${craft.spacecraft_id}`;
+const instance = (craft) => `?instance=${encodeURIComponent(craft.instance)}`;
+const words = (name) => name.replaceAll("_", " ");
+
+const deed = (label, task, name = label) =>
+  element("button", { type: "button", "data-needs": "operator", "aria-label": name, onclick: acting(async () => { await task(); await load(); }) }, label);
+
+const number = (label, value, note) =>
+  element("div", {}, element("dt", {}, label), element("dd", { class: "number" }, value), element("dd", { class: "note" }, note));
+
+// The contact of a spacecraft now, otherwise the next one.
+function contactOf(craft, contacts) {
+  const now = missionNow();
+  const ahead = contacts.filter((one) => one.spacecraft_id === craft.spacecraft_id && (one.state === "open" || (one.state === "predicted" && seconds(one.stop) > now)));
+  return ahead.find((one) => one.state === "open") ?? ahead.sort((a, b) => seconds(a.start) - seconds(b.start))[0] ?? null;
+}
+
+function contactFigure(craft, data) {
+  const contact = contactOf(craft, data.contacts.contacts);
+  const reason = Object.values(data.contacts.unpredicted)[0];
+  if (!mine(data.links, craft).length) return number("Contact", "none", "the mission description declares no link");
+  if (!contact) return number("Contact", "none", reason ?? "no contact in the next two days");
+  const open = contact.state === "open";
+  const left = open ? contact.stop ?? contact.predicted_stop : contact.start;
+  return number("Contact", open ? "now" : inTime(contact.start), `${contact.station}${left ? `, ${open ? "to" : "at"} ${timeText(left).slice(5, 16)}` : ""}`);
+}
+
+function ageFigure(newest) {
+  const ages = newest.map((one) => one.age_s).filter((one) => one !== null);
+  return ages.length ? number("Age of data", lengthText(Math.min(...ages)), "newest telemetry") : number("Age of data", "none", "no telemetry received");
+}
+
+async function release(window) {
+  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, "Its telecommands are released; a link sends them in a contact or on request."];
+  if (!(await confirmed(`Release the telecommands of ${window.name}?`, lines, "Release"))) return;
+  const released = await send("POST", `windows/${window.id}/uplink`);
+  notice(`${window.name}: ${released.items.length} telecommands released`);
+}
+
+async function transmit(link, waiting) {
+  const lines = waiting.map((one) => `${one.id}  ${words(one.name)}${one.window_id ? `, window ${one.window_id}` : ""}`);
+  if (!(await confirmed(`Send ${lines.length} telecommands over ${link.name} now?`, lines, "Send"))) return;
+  await send("POST", `links/${encodeURIComponent(link.name)}/send`);
+  notice(`Link ${link.name} sends what is released.`);
+}
+
+function continuation(window, chain, craft, data) {
+  const named = (label) => `${label} ${window.name}`;
+  if (chain.waiting === "approved") return deed("Approve", () => send("PATCH", `windows/${window.id}`, { state: "approved" }), named("Approve"));
+  if (chain.waiting === "released") return deed("Release…", () => release(window), named("Release"));
+  if (chain.waiting === "sent") {
+    const links = mine(data.links, craft).filter((one) => one.uplink);
+    const next = contactOf(craft, data.contacts.contacts)?.link;
+    const link = links.find((one) => one.name === next) ?? links.find((one) => one.state !== "failed") ?? links[0];
+    const waiting = mine(data.released, craft).filter((one) => one.carrier_id === null).reverse();
+    return link ? deed("Send now…", () => transmit(link, waiting), named("Send")) : element("a", { href: "/commands" }, "Commands");
+  }
+  if (chain.waiting === "reported" && window.pass_id) return deed("Make a report", () => send("POST", `passes/${window.pass_id}/reports`), named("Report"));
+  return window.pass_id ? element("a", { href: `/passes/${window.pass_id}` }, "Pass") : element("a", { href: `/planner?window=${window.id}` }, "Plan");
+}
+
+function chainLights(chain) {
+  const reached = chain.steps.filter((one) => one.state === "on").map((one) => one.step);
+  return element(
+    "ol",
+    { class: "chain", "aria-label": `reached: ${reached.join(", ")}` },
+    chain.steps.map((one) => element("li", { class: one.state, title: `${one.step}${one.note ? `, ${one.note}` : ""}` }, one.step)),
+  );
+}
+
+function windowsOf(craft, data) {
+  const contact = contactOf(craft, data.contacts.contacts);
+  const rows = mine(data.windows, craft)
+    .sort((a, b) => seconds(a.start) - seconds(b.start))
+    .filter((one) => seconds(one.start) < missionNow() + DAY_S)
+    .map((window) => ({ window, chain: chainOf(window, data.telecommands.filter((one) => one.window_id === window.id), contact) }));
+  const hidden = rows.length - SHOWN;
+  return [
+    table(
+      "Windows of the next day",
+      [
+        ["Window", ({ window }) => element("a", { href: `/planner?window=${window.id}` }, window.name)],
+        ["Start", ({ window }) => timeText(window.start).slice(5, 16)],
+        ["Chain", ({ chain }) => [chainLights(chain), element("span", { class: "note" }, chain.text)]],
+        ["", ({ window, chain }) => continuation(window, chain, craft, data)],
+      ],
+      rows.slice(0, SHOWN),
+      "No window begins within a day.",
+    ),
+    hidden > 0 ? element("p", { class: "hint" }, `${hidden} more in the `, element("a", { href: "/planner" }, "planner"), ".") : null,
+  ];
+}
+
+function alarmsOf(craft, data) {
+  const open = mine(data.alarms, craft).filter((one) => one.state !== "shelved");
+  const acknowledge = (row) => (row.state === "raised" ? deed("Acknowledge", () => send("POST", `alarms/${row.id}/acknowledge`, {}), `Acknowledge ${alarmName(row)}`) : `by ${row.acknowledged_by}`);
+  return table(
+    "Open alarms",
+    [
+      ["Alarm", (row) => element("a", { href: `/alarms?alarm=${row.id}` }, alarmName(row))],
+      ["Since", (row) => timeText(row.first).slice(5, 16)],
+      ["Severity", (row) => stateMark(row.severity)],
+      ["", acknowledge],
+    ],
+    open.slice(0, SHOWN),
+    "None.",
+  );
+}
+
+function verdictsOf(craft, data) {
+  return table(
+    "Last verdicts",
+    [
+      ["Pass", (row) => element("a", { href: `/passes/${row.id}` }, row.name)],
+      ["Verdict", (row) => { const found = data.reports.find((one) => one.pass_id === row.id); return found ? [stateMark(found.verdict_level), " ", element("span", { class: "note" }, found.verdict)] : "no report"; }],
+      ["", (row) => { const found = data.reports.find((one) => one.pass_id === row.id); return found ? element("a", { href: `/reports/${found.id}`, target: "_blank" }, "Report") : ""; }],
+    ],
+    data.passes.filter((one) => one.spacecraft_id === craft.spacecraft_id).slice(0, 3), // emulated and replayed ones too
+    "No pass yet: upload a downlink below, or use linna ingest.",
+  );
+}
+
+// The note, and what is switched off: the hold and shelved alarms.
+function handoverOf(craft, data) {
+  const found = mine(data.handovers, craft)[0] ?? { note: "", held_by: null };
+  const shelved = mine(data.alarms, craft).filter((one) => one.state === "shelved");
+  const note = element("textarea", { rows: 2, maxlength: 2000, "aria-label": `Note for the next shift, spacecraft ${keyOf(craft)}` }, found.note);
+  const overrides = [
+    found.held_by ? `hold by ${found.held_by} since ${timeText(found.held)}: ${found.hold_reason}` : null,
+    ...shelved.map((one) => `alarm ${alarmName(one)} shelved by ${one.shelved_by} until ${timeText(one.shelved_until)}`),
+  ].filter(Boolean);
+  return [
+    element(
+      "form",
+      { class: "handover", onsubmit: acting(async () => { await send("PUT", `${query(craft)}/handover${instance(craft)}`, { note: note.value }); notice("The note is kept."); await load(); }) },
+      note,
+      element("span", { class: "actions" }, element("button", { "data-needs": "operator" }, "Keep the note"), element("span", { class: "note" }, found.noted_by ? `${timeText(found.noted)} by ${found.noted_by}` : "no note yet")),
+    ),
+    element("p", { class: "hint" }, overrides.length ? "Overrides in force:" : "No override is in force."),
+    overrides.length ? element("ul", { class: "reasons" }, overrides.map((one) => element("li", {}, one))) : null,
+  ];
+}
+
+function holdOf(craft, data) {
+  const found = mine(data.handovers, craft)[0];
+  const path = `${query(craft)}/hold${instance(craft)}`;
+  if (found?.held_by) {
+    return element("p", { class: "conflicts held" }, element("strong", {}, "On hold"), ` by ${found.held_by} since ${timeText(found.held)}: ${found.hold_reason}. No telecommand is released or sent. `, deed("Resume", () => send("DELETE", path), `Resume ${keyOf(craft)}`));
+  }
+  const reason = element("input", { placeholder: "reason", required: true, maxlength: 500, "aria-label": `Reason of the hold, spacecraft ${keyOf(craft)}` });
+  return element(
+    "form",
+    { class: "hold", "data-needs": "operator", onsubmit: acting(async () => { await send("POST", path, { reason: reason.value }); await load(); }) },
+    reason,
+    element("button", { "aria-label": `Hold ${keyOf(craft)}` }, "Hold"),
+  );
+}
+
+function spacecraftOf(craft, data, newest) {
+  const next = mine(data.windows, craft).filter((one) => seconds(one.stop) > missionNow()).sort((a, b) => seconds(a.start) - seconds(b.start))[0];
+  const part = (heading, ...content) => element("section", {}, element("h3", {}, heading), ...content);
+  return element(
+    "section",
+    { class: "craft", "aria-label": `Spacecraft ${keyOf(craft)}` },
+    element("div", { class: "head" }, element("h2", {}, `Spacecraft ${craft.spacecraft_id}${craft.instance === "flight" ? "" : `, ${craft.instance}`}`), holdOf(craft, data)),
+    element(
+      "dl",
+      { class: "glance" },
+      contactFigure(craft, data),
+      next ? number("Next window", seconds(next.start) <= missionNow() ? "now" : inTime(next.start), next.name) : number("Next window", "none", "no window planned"),
+      ageFigure(newest),
+      number("Open alarms", String(mine(data.alarms, craft).filter((one) => one.state !== "shelved").length), "raised or acknowledged"),
+    ),
+    element(
+      "div",
+      { class: "columns shift" },
+      element("div", {}, part("Windows of the next day", ...windowsOf(craft, data))),
+      element("div", {}, part("Open alarms", alarmsOf(craft, data)), part("Last verdicts", verdictsOf(craft, data)), part("Handover", ...handoverOf(craft, data))),
+    ),
+  );
+}
+
+function repeatButton(row) {
+  return deed("Repeat", () => send("POST", `jobs/${row.id}/repeat`), `Repeat ${row.kind} of ${timeText(row.created)}`);
+}
+
+function showJobs(jobs) {
+  const running = jobs.filter((job) => ["queued", "running"].includes(job.state)).length;
+  const failed = jobs.filter((job) => job.state === "failed").length;
+  byId("jobs-count").textContent = `${running} under way, ${failed} of the latest failed`;
+  if (failed) byId("work").open = true;
+  show(
+    "jobs",
+    table(
+      "Jobs",
+      [
+        ["Job", (row) => row.kind],
+        ["Entered", (row) => timeText(row.created)],
+        ["State", (row) => (row.state === "running" ? element("progress", { max: 1, value: row.progress, "aria-label": row.kind }) : stateMark(row.state))],
+        ["", (row) => row.error ?? ""],
+        ["", (row) => (row.state === "failed" ? repeatButton(row) : "")],
+      ],
+      jobs,
+      "None.",
+    ),
+  );
+}
+
+let pressEnded = null;
+document.addEventListener("pointerdown", () => {
+  pressEnded = new Promise((resolve) => ["pointerup", "pointercancel"].forEach((name) => document.addEventListener(name, () => setTimeout(resolve), { once: true })));
+});
+
+async function load() {
+  const [spacecraft, windows, links, contacts, alarms, passes, handovers, released, jobs] = await Promise.all([
+    get("spacecraft"),
+    get("windows", { limit: 100, state: OPEN }),
+    get("links"),
+    get("contacts", { since: new Date(1000 * (missionNow() - 3600)).toISOString() }),
+    get("alarms", { limit: 50, state: ["raised", "acknowledged", "shelved"] }),
+    get("passes", { limit: 30 }),
+    get("handovers"),
+    get("telecommands", { limit: 200, state: "released" }),
+    get("jobs", { limit: 8 }),
+  ]);
+  const ids = windows.items.map((one) => one.id);
+  const passIds = passes.items.map((one) => one.id);
+  // The flown one of each spacecraft; a spacecraft of archives alone is shown in one of its instances. Flown ones come first.
+  const crafts = [...new Map(spacecraft.items.toReversed().map((one) => [one.spacecraft_id, one])).values()].reverse();
+  const [telecommands, reports, ...newest] = await Promise.all([
+    ids.length ? get("telecommands", { limit: 1000, window_id: ids }) : { items: [] },
+    passIds.length ? get("reports", { pass_id: passIds }) : { items: [] },
+    ...crafts.map((one) => get("parameters", { live: true, spacecraft_id: one.spacecraft_id, instance: one.instance }).then((answer) => answer.items)),
+  ]);
+  const data = { windows: windows.items, links: links.items, contacts, alarms: alarms.items, passes: passes.items, handovers: handovers.items, released: released.items, telecommands: telecommands.items, reports: reports.items };
+  await pressEnded; // a button that is drawn again while it is pressed is not clicked
+  show("spacecraft", crafts.length ? crafts.map((craft, index) => spacecraftOf(craft, data, newest[index])) : element("p", { class: "hint" }, "No spacecraft yet: register a mission description on the page ", element("a", { href: "/missions" }, "Missions"), ", or upload a downlink."));
+  showJobs(jobs.items);
+}
+
+byId("upload").addEventListener(
+  "submit",
+  acting(async () => {
+    const [file] = byId("file").files;
+    const kind = byId("kind").value;
+    const answer = await request(`${kind}?name=${encodeURIComponent(file.name)}`, {
+      method: "POST",
+      body: file,
+      headers: { "Content-Type": "application/octet-stream" },
+    });
+    const accepted = await answer.json();
+    if (kind === "telemetry") {
+      const bar = byId("upload-progress");
+      bar.hidden = false;
+      await finished(accepted.job_id, (job) => (bar.value = job.progress)).finally(() => (bar.hidden = true));
+      notice(`${file.name}: ingested`);
+    } else {
+      notice(`${file.name}: ${accepted.states} states from ${timeText(accepted.start)} to ${timeText(accepted.stop)}`);
+    }
+    await load();
+  }),
+);
+
+let pending = null;
+watch((message) => {
+  const text = Object.entries(message.payload)
+    .map(([key, value]) => `${words(key)} ${typeof value === "object" ? JSON.stringify(value) : value}`)
+    .join(", ");
+  byId("feed").prepend(element("li", { value: message.sequence }, `${timeText(message.time)} ${message.kind}: ${text}`));
+  while (byId("feed").children.length > 50) byId("feed").lastChild.remove();
+  clearTimeout(pending);
+  pending = setTimeout(() => load().catch(trouble), 400);
+}, load);
+
+load().catch((error) => error.status === 401 || trouble(error));
