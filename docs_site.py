@@ -149,7 +149,7 @@ def main(arguments: list[str]) -> int:
 
 
 def save_tour(folder: Path, out: Path) -> None:
-    """Save the pass and the report of a demo as PNG files, and with its text and the overview as an animation."""
+    """Save the pass and the report of a demo as PNG files, and with its text and the shift page as an animation."""
     from PIL import Image
 
     from benchmarks.pages import open_chromium, served
@@ -166,7 +166,7 @@ def save_tour(folder: Path, out: Path) -> None:
         page = browser.new_page(viewport={"width": 1200, "height": 800}, color_scheme="light")
         for name, address in (
             ("", "about:blank"),
-            ("overview", f"{url}/"),
+            ("shift", f"{url}/"),
             ("pass", f"{url}/passes/1"),
             ("report", report.resolve().as_uri()),
         ):

@@ -399,7 +399,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     expect(craft.locator("section", has_text="Open alarms")).to_contain_text("temperature")
     expect(page.locator("#feed-light")).to_have_class("light on")
     dismiss_notices(page)
-    pictures.take(page, "overview")
+    pictures.take(page, "shift")
 
     # Sign out: the next request needs a sign-in.
     page.locator("#caller").click()
