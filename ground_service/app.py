@@ -7,7 +7,7 @@ import json
 import logging
 import re
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from typing import Any
 
 from anyio import to_thread
@@ -25,6 +25,7 @@ from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
+from ground_service.missions.clocks import mission_clock
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis
@@ -89,6 +90,8 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         if inline_jobs or settings.resolved_broker_url() is None:
             app.state.dispatcher.resume()
         app.state.follow_up.drain()
+        clock = ExitStack()
+        clock.enter_context(mission_clock(ground))
         supervisor = LinkSupervisor(ground) if settings.links else None
         if supervisor is not None:
             supervisor.start()
@@ -118,6 +121,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
                 await asyncio.to_thread(supervisor.stop)
             await asyncio.to_thread(app.state.uploads.close)
             app.state.dispatcher.close()
+            clock.close()
             ground.close()
 
     app = DescribedApi(

@@ -1,8 +1,8 @@
 """Clocks of the service: the wall clock, and the mission time, which a simulated mission sets.
 
 The wall clock counts for leases, time-outs, tokens and the audit log. The mission time counts for everything that
-depends on the time at the spacecraft: contacts, plans, windows and the delays of automation. Outside of simulations it
-is the wall clock.
+depends on the time at the spacecraft: contacts, plans, windows and the delays of automation. A mission description can
+state its clock; otherwise it is the wall clock.
 """
 
 from __future__ import annotations
@@ -25,20 +25,29 @@ def utc_now_ns() -> int:
 
 @dataclass(slots=True)
 class _Source:
-    read: Callable[[], int] = field(default=utc_now_ns)
+    read: Callable[[], int] | None = None
+    stated: Callable[[], int] | None = None
 
 
 _mission = _Source()
 
 
 def mission_now_ns() -> int:
-    """Mission time: nanoseconds since 1970-01-01T00:00:00 UTC, the wall clock where no simulation sets it."""
-    return _mission.read()
+    """Mission time: nanoseconds since 1970-01-01T00:00:00 UTC.
+
+    That of a simulation, otherwise the clock that the mission descriptions in force state, otherwise the wall clock.
+    """
+    return (_mission.read or _mission.stated or utc_now_ns)()
 
 
 def set_mission_clock(read: Callable[[], int] | None = None) -> None:
-    """Take the mission time of this process from a function; None: from the wall clock."""
-    _mission.read = utc_now_ns if read is None else read
+    """Take the mission time of this process from a function, whatever is stated; None: no longer."""
+    _mission.read = read
+
+
+def follow_missions(stated: Callable[[], int] | None) -> None:
+    """Take the mission time of this process from a clock that mission descriptions state; None: none."""
+    _mission.stated = stated
 
 
 @dataclass(slots=True, eq=False)

@@ -376,6 +376,12 @@ class Operations(Connection):
     ) -> list[timekeeping.Correlation]:
         """Add time reports and correlate on-board time with UTC from them; the correlations then in force."""
 
+    @operation("DELETE /spacecraft/{spacecraft_id}/correlations")
+    def withdraw_correlations(
+        self, spacecraft_id: int, *, instance: str = "flight"
+    ) -> list[timekeeping.Correlation]:
+        """Withdraw correlations that were added by hand: those of the received time reports are in force again."""
+
     @operation("POST /spacecraft/{spacecraft_id}/correlations/run")
     def run_correlation(
         self, spacecraft_id: int, *, instance: str = "flight"

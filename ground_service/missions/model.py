@@ -157,6 +157,37 @@ class Link(FrameSettings):
     stations: dict[StationName, StationLink] | None = None
 
 
+def _utc(text: str) -> str:
+    try:
+        parse_utc(text)
+    except TimeFormatError as error:
+        raise ValueError(f"a time in UTC: {error}") from None
+    return text
+
+
+class MissionClock(Section):
+    """Clock of the mission time, at which plans, contacts and ages of values are counted.
+
+    Attributes
+    ----------
+    source
+        "wall": the time of day. "telemetry": it stands at the newest telemetry. "simulated": it was `mission` when the
+        time of day was `wall` (UTC), and `rate` seconds pass in a second.
+    """
+
+    source: Literal["wall", "telemetry", "simulated"]
+    mission: Annotated[str, AfterValidator(_utc)] | None = None
+    wall: Annotated[str, AfterValidator(_utc)] | None = None
+    rate: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _both_times(self) -> MissionClock:
+        stated = (self.mission is not None, self.wall is not None)
+        if stated != (self.source == "simulated",) * 2:
+            raise ValueError("mission and wall with a simulated clock, and with no other")
+        return self
+
+
 class Time(Section):
     """On-board time and its correlation with UTC."""
 
@@ -164,6 +195,7 @@ class Time(Section):
     ticks_per_second: int | None = None
     clock: str | None = None
     correlation: Literal["automatic", "manual", "ideal"] | None = None
+    mission_clock: MissionClock | None = None
 
 
 class Frames(Section):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Connection, func, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import NotFound
@@ -203,6 +203,14 @@ def mission_of_vehicle(connection: Connection, vehicle: int) -> Mission | None:
     key = connection.execute(query.order_by(table.c.id.desc()).limit(1)).scalar()
     key = in_force(connection, vehicle) if key is None else int(key)
     return None if key is None else get_mission(connection, key)
+
+
+def newest_ticks(connection: Connection, vehicle: int) -> int | None:
+    """Return the newest on-board time in the telemetry of a vehicle; None without any."""
+    table = repository.INGESTS
+    newest = select(func.max(table.c.last_ticks)).where(table.c.vehicle_id == vehicle)
+    found = connection.execute(newest).scalar()
+    return None if found is None else int(found)
 
 
 def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:

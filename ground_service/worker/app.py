@@ -20,6 +20,7 @@ from ground_service.errors import PASSING, SettingsError
 from ground_service.ground import Ground, ground_from_settings
 from ground_service.logs import logging_config
 from ground_service.memory import limit_heaps
+from ground_service.missions.clocks import read_mission_clock
 from ground_service.settings import Settings, start_tracing
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import run_job
@@ -139,7 +140,10 @@ def _key(settings: Settings) -> str:
 
 
 def _ground_of(settings: Settings) -> Ground:
-    """Return the service, opened once per process; jobs of its follow-up work go to all workers."""
+    """Return the service, opened once per process, with the mission time as stated now.
+
+    Jobs of its follow-up work go to all workers.
+    """
     key = _key(settings)
     if key not in _grounds:
         ground = ground_from_settings(settings)
@@ -150,6 +154,7 @@ def _ground_of(settings: Settings) -> Ground:
 
         follow_in_process(ground, start)
         _grounds[key] = ground
+    read_mission_clock(_grounds[key])
     return _grounds[key]
 
 

@@ -31,18 +31,19 @@ class Watch:
     _clock: int = 0
 
     def tick(self) -> None:
-        """Look at all spacecraft; raise alarms, or end their conditions."""
+        """Look at all spacecraft; raise alarms, or end their conditions.
+
+        A process that has just begun knows no ages: it raises nothing, and ends only what no longer holds.
+        """
         now = time.monotonic()
+        unknown = {"mission_time_stopped"} if self._clock == 0 else set()
         with self.ground.database.reading() as connection:
             spacecraft = set(missions_in_force(connection))
         self._since = {one: self._since.get(one, now) for one in self._conditions(spacecraft)}
         for number in spacecraft:
-            held = {
-                name
-                for (own, name), since in self._since.items()
-                if own == number and now - since >= self.holds_s
-            }
-            note_operations(self.ground, number, held)
+            mine = {name: since for (own, name), since in self._since.items() if own == number}
+            lasting = {name for name, since in mine.items() if now - since >= self.holds_s}
+            note_operations(self.ground, number, lasting, mine.keys() | unknown)
 
     def _conditions(self, spacecraft: Set[int]) -> Iterator[tuple[int, str]]:
         now, before = mission_now_ns(), self._clock

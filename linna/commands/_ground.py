@@ -50,12 +50,13 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
         import logging
 
         from ground_service.client.local import local_client
+        from ground_service.missions.clocks import read_mission_clock
 
         # The error of a failed job is that of the command, which prints it.
         logging.getLogger("ground_service.worker").setLevel(logging.ERROR)
-        return local_client(
-            open_ground_only(arguments), str(arguments.actor or local_actor()), background=background
-        )
+        ground = open_ground_only(arguments)
+        read_mission_clock(ground)
+        return local_client(ground, str(arguments.actor or local_actor()), background=background)
     from ground_service.client import Client
     from linna.errors import UsageError
 
@@ -105,10 +106,12 @@ def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
 
 def open_service(arguments: argparse.Namespace) -> Ground:
     """Return the opened service of this machine, which handles its events in this process."""
+    from ground_service.missions.clocks import read_mission_clock
     from ground_service.worker.follow_up import follow_in_process
 
     ground = open_ground_only(arguments)
     follow_in_process(ground)
+    read_mission_clock(ground)
     return ground
 
 

@@ -79,6 +79,11 @@ COMMANDS = {
         "fit the segments again from the received time reports; this replaces segments entered by hand",
         *SEGMENTS,
     ),
+    "withdraw": Command(
+        "withdraw_correlations",
+        "withdraw segments entered by hand; those of the received time reports are in force again",
+        *SEGMENTS,
+    ),
     "receptions": Command(
         _receptions,
         "enter reception times of time reports (CSV)",

@@ -72,7 +72,7 @@ COMMANDS = {
         "list passes, newest first",
         _line,
         "passes",
-        "no passes",
+        "no passes: telemetry alone makes none; a pass is a flown window, an imported archive, or a defined interval",
         _listed,
         options={
             "search": "part of the name",

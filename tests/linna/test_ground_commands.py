@@ -272,6 +272,7 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("correlate", "list", "--spacecraft-id", 76)
             ask("correlate", "residuals", "--spacecraft-id", 76)
             ask("correlate", "run", "--spacecraft-id", 76)
+            ask("correlate", "withdraw", "--spacecraft-id", 76)
             ask("correlate", "receptions", receptions, "--spacecraft-id", 76)
             ask("correlate", "receptions", mission, "--spacecraft-id", 76)
             ask("regress", "archive", "add", synthetic_archive)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from ground_service.access.security import Operator, Viewer
 from ground_service.http.common import GroundOf, Instance, SpacecraftId
 from ground_service.http.model import PageOf
-from ground_service.http.requests import operations
+from ground_service.http.requests import operations, problems
+from ground_service.missions.timekeeping import service
 from ground_service.missions.timekeeping.model import Correlation, Receptions, TimePoints, TimeReport
 from ground_service.missions.timekeeping.recorrelation import enter_receptions, received_reports
 from ground_service.missions.timekeeping.service import (
@@ -42,6 +43,18 @@ def add_correlations(
         for one in given.points
     ]
     return PageOf.all_of(correlate_spacecraft(ground, spacecraft_id, instance, points, actor=caller.name))
+
+
+@timekeeping.delete("/spacecraft/{spacecraft_id}/correlations", responses=problems(409))
+def withdraw_correlations(
+    ground: GroundOf, caller: Operator, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> PageOf[Correlation]:
+    """Withdraw correlations that were added by hand: those of the received time reports are in force again.
+
+    The withdrawn ones stay in the list.
+    """
+    found = service.withdraw_correlations(ground, spacecraft_id, instance, actor=caller.name)
+    return PageOf.all_of(found)
 
 
 @timekeeping.post("/spacecraft/{spacecraft_id}/correlations/run")

@@ -13,7 +13,7 @@ import numpy as np
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput
+from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import CorrelationChanged, publish
 from ground_service.ground import Ground
 from ground_service.missions.timekeeping import store
@@ -90,6 +90,33 @@ def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor:
     if recorrelate(ground, vehicle, over_manual=True):
         with ground.database.writing() as connection:
             audit(connection, actor, "correlate time", str(vehicle), {"from": "time reports"})
+    return in_force(ground, vehicle)
+
+
+def withdraw_correlations(
+    ground: Ground, spacecraft_id: int, instance: str, *, actor: str
+) -> list[Correlation]:
+    """Withdraw the correlations in force that a person entered, and correlate again; the correlations then in force.
+
+    The withdrawn ones stay on record.
+
+    Raises
+    ------
+    Conflict
+        None in force was entered by a person.
+    """
+    vehicle = _vehicle(ground, spacecraft_id, instance)
+    with ground.database.writing() as connection:
+        lock_vehicle(connection, vehicle)
+        entered = [one.id for one in store.correlations_in_force(connection, vehicle) if one.method == MANUAL]
+        if not entered:
+            raise Conflict(
+                f"spacecraft {spacecraft_id}: expected correlations in force that a person entered, found none"
+            )
+        store.replace_correlations(connection, vehicle, (), method=MANUAL, now_utc_ns=utc_now_ns())
+        audit(connection, actor, "withdraw correlations", str(vehicle), {"ids": entered})
+        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=0))
+    recorrelate(ground, vehicle)
     return in_force(ground, vehicle)
 
 

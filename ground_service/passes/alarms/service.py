@@ -143,13 +143,14 @@ def shelve_alarm(
         return get_alarm(connection, alarm_id)
 
 
-def note_operations(ground: Ground, spacecraft_id: int, names: Set[str]) -> None:
-    """Raise the alarms of conditions that stop the operation of a spacecraft, and end those of others."""
+def note_operations(ground: Ground, spacecraft_id: int, lasting: Set[str], holding: Set[str]) -> None:
+    """Raise the alarms of lasting conditions that stop operations, and end those whose conditions hold no more."""
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, spacecraft_id, FLOWN)
         lock_vehicle(connection, vehicle)
         rows = store.open_alarms(connection, vehicle)
         known = {row.name for row in rows if row.source == core.OPERATIONS and row.active}
+        names = lasting | (known & holding)
         if known != names:
             ticks = ticks_of_utc_ns(mission_now_ns(), load_correlations(connection, vehicle))
             new = sorted(names - known)

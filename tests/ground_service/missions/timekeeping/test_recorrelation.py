@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
-from ground_service.errors import InvalidInput
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
+from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
@@ -30,6 +32,7 @@ from ground_service.missions.timekeeping.service import (
     correlate,
     correlate_again,
     correlations_on_record,
+    withdraw_correlations,
 )
 from ground_service.passes.service import define_pass, list_events
 from ground_service.worker.follow_up import follow_in_process
@@ -199,6 +202,24 @@ def test_what_an_operator_entered_stays_until_asked_otherwise(
     correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
     assert [row.points for row in receive(ground, spacecraft.reports)] == [1]
     assert len(correlate_again(ground, SPACECRAFT, "flight", actor="ann")) == 2
+
+
+def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
+    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
+) -> None:
+    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    fitted = [row.id for row in receive(ground, spacecraft.reports)]
+    with pytest.raises(Conflict, match="expected correlations in force that a person entered, found none"):
+        withdraw_correlations(ground, SPACECRAFT, "flight", actor="ann")
+    correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
+    (entered,) = in_force(ground, vehicle)
+    left = withdraw_correlations(ground, SPACECRAFT, "flight", actor="ann")
+    assert [row.points for row in left] == [15, 15]
+    record = {row.id: row.in_force for row in correlations_on_record(ground, vehicle)}
+    assert record == dict.fromkeys((*fitted, entered.id), False) | {one.id: True for one in left}
+    with ground.database.reading() as connection:
+        trace = list_audit(connection, AuditFilter(action="withdraw correlations")).items
+    assert [(one.actor, one.detail) for one in trace] == [("ann", {"ids": [entered.id]})]
 
 
 def test_an_earlier_reception_of_the_same_report_counts(

@@ -262,7 +262,20 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
             moment += 2 * 86_400 * 10**9
             watch.tick()
             assert any(one.name == "report_overdue" and one.active for one in alarms(ground))
-            Watch(ground).tick()  # nothing has lasted for long
+            before = {one.name for one in alarms(ground) if one.active}
+            Watch(ground).tick()  # another process, which knows no ages
+            assert {one.name for one in alarms(ground) if one.active} == before >= {"no_link", "plan_empty"}
+            watch.tick()  # no time has passed since
+            other = Watch(ground)
+            other.tick()
+            assert any(one.name == "mission_time_stopped" and one.active for one in alarms(ground))
+            with ground.database.writing() as connection:
+                repository.change(connection, repository.WINDOWS, window, state="processed")
+                repository.change(connection, repository.STANDING_REQUESTS, 1, state="ended")
+            ended = text.replace('[[links]]\nname = "lab"\nkind = "tcp"\nuplink = "127.0.0.1:9"\n', "")
+            assert ended != text
+            add_mission(ground, ended.encode())
+            other.tick()
             assert not any(one.active for one in alarms(ground))
     finally:
         set_mission_clock()

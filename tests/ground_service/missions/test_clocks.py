@@ -1,0 +1,122 @@
+"""Mission time from the descriptions in force, in every form of the service."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.app import create_app
+from ground_service.clock import follow_missions, mission_now_ns, set_mission_clock
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground
+from ground_service.missions import clocks
+from ground_service.missions.clocks import mission_clock, read_mission_clock
+from ground_service.missions.model import parse_mission
+from ground_service.missions.service import add_mission
+from ground_service.settings import Settings
+from ground_service.worker.app import _ground_of
+from lunar.timescales import format_utc, parse_utc
+from tests.serving import TestClient, wait_for
+
+YEAR_2029 = parse_utc("2029-08-07T06:00:00Z")
+TEXT = """
+name = "{name}"
+[spacecraft]
+id = {number}
+[time]
+mission_clock = {{ {clock} }}
+"""
+
+
+def simulated(rate: float = 1.0) -> str:
+    wall = format_utc(time.time_ns())
+    return f'source = "simulated", mission = "2029-08-07T06:00:00Z", wall = "{wall}", rate = {rate}'
+
+
+def state(ground: Ground, clock: str, number: int = 76) -> None:
+    add_mission(ground, TEXT.format(name=f"m{number}", number=number, clock=clock).encode())
+
+
+@pytest.fixture(autouse=True)
+def _wall_clock_again() -> Any:
+    yield
+    follow_missions(None)
+    set_mission_clock(None)
+
+
+def seconds_after_start() -> float:
+    return (mission_now_ns() - YEAR_2029) / 1e9
+
+
+def test_a_simulated_clock_runs_at_its_rate(ground: Ground) -> None:
+    state(ground, simulated(rate=1000.0))
+    read_mission_clock(ground)
+    first = seconds_after_start()
+    time.sleep(0.05)
+    assert 50.0 <= seconds_after_start() - first < 60_000.0
+
+
+def test_a_stated_clock_is_behind_that_of_a_simulation_and_ends_with_the_description(ground: Ground) -> None:
+    state(ground, simulated())
+    set_mission_clock(lambda: 7)
+    read_mission_clock(ground)
+    assert mission_now_ns() == 7
+    set_mission_clock(None)
+    assert abs(seconds_after_start()) < 600.0
+    state(ground, 'source = "wall"')
+    read_mission_clock(ground)
+    assert abs(mission_now_ns() - time.time_ns()) < 600e9
+
+
+def test_the_clock_of_telemetry_stands_at_the_newest(ground: Ground, synthetic_pass: Any) -> None:
+    state(ground, 'source = "telemetry"')
+    read_mission_clock(ground)
+    assert abs(mission_now_ns() - time.time_ns()) < 600e9  # no telemetry yet
+    with TestClient(create_app(Settings(home=ground.home), inline_jobs=True)) as client:
+        octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
+        client.post("/api/v1/telemetry", content=octets)
+        read_mission_clock(ground)
+        last = synthetic_pass.utc_ns[-1]
+        assert 0 <= mission_now_ns() - last < 1e9
+        assert parse_utc(client.get("/api/v1/session").json()["time"]) // 1000 == mission_now_ns() // 1000
+        assert {
+            one["age_s"] < 600.0 for one in client.get("/api/v1/parameters?spacecraft_id=76").json()["items"]
+        } == {True}
+
+
+def test_several_stated_clocks_are_none(ground: Ground, caplog: pytest.LogCaptureFixture) -> None:
+    state(ground, simulated())
+    state(ground, 'source = "telemetry"', number=77)
+    read_mission_clock(ground)
+    assert abs(mission_now_ns() - time.time_ns()) < 600e9
+    assert "several mission clocks" in caplog.text
+
+
+def test_a_running_service_takes_a_new_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clocks, "REFRESH_S", 0.05)
+    with TestClient(create_app(Settings(home=tmp_path))) as client:
+        state(client.app.state.ground, simulated())
+        wait_for(lambda: abs(seconds_after_start()) < 600.0, "mission time in 2029")
+        assert client.get("/api/v1/session").json()["time"].startswith("2029-08-07T06:")
+    assert abs(mission_now_ns() - time.time_ns()) < 600e9  # the service has ended
+
+
+def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground: Ground) -> None:
+    state(ground, simulated())
+    _ground_of(Settings(home=ground.home))
+    assert abs(seconds_after_start()) < 600.0
+    follow_missions(None)
+    with mission_clock(ground):
+        assert abs(seconds_after_start()) < 600.0
+
+
+@pytest.mark.parametrize(
+    "clock",
+    ['source = "simulated"', 'source = "wall", mission = "2029-08-07T06:00:00Z"', 'source = "moon"'],
+)
+def test_an_incomplete_clock_is_refused(clock: str) -> None:
+    with pytest.raises(InvalidInput, match="mission_clock"):
+        parse_mission(TEXT.format(name="m", number=1, clock=clock))
