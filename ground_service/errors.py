@@ -29,14 +29,17 @@ GroundError
 from __future__ import annotations
 
 import errno
+import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"]*")
 _PATH = re.compile(r"(?<![\w./])/(?:[^\s/'\",;:()]+/)+([^\s/'\",;:()]*)")
 PUBLIC_LIMIT = 500
+_log = logging.getLogger(__name__)
 
 
 class GroundError(Exception):
@@ -239,6 +242,23 @@ def storage_error(error: OSError, where: Path | str) -> GroundError:
     if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
         return StorageReadOnly(str(where), error.strerror or "read-only")
     return StoreError(f"{where}: {error.strerror or error}")
+
+
+@contextmanager
+def fault_of(work: str, *, passing: tuple[type[Exception], ...] = PASSING) -> Iterator[list[str]]:
+    """Run one of many pieces of work, none of which a fault of another one stops: the outermost loop of the work.
+
+    A fault is logged, with a traceback if it is unexpected, and its text is in the yielded list after the block. Errors
+    of the kinds `passing` are raised.
+    """
+    found: list[str] = []
+    try:
+        yield found
+    except passing:
+        raise
+    except Exception as error:
+        _log.error("%s: failed: %s", work, error, exc_info=not isinstance(error, GroundError))
+        found.append(public_text(error))
 
 
 def public_text(error: BaseException) -> str:

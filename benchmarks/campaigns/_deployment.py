@@ -27,12 +27,6 @@ def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> 
     raise SystemExit(f"{what}: not ready within {seconds:.0f} s")
 
 
-def connected(port: int) -> bool:
-    """Whether somebody is connected to a port of this machine, by what the kernel says."""
-    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-    return any(row[1].endswith(f":{port:04X}") and row[3] == "01" for row in rows)
-
-
 def service_environment(**settings: str) -> dict[str, str]:
     """Return the environment of a service whose role owns the database."""
     return bare_environment(LINNA_ALLOW_DATABASE_OWNER="true", **settings)
@@ -71,7 +65,6 @@ class Deployment:
         folder: Path,
         apis: int = 1,
         *,
-        schedulers: int = 0,
         database_settings: Mapping[str, str] | None = None,
         **settings: str,
     ) -> None:
@@ -100,10 +93,6 @@ class Deployment:
             for number in (1, 2):
                 log = folder / f"worker{number}.log"
                 self._add(f"worker {number}", Part([*linna, "worker"], log, lambda: True, env=environment))
-            for number in range(1, schedulers + 1):
-                log = folder / f"scheduler{number}.log"
-                part = Part([*linna, "scheduler"], log, lambda: True, env=environment)
-                self._add(f"scheduler {number}", part)
         except BaseException:
             self.stop()
             raise

@@ -6,6 +6,7 @@ import hashlib
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders, State
+from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -80,7 +81,7 @@ class BodyLimit:
 
         try:
             await self._app(scope, counted, watched)
-        except Exception:  # an application that got half of a body may fail in any way
+        except ClientDisconnect:  # of an application that was refused the rest of the body
             if refusal is None:
                 raise
         finally:

@@ -14,11 +14,11 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import (
-    PASSING,
     EvaluationError,
     GroundError,
     InvalidInput,
     StateConflict,
+    fault_of,
     public_text,
 )
 from ground_service.evaluation.landmarks.service import update_landmarks
@@ -122,17 +122,9 @@ def _run_attempts(ground: Ground, action: AutomationAction) -> str:
 
 def _run_one(ground: Ground, action: AutomationAction) -> str | None:
     """Run one action and record its success; return None, or why it failed."""
-    try:
+    with fault_of(f"automation action {action.id} ({action.action})") as faults:
         _end(ground, action, "done", result=DOING[action.action](ground, action))
-        return None
-    except PASSING:
-        raise
-    except GroundError as error:
-        log.warning("automation action %d (%s) failed: %s", action.id, action.action, error)
-        return public_text(error)
-    except Exception as error:  # one faulty action must not stop those of other rules
-        log.exception("automation action %d (%s): unexpected error", action.id, action.action)
-        return public_text(error)
+    return faults[0] if faults else None
 
 
 def _give_up(ground: Ground, action: AutomationAction, error: str) -> None:

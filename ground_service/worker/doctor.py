@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
+from pathlib import Path
 
 from pydantic import Field
 
@@ -27,6 +29,7 @@ from ground_service.worker.presence import (
     statement_of,
 )
 from ground_service.worker.scheduler import has_scheduler
+from ground_service.worker.upkeep import CHANNEL, channel_of_heads
 
 LISTED = 10
 """Faults of one check that are listed."""
@@ -156,6 +159,17 @@ def _channels(ground: Ground, _settings: Settings) -> Result:
     return faults, f"{len(channels)} permitted" if channels else ""
 
 
+def _audit_heads(ground: Ground, settings: Settings) -> Result:
+    target = settings.audit_heads
+    if target is None:
+        return [], ""
+    if target.startswith(CHANNEL):
+        channel_of_heads(ground, target)
+    elif not (Path(target).is_dir() and os.access(target, os.W_OK)):
+        return [f"LINNA_AUDIT_HEADS: expected a folder that can be written, found {target}"], ""
+    return [], target
+
+
 CHECKS: dict[str, Callable[[Ground, Settings], Result]] = {
     "schema": _schema,
     "processes": _processes,
@@ -166,4 +180,5 @@ CHECKS: dict[str, Callable[[Ground, Settings], Result]] = {
     "files": _files,
     "provider": _provider,
     "notifications": _channels,
+    "audit heads": _audit_heads,
 }

@@ -16,10 +16,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 
-from pydantic import ValidationError
 from sqlalchemy import Connection
 
-from ground_service.errors import PASSING, NotFound, public_text
+from ground_service.errors import PASSING, NotFound, fault_of
 from ground_service.events import (
     AutomationChanged,
     CommandsSent,
@@ -310,33 +309,18 @@ class FollowUp:
         work: dict[Work, list[int]] = {}
         failed = []
         for event in batch:
-            try:
+            with fault_of(f"work of event {event.number} ({event.kind})") as faults:
                 for one in _work_of(ground, event):
                     work.setdefault(one, []).append(event.number)
-            except ValidationError as error:
-                log.error("event %d (%s) is not valid: %s", event.number, event.kind, error)
-                failed.append(
-                    FollowUpFailed(work=event.kind, events=(event.number,), error="the event is not valid")
-                )
-            except PASSING:
-                raise
-            except Exception as error:  # one faulty event must not stop all later ones
-                log.exception("event %d (%s): its work cannot be determined", event.number, event.kind)
-                failed.append(
-                    FollowUpFailed(work=event.kind, events=(event.number,), error=public_text(error))
-                )
+            failed += [FollowUpFailed(work=event.kind, events=(event.number,), error=one) for one in faults]
         for one in sorted(work, key=lambda one: (_ORDER[one[0]], one[1])):
             ground.check_stopping()
-            try:
+            name = f"{one[0]} {one[1]}"
+            with fault_of(f"follow-up work {name}") as faults:
                 job_id = DOING[one[0]](ground, one[1], work[one][-1])
                 if job_id is not None:
                     jobs.append(job_id)
-            except PASSING:
-                raise
-            except Exception as error:  # one fault must not stop the work of later events
-                log.exception("follow-up work failed: %s %d", *one)
-                name = f"{one[0]} {one[1]}"
-                failed.append(FollowUpFailed(work=name, events=tuple(work[one]), error=public_text(error)))
+            failed += [FollowUpFailed(work=name, events=tuple(work[one]), error=fault) for fault in faults]
         if batch:
             with ground.database.writing() as connection:
                 events.advance(connection, CONSUMER, batch[-1].number)

@@ -16,7 +16,7 @@ from typing import Any
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.service import note_timeouts
 from ground_service.contacts.links.supervisor import process_name
-from ground_service.errors import GroundError
+from ground_service.errors import GroundError, fault_of
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.jobs.store import repeat_ingests
@@ -125,12 +125,8 @@ class Scheduler:
         return True
 
     def _do(self, name: str, work: Callable[[], object]) -> None:
-        try:
+        with fault_of(f"recurring work ({name})", passing=()):
             work()
-        except GroundError as error:
-            log.warning("recurring work (%s) could not be done: %s", name, error)
-        except Exception as error:  # one faulty part must not stop the others
-            log.warning("recurring work (%s) could not be done: %s", name, error, exc_info=True)
 
     def _repeat_ingests(self) -> None:
         with self._ground.database.writing() as connection:

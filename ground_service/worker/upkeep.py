@@ -22,6 +22,7 @@ from ground_service.evaluation.performance.service import make_due_reports
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
+from ground_service.missions.rules import Channel
 from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends
 from ground_service.regression.archives import let_go, remove_unfinished
@@ -138,12 +139,23 @@ def keep_head(ground: Ground, target: str) -> None:
         with (Path(target) / f"{format_utc(utc_now_ns())[:10]}.head").open("a") as stream:
             stream.write(f"{line} {signed}\n")
         return
+    identity, content = f"audit-{head.number}-{signed[:16]}", {"head": line, "signature": signed}
+    channel = channel_of_heads(ground, target)
+    send(ground.home, channel, identity, "LINNA: audit head", content, networks=ground.networks)
+
+
+def channel_of_heads(ground: Ground, target: str) -> Channel:
+    """Return the channel of `channel:NAME`.
+
+    Raises
+    ------
+    InvalidInput
+        If no mission description in force has it.
+    """
     name = target.removeprefix(CHANNEL)
     for _, found, channel in ground.read(channels_in_force):
         if found == name:
-            identity, content = f"audit-{head.number}-{signed[:16]}", {"head": line, "signature": signed}
-            send(ground.home, channel, identity, "LINNA: audit head", content, networks=ground.networks)
-            return
+            return channel
     raise InvalidInput("LINNA_AUDIT_HEADS", "", "a channel of a mission description in force", name)
 
 

@@ -88,7 +88,7 @@ def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...
     UnknownTimeSystemError
         Where the time scale is none that can be converted.
     """
-    reader = Lines(numbered_lines(text), source)
+    reader = Lines(numbered_lines(text.splitlines()), source)
     _read_header(reader)
     segments: list[AttitudeSegment] = []
     while reader.peek() is not None:
@@ -139,7 +139,9 @@ def format_aem(segments: tuple[AttitudeSegment, ...]) -> str:
 def _read_header(reader: Lines) -> None:
     first = reader.peek()
     if first is None or not first.startswith("CCSDS_AEM_VERS"):
-        raise reader.error("CCSDS_AEM_VERS = 1.0 or 2.0", "nothing" if first is None else repr(first[:40]), 0)
+        raise reader.next_error(
+            "CCSDS_AEM_VERS = 1.0 or 2.0", "nothing" if first is None else repr(first[:40])
+        )
     seen: set[str] = set()
     while True:
         for _ in reader.comments():

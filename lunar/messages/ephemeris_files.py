@@ -5,6 +5,8 @@ SPICE kernels are binary and read by `lunar.messages.spice`, outside of the serv
 
 from __future__ import annotations
 
+import io
+import itertools
 from pathlib import Path
 
 from lunar.compressed import read_expanded
@@ -41,23 +43,22 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
         raise DataFileError(path, "", f"at most {LINES_LIMIT} lines", str(lines))
     if octets.startswith(SPK_MARK):
         raise DataFileError(path, "", EXPECTED, "a SPICE kernel; convert it with 'linna orbit convert'")
+    stream = io.TextIOWrapper(io.BytesIO(octets), "utf-8-sig")
     try:
-        text = octets.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataFileError(path, f"octet {error.start}", EXPECTED, "octets that are no text") from None
-    if text.lstrip()[:1] == "<":
-        return parse_oem_xml(octets, source=str(path))
-    for word in map(str.strip, text.split("\n", 50)[:50]):
-        if word.startswith("CCSDS_OEM_VERS"):
-            reader = Lines(numbered_lines(text), str(path))
-            del octets, text  # the largest part of the memory
-            return parse_oem_lines(reader)
-        if word.lower().startswith("stk.v"):
-            return parse_stk(text, source=str(path))
-        if word and not word.startswith(("COMMENT", "#")):
-            if is_horizons(text):
-                return parse_horizons(text, source=str(path))
-            raise DataFileError(path, "first line", _FIRST, repr(word[:40]))
+        for word in map(str.strip, itertools.islice(stream, 50)):
+            if word.startswith("<"):
+                return parse_oem_xml(octets, source=str(path))
+            if word.startswith("CCSDS_OEM_VERS"):
+                stream.seek(0)
+                return parse_oem_lines(Lines(numbered_lines(stream), str(path)))
+            if word.lower().startswith("stk.v"):
+                return parse_stk(octets.decode("utf-8-sig"), source=str(path))
+            if word and not word.startswith(("COMMENT", "#")):
+                if is_horizons(text := octets.decode("utf-8-sig")):
+                    return parse_horizons(text, source=str(path))
+                raise DataFileError(path, "first line", _FIRST, repr(word[:40]))
+    except UnicodeDecodeError:
+        raise DataFileError(path, "", EXPECTED, "octets that are no text") from None
     raise DataFileError(path, "first line", _FIRST, "nothing")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,44 +11,44 @@ from lunar.errors import DataFileError, TimeFormatError
 from lunar.timescales import NS, parse_utc, to_utc_ns
 
 
-def numbered_lines(text: str) -> list[tuple[int, str]]:
-    """Return the lines of a text that are not blank, stripped, with their line numbers."""
-    return [item for item in enumerate(map(str.strip, text.splitlines()), start=1) if item[1]]
+def numbered_lines(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are not blank, stripped, with their line numbers."""
+    return (item for item in enumerate(map(str.strip, lines), start=1) if item[1])
 
 
-@dataclass(slots=True)
 class Lines:
-    """Lines of a message that are not blank, with their line numbers in the file, and the place reached."""
+    """Lines of a message that are not blank, read once; `at` is the line number of the line last taken."""
 
-    numbered: list[tuple[int, str]]
-    source: str
-    at: int = 0
+    def __init__(self, numbered: Iterable[tuple[int, str]], source: str) -> None:
+        self._lines = iter(numbered)
+        self._next = next(self._lines, None)
+        self.source = source
+        self.at = 1
 
     def peek(self) -> str | None:
         """Return the next line, None at the end."""
-        return self.numbered[self.at][1] if self.at < len(self.numbered) else None
+        return None if self._next is None else self._next[1]
 
     def take(self) -> str:
         """Return the next line and pass it."""
-        line = self.peek()
-        if line is None:
+        if self._next is None:
             raise self.error("more lines", "the end of the file")
-        self.at += 1
+        self.at, line = self._next
+        self._next = next(self._lines, None)
         return line
 
-    def number(self, at: int | None = None) -> int:
-        """Return the line number of the line last taken, or of index ``at``."""
-        index = self.at - 1 if at is None else at
-        return self.numbered[min(max(index, 0), len(self.numbered) - 1)][0] if self.numbered else 1
+    def next_error(self, expected: str, found: str) -> DataFileError:
+        """Return an error at the next line, at the end at the last one."""
+        return self.error(expected, found, None if self._next is None else self._next[0])
 
     def error(self, expected: str, found: str, at: int | None = None) -> DataFileError:
-        """Return an error at the line last taken, or at index ``at``."""
-        return DataFileError(self.source, f"line {self.number(at)}", expected, found)
+        """Return an error at the line last taken, or at line number ``at``."""
+        return DataFileError(self.source, f"line {self.at if at is None else at}", expected, found)
 
     def comments(self) -> Iterator[str]:
         """Yield the comments here and pass them."""
         while (line := self.peek()) is not None and line.split(None, 1)[0] == "COMMENT":
-            self.at += 1
+            self.take()
             yield line[7:].strip()
 
     def keyword(self, allowed: Iterable[str]) -> tuple[str, str]:
@@ -66,7 +65,7 @@ class Lines:
     def metadata(
         self, allowed: Iterable[str], mandatory: Iterable[str]
     ) -> tuple[list[str], dict[str, str], dict[str, int]]:
-        """Return comments, values and line indices of the keywords up to META_STOP, which is passed."""
+        """Return comments, values and line numbers of the keywords up to META_STOP, which is passed."""
         comments: list[str] = []
         meta: dict[str, str] = {}
         where: dict[str, int] = {}
@@ -78,7 +77,7 @@ class Lines:
             key, value = self.keyword(allowed)
             if key in meta:
                 raise self.error(f"{key} once", "it again")
-            meta[key], where[key] = value, self.at - 1
+            meta[key], where[key] = value, self.at
         for key in mandatory:
             if key not in meta:
                 raise self.error(f"{key} before META_STOP", "none")

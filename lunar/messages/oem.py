@@ -34,6 +34,10 @@ from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns, to_utc_ns
 
 VERSIONS = ("1.0", "2.0", "3.0")
 CENTRES = ("MOON",)
+STATES_LIMIT = 1_000_000
+"""States of a file: two years of states each minute."""
+
+BLOCK_ROWS = 10_000
 
 _HEADER_KEYS = ("CCSDS_OEM_VERS", "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 _MANDATORY = (
@@ -76,15 +80,15 @@ def parse_oem(text: str, source: str = "OEM text") -> Ephemeris:
     UnknownFrameError, UnknownTimeSystemError
         Where axes, centre or time scale are none that can be converted.
     """
-    return parse_oem_lines(Lines(numbered_lines(text), source))
+    return parse_oem_lines(Lines(numbered_lines(text.splitlines()), source))
 
 
 def parse_oem_lines(reader: Lines) -> Ephemeris:
     """Return the ephemeris in the lines of an OEM in keyword notation; raises as `parse_oem`."""
     header, comments = _read_header(reader)
-    segments = []
+    segments: list[EphemerisSegment] = []
     while reader.peek() is not None:
-        segments.append(_read_segment(reader))
+        segments.append(_read_segment(reader, STATES_LIMIT - sum(len(one.utc_ns) for one in segments)))
     if not segments:
         raise reader.error("META_START", "the end of the file")
     for k, (earlier, later) in enumerate(pairwise(segments), start=2):
@@ -121,7 +125,7 @@ def _read_header(reader: Lines) -> tuple[dict[str, str], tuple[str, ...]]:
     first = reader.peek()
     if first is None or not first.startswith("CCSDS_OEM_VERS"):
         found = "nothing" if first is None else repr(first[:40])
-        raise reader.error("CCSDS_OEM_VERS = 1.0, 2.0 or 3.0", found, reader.at)
+        raise reader.next_error("CCSDS_OEM_VERS = 1.0, 2.0 or 3.0", found)
     while True:
         comments += reader.comments()
         line = reader.peek()
@@ -139,18 +143,18 @@ def _read_header(reader: Lines) -> tuple[dict[str, str], tuple[str, ...]]:
     return header, tuple(comments)
 
 
-def _read_segment(reader: Lines) -> EphemerisSegment:
+def _read_segment(reader: Lines, left: int) -> EphemerisSegment:
     line = reader.take()
     if line != "META_START":
         raise reader.error("META_START", repr(line[:60]))
     comments, meta, where = reader.metadata(_META_KEYS, _MANDATORY)
     system = meta["TIME_SYSTEM"].upper()
     if system not in TIME_SYSTEMS:
-        place = f"{reader.source}: line {reader.number(where['TIME_SYSTEM'])}"
+        place = f"{reader.source}: line {where['TIME_SYSTEM']}"
         raise UnknownTimeSystemError(meta["TIME_SYSTEM"], TIME_SYSTEMS, place)
     frame = meta["REF_FRAME"].upper().replace(" ", "")
     if frame not in ICRF_NAMES + J2000_NAMES:
-        place = f"{reader.source}: line {reader.number(where['REF_FRAME'])}"
+        place = f"{reader.source}: line {where['REF_FRAME']}"
         raise UnknownFrameError(meta["REF_FRAME"], (*ICRF_NAMES, *J2000_NAMES), place)
     if meta["CENTER_NAME"].upper() not in CENTRES:
         raise reader.error("CENTER_NAME = MOON", repr(meta["CENTER_NAME"]), where["CENTER_NAME"])
@@ -166,7 +170,7 @@ def _read_segment(reader: Lines) -> EphemerisSegment:
         if key in meta
     }
     comments += reader.comments()
-    utc_ns, states, lines_at = _read_states(reader, system)
+    utc_ns, states, lines_at = _read_states(reader, system, left)
     _check_epochs(reader, utc_ns, times, lines_at)
     position_m, velocity_m_s = 1e3 * states[:, :3], 1e3 * states[:, 3:6]
     if frame in J2000_NAMES:
@@ -200,48 +204,55 @@ def _degree(reader: Lines, meta: dict[str, str], where: dict[str, int], method: 
     return int(text)
 
 
-def _read_states(reader: Lines, system: str) -> tuple[IntArray, FloatArray, int]:
-    """Return epochs (n,), states (n, 6 or 9) in km and the line index of the first."""
-    begin = reader.at
-    end = begin
-    lines = reader.numbered
-    while end < len(lines) and lines[end][1][0].isdigit():
-        end += 1
-    rows = [line for _, line in lines[begin:end]]
-    reader.at = end
-    if not rows:
+def _read_states(reader: Lines, system: str, left: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """Return epochs (n,), states (n, 6 or 9) in km and line numbers (n,); at most ``left`` of them."""
+    if not (reader.peek() or " ")[0].isdigit():
         found = reader.peek()
-        raise reader.error(
-            "a state: epoch x y z vx vy vz", "the end of the file" if found is None else repr(found[:60]), end
-        )
-    width = len(rows[0].split())
+        expected = "a state: epoch x y z vx vy vz"
+        raise reader.next_error(expected, "the end of the file" if found is None else repr(found[:60]))
+    blocks = []
+    width = len((reader.peek() or "").split())
+    while (reader.peek() or " ")[0].isdigit():
+        rows: list[str] = []
+        at: list[int] = []
+        while len(rows) < BLOCK_ROWS and (reader.peek() or " ")[0].isdigit():
+            rows.append(reader.take())
+            at.append(reader.at)
+        left -= len(rows)
+        if left < 0:
+            raise reader.error(f"at most {STATES_LIMIT} states", "more")
+        blocks.append((*_parse_states(reader, rows, at, width), np.array(at)))
+    epochs, numbers, lines = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    return np.asarray(to_utc_ns(epochs, system)), numbers, lines
+
+
+def _parse_states(reader: Lines, rows: list[str], at: list[int], width: int) -> tuple[IntArray, FloatArray]:
+    """Return the epochs and numbers of a block of rows with ``width`` values each."""
     table = None
     if width in (7, 10):
         # The reader of numpy takes epochs and numbers in one go; what it refuses is gone through line by line.
         with suppress(ValueError):
-            table = np.loadtxt(
-                rows, dtype=[("epoch", "S40"), ("state", "f8", width - 1)], comments=None, ndmin=1
-            )
+            kind = [("epoch", "S40"), ("state", "f8", width - 1)]
+            table = np.loadtxt(rows, dtype=kind, comments=None, ndmin=1)
     if table is None:
-        for k, row in enumerate(rows):
+        for row, line in zip(rows, at, strict=True):
             count = len(row.split())
             if count not in (7, 10) or count != width:
-                expected = (
-                    "an epoch and 6 or 9 numbers" if k == 0 else f"{width} values as in the line before"
-                )
-                raise reader.error(expected, f"{count} values", begin + k)
+                first = width not in (7, 10)
+                expected = "an epoch and 6 or 9 numbers" if first else f"{width} values as in the line before"
+                raise reader.error(expected, f"{count} values", line)
             for token in row.split()[1:]:
                 if not is_number(token):
-                    raise reader.error("a number", repr(token), begin + k)
-        raise reader.error("states of numbers", "others", begin)
-    numbers = table["state"]
+                    raise reader.error("a number", repr(token), line)
+        raise reader.error("states of numbers", "others", at[0])
+    numbers = table["state"].copy()
     bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
     if bad.size:
-        raise reader.error("finite numbers", "NaN or infinity", begin + int(bad[0]))
-    return to_utc_ns(_epochs(reader, table["epoch"], begin), system), numbers, begin
+        raise reader.error("finite numbers", "NaN or infinity", at[int(bad[0])])
+    return _epochs(reader, table["epoch"], at), numbers
 
 
-def _epochs(reader: Lines, texts: NDArray[np.bytes_], begin: int) -> IntArray:
+def _epochs(reader: Lines, texts: NDArray[np.bytes_], at: list[int]) -> IntArray:
     # numpy reads calendar dates in one go; other notations and faults go through the slow reader, which names the line.
     if np.all(np.strings.endswith(texts, b"Z")):
         texts = np.strings.rstrip(texts, b"Z")
@@ -249,33 +260,33 @@ def _epochs(reader: Lines, texts: NDArray[np.bytes_], begin: int) -> IntArray:
         with suppress(ValueError):
             return texts.astype("datetime64[ns]").astype(np.int64)
     return np.array(
-        [reader.epoch(text.decode("latin-1"), "UTC", begin + k) for k, text in enumerate(texts)],
+        [reader.epoch(text.decode("latin-1"), "UTC", line) for text, line in zip(texts, at, strict=True)],
         dtype=np.int64,
     )
 
 
-def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], begin: int) -> None:
+def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], at: IntArray) -> None:
     late = np.flatnonzero(np.diff(utc_ns) <= 0)
     if late.size:
         k = int(late[0])
         raise reader.error(
             f"an epoch after {format_utc(int(utc_ns[k]), 6)}",
             format_utc(int(utc_ns[k + 1]), 6),
-            begin + k + 1,
+            int(at[k + 1]),
         )
     start_ns, stop_ns, grace_ns = times["START_TIME"], times["STOP_TIME"], 10**6  # Both may be rounded.
     outside = np.flatnonzero((utc_ns < start_ns - grace_ns) | (utc_ns > stop_ns + grace_ns))
     if outside.size:
         span = f"{format_utc(start_ns)}..{format_utc(stop_ns)} (START_TIME..STOP_TIME)"
         k = int(outside[0])
-        raise reader.error(f"an epoch within {span}", format_utc(int(utc_ns[k])), begin + k)
+        raise reader.error(f"an epoch within {span}", format_utc(int(utc_ns[k])), int(at[k]))
     is_cut = stop_ns > utc_ns[-1] + grace_ns
     if is_cut or start_ns < utc_ns[0] - grace_ns:
         side, key = (-1, "STOP_TIME") if is_cut else (0, "START_TIME")
         raise reader.error(
             f"a {'last' if side else 'first'} state at {key} = {format_utc(times[key])}",
             f"{format_utc(int(utc_ns[side]))}; the segment is cut short",
-            begin + (len(utc_ns) - 1 if side else 0),
+            int(at[side]),
         )
     low = times.get("USEABLE_START_TIME", int(utc_ns[0]))
     high = times.get("USEABLE_STOP_TIME", int(utc_ns[-1]))
@@ -283,7 +294,7 @@ def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], begin:
         raise reader.error(
             f"a useable interval within {format_utc(int(utc_ns[0]))}..{format_utc(int(utc_ns[-1]))}",
             f"{format_utc(low)}..{format_utc(high)}",
-            begin,
+            int(at[0]),
         )
 
 

@@ -11,7 +11,7 @@ CCSDS 505.0-B-2 (2021), XML Specification for Navigation Data Messages, section 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from xml.parsers import expat
 from xml.sax.saxutils import escape
 
@@ -28,6 +28,7 @@ _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 _COVARIANCE = [[f"C{row}_{column}" for column in _AXES[: k + 1]] for k, row in enumerate(_AXES)]
 _UNITS = dict.fromkeys(("X", "Y", "Z"), "km") | dict.fromkeys(("X_DOT", "Y_DOT", "Z_DOT"), "km/s")
 _DEPTH = 16
+BLOCK_OCTETS = 1 << 16
 _GROUPS = ("header", "metadata", "stateVector", "covarianceMatrix")
 _FRAMES = ("ndm", "oem", "body", "segment", "data", *_GROUPS)
 
@@ -82,14 +83,18 @@ class _Reader:
         self.parser.EndElementHandler = self._end
         self.parser.CharacterDataHandler = self.text.append
 
-    def read(self, octets: bytes) -> list[tuple[int, str]]:
+    def read(self, octets: bytes) -> Iterator[tuple[int, str]]:
         try:
-            self.parser.Parse(octets, True)
+            for begin in range(0, len(octets), BLOCK_OCTETS):
+                self.parser.Parse(octets[begin : begin + BLOCK_OCTETS], False)
+                yield from self.lines[:-1]
+                del self.lines[:-1]  # the next covariance may replace the last line
+            self.parser.Parse(b"", True)
         except expat.ExpatError as error:
             raise self._error("well-formed XML", expat.ErrorString(error.code)) from None
         except (LookupError, ValueError) as error:  # an encoding that is unknown or not supported
             raise self._error("XML in UTF-8", str(error)) from None
-        return self.lines
+        yield from self.lines
 
     def _error(self, expected: str, found: str) -> DataFileError:
         return DataFileError(self.source, f"line {self.parser.CurrentLineNumber}", expected, found)

@@ -244,25 +244,25 @@ class PostgresServer:
             raise GroundError("expected PostgreSQL on this machine, found none under /usr/lib/postgresql")
         self._bin = found[-1].parent
         self._user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
-        self._port = free_port()
-        self.url = f"postgresql+psycopg://linna@127.0.0.1:{self._port}/linna"
+        self.port = free_port()
+        self.url = f"postgresql+psycopg://linna@127.0.0.1:{self.port}/linna"
         note = folder / "postgres-folder"
         is_new = not note.exists()
         if is_new:
-            self._place = Path(tempfile.mkdtemp(prefix="linna-postgres-", dir=None if self._user else folder))
+            self.place = Path(tempfile.mkdtemp(prefix="linna-postgres-", dir=None if self._user else folder))
             if self._user:
-                shutil.chown(self._place, "postgres", "postgres")
-            self._run("initdb", "-D", str(self._place / "data"), "-U", "linna", "-A", "trust", "--no-sync")
+                shutil.chown(self.place, "postgres", "postgres")
+            self.run("initdb", "-D", str(self.place / "data"), "-U", "linna", "-A", "trust", "--no-sync")
         else:
-            self._place = Path(note.read_text())
-        words = ["-p", str(self._port), "-k", str(self._place), "-h", "127.0.0.1", "-c", "fsync=off"]
+            self.place = Path(note.read_text())
+        words = ["-p", str(self.port), "-k", str(self.place), "-h", "127.0.0.1", "-c", "fsync=off"]
         words += [word for name, value in settings.items() for word in ("-c", f"{name}={value}")]
-        server = [*self._user, str(self._bin / "postgres"), "-D", str(self._place / "data"), *words]
-        self.part = Part(server, folder / "postgres.log", self._answers, cwd=self._place)
+        server = self.command("postgres", "-D", str(self.place / "data"), *words)
+        self.part = Part(server, folder / "postgres.log", self._answers, cwd=self.place)
         self.part.start()
         if is_new:
-            self._run("createdb", "-h", "127.0.0.1", "-p", str(self._port), "-U", "linna", "linna")
-            note.write_text(str(self._place))
+            self.run("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", "linna", "linna")
+            note.write_text(str(self.place))
 
     def __enter__(self) -> PostgresServer:
         return self
@@ -284,18 +284,19 @@ class PostgresServer:
 
     def remove(self) -> None:
         """Remove its files after its end."""
-        shutil.rmtree(self._place, ignore_errors=True)
+        shutil.rmtree(self.place, ignore_errors=True)
 
-    def _run(self, program: str, *arguments: str) -> None:
-        subprocess.run(
-            [*self._user, str(self._bin / program), *arguments],
-            check=True,
-            cwd=self._place,
-            stdout=subprocess.DEVNULL,
-        )
+    def command(self, program: str, *arguments: str) -> list[str]:
+        """Return the command of a program of PostgreSQL, as the user of the server."""
+        return [*self._user, str(self._bin / program), *arguments]
+
+    def run(self, program: str, *arguments: str) -> None:
+        """Run a program of PostgreSQL in the folder of the server."""
+        command = self.command(program, *arguments)
+        subprocess.run(command, check=True, cwd=self.place, stdout=subprocess.DEVNULL)
 
     def _answers(self) -> bool:
-        ask = [str(self._bin / "pg_isready"), "-h", "127.0.0.1", "-p", str(self._port), "-q"]
+        ask = [str(self._bin / "pg_isready"), "-h", "127.0.0.1", "-p", str(self.port), "-q"]
         return subprocess.run(ask, check=False).returncode == 0
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput
@@ -18,8 +20,11 @@ from ground_service.passes.model import PassFilter
 from ground_service.passes.store import list_passes
 from ground_service.regression.build_runs import read_performance
 from ground_service.regression.builds import load_build
+from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError
-from lunar.messages import ephemeris_files
+from lunar.messages import ephemeris_files, oem
+from lunar.messages.oem import format_oem
+from lunar.messages.oem_xml import format_oem_xml
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import parse_scenario
 from tmtc.definitions import parse_dictionary
@@ -110,4 +115,29 @@ def test_ephemerides_are_limited_in_size_and_lines(monkeypatch: pytest.MonkeyPat
         ephemeris_files.load_ephemeris(path)
     path.write_bytes(bytes(ephemeris_files.OCTETS_LIMIT + 1))
     with pytest.raises(DataFileError, match="expected at most 96 MiB"):
+        ephemeris_files.load_ephemeris(path)
+
+
+@pytest.mark.parametrize("name", ["a.oem", "a.xml"])
+def test_an_ephemeris_is_read_as_a_stream_with_a_limit_on_states(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    """Reading takes less than twice the size of the file, and 4 MiB."""
+    count = 20_000
+    utc_ns = np.int64(1_800_000_000_000_000_000) + np.arange(count, dtype=np.int64) * 60_000_000_000
+    states = np.full((count, 3), 1.8e6)
+    made = Ephemeris((EphemerisSegment(utc_ns, states, states / 1e3, "MOON", "ICRF"),))
+    path = tmp_path / name
+    path.write_text(format_oem_xml(made) if name == "a.xml" else format_oem(made))
+    size = path.stat().st_size
+    monkeypatch.setattr(ephemeris_files, "OCTETS_LIMIT", size)  # the reserved, unused memory of the reader
+    ephemeris_files.load_ephemeris(path)  # what is imported and kept
+    tracemalloc.start()
+    found = ephemeris_files.load_ephemeris(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found.segments[0].utc_ns) == count
+    assert peak < 2 * size + 4 * 2**20
+    monkeypatch.setattr(oem, "STATES_LIMIT", count - 1)
+    with pytest.raises(DataFileError, match="expected at most 19999 states, found more"):
         ephemeris_files.load_ephemeris(path)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping
+from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping, fault_of
 from ground_service.evaluation.model import PassFigures, StoredReport
 from ground_service.evaluation.performance import store
 from ground_service.evaluation.performance.core import (
@@ -309,16 +309,11 @@ def make_due_reports(ground: Ground) -> tuple[list[dict[str, Any]], list[int]]:
     made: list[dict[str, Any]] = []
     failed = []
     for one in spacecraft:
-        try:
+        with fault_of(f"monthly report of spacecraft {one}", passing=(Stopping, DatabaseBusy)) as faults:
             report = make_due_report(ground, one)
-        except (Stopping, DatabaseBusy):
-            raise
-        except Exception:  # one spacecraft does not keep the others from their reports
-            log.exception("monthly report of spacecraft %d: failed", one)
-            failed.append(one)
-        else:
             if report is not None:
                 made.append({"spacecraft_id": one, "month": report.month, "report": report.id})
+        failed += [one for _ in faults]
     return made, failed
 
 

@@ -404,14 +404,23 @@ def _class_medians(session: onnxruntime.InferenceSession, metadata: dict[str, st
 
 def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSession:
     import onnxruntime
+    from onnxruntime.capi import onnxruntime_pybind11_state as library
 
+    kinds = (
+        "Fail",
+        "InvalidArgument",
+        "InvalidGraph",
+        "InvalidProtobuf",
+        "NotImplemented",
+        "RuntimeException",
+    )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
         session = onnxruntime.InferenceSession(model_octets, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises several kinds, all of them meaning "no such model"
+    except tuple(getattr(library, kind) for kind in kinds) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise ModelError(
             f"detector network ({len(model_octets)} octets): expected an ONNX model, found none ({reason})"

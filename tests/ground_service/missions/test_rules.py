@@ -81,6 +81,10 @@ def rule(name: str = "a", on: str = "window ended", do: str = '["report"]', more
             "automation.channels.ops: expected either webhook or email, found",
         ),
         (
+            "[automation.channels.ops]\nwebhook = 'http://x/'\nsigning_secret = '..'\n",
+            "automation.channels.ops.signing_secret: expected ",
+        ),
+        (
             "[automation]\nevaluate = false\n" + rule(),
             "automation: expected no rule with a report where evaluate is false, found 'a'",
         ),

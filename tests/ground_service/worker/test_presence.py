@@ -164,6 +164,16 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
             "channel people of spacecraft 76: localhost: expected a public address"
             in (faults(opened, given)["notifications"])
         )
+        opened_to_people = given.model_copy(update={"audit_heads": "channel:people"})
+        assert "audit heads" not in faults(opened, opened_to_people)
+
+        # 6. Audit heads go to a channel that no mission description has, or to a folder that does not exist.
+        for target, told in (
+            ("channel:nobody", "found nobody"),
+            (str(tmp_path / "none"), "a folder that can"),
+        ):
+            given_heads = given.model_copy(update={"audit_heads": target})
+            assert told in faults(opened, given_heads)["audit heads"]
     found = faults(opened, given)
     assert "expected a running api, found none; expected a running worker" in found["processes"]
 

@@ -1,24 +1,30 @@
 """The nightly job: trends with limits, and what is taken away and what never is."""
 
 import os
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import func, select
 
 from ground_service.access import service as users
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
+from ground_service.evaluation.service import make_report
 from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
+from ground_service.passes.archive_import import import_archive
 from ground_service.passes.core import downsample
 from ground_service.passes.service import spacecraft_trends, trend_of
 from ground_service.regression.archives import working_folder
 from ground_service.store import repository
 from ground_service.store.events import publish
+from ground_service.store.models import METADATA
 from ground_service.worker.jobs import run_job
 from ground_service.worker.upkeep import nightly_job_id, tidy
 from tests.serving import token_valid
@@ -87,6 +93,35 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
     assert [item.number for item in read_events(ground.database, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.newest(connection, repository.AUDIT, Paging())[1] == 1
+
+
+def counts(ground: Ground) -> dict[str, int]:
+    with ground.database.reading() as connection:
+        return {
+            name: connection.execute(select(func.count()).select_from(table)).scalar_one()
+            for name, table in METADATA.tables.items()
+        }
+
+
+def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(
+    ground: Ground, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The documented policy names every table, and the nightly job deletes from no other one."""
+    text = (Path(__file__).parents[3] / "docs/archive.md").read_text(encoding="utf-8")
+    rows = text.partition("## Retention")[2].partition("## Schema")[0].splitlines()
+    policy = {table: row.split("|")[1].strip() for row in rows for table in re.findall(r"`([a-z_]+)`", row)}
+    assert set(policy) == set(METADATA.tables)
+    make_report(ground, import_archive(ground, synthetic_pass.folder))
+    run_job(ground, enter_job(ground, "plan", {}))
+    before, files = counts(ground), sorted(ground.files.root.rglob("*"))
+    later = utc_now_ns() + 3653 * DAY_NS
+    for module in ("upkeep", "jobs"):
+        monkeypatch.setattr(f"ground_service.worker.{module}.utc_now_ns", lambda: later)
+    removed = tidy(ground, 90)
+    after = counts(ground)
+    assert {policy[name] for name in before if before[name] != after[name]} == {"operation"}
+    assert removed["jobs"] == before["jobs"] >= 1 and after["event_log"] < before["event_log"]
+    assert files == sorted(ground.files.root.rglob("*"))
 
 
 def test_expired_sessions_are_deleted_and_tokens_are_kept(
