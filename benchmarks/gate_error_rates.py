@@ -272,9 +272,7 @@ def one_wrong_fix(frames: PassFrames, rng: np.random.Generator) -> PassFrames:
 
 def silent_frames(frames: PassFrames, rng: np.random.Generator) -> PassFrames:
     """Send no navigation state in a fifth of the frames."""
-    return of_anchored(
-        frames, error_m=np.where(rng.random(len(frames)) < 0.2, np.nan, frames.estimators["anchored"].error_m)
-    )
+    return of_anchored(frames, stated=frames.estimators["anchored"].stated & (rng.random(len(frames)) > 0.2))
 
 
 Change = Callable[[Packets], Packets]

@@ -301,8 +301,8 @@ def kept_archive(ground: Ground, digest: str) -> KeptArchive:
         return _shown(store.get_archive(connection, digest))
 
 
-def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
-    """Write a kept archive into a folder, checked again."""
+def check_out(ground: Ground, digest: str, folder: Path, *, images: bool = True) -> PassArchive:
+    """Write a kept archive into a folder, checked again; without its images what the ground reads of a pass."""
     with ground.database.writing() as connection:
         record = store.use_archive(connection, digest, utc_now_ns())
     files = store_of(ground)
@@ -310,17 +310,22 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).write_bytes(files.get(record.manifest_sha256))
-        for name, entry in archive.manifest["files"].items():
+        names = {
+            name: entry
+            for name, entry in archive.manifest["files"].items()
+            if images or not name.startswith("frames/")
+        }
+        for name, entry in names.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(files.path(entry["sha256"]), folder / name)
     except FileNotFoundError:
         raise NotFound("file of archive", digest) from None
     except OSError as error:
         raise storage_error(error, folder) from None
-    if archive.has_inputs:
+    if archive.has_inputs and images:
         check_archive(folder)
     else:
-        checked_files(folder, archive.manifest)
+        checked_files(folder, {**archive.manifest, "files": names})
     return archive
 
 

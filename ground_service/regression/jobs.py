@@ -127,12 +127,17 @@ def _outcome(
             with ground.database.writing() as connection:
                 set_progress(connection, job_id, share)
 
+    archives = list(arguments["archives"])
+    candidate, baseline = (
+        registered_build(ground, str(arguments[side])) for side in ("candidate", "baseline")
+    )
     return run_regression(
         ground,
-        list(arguments["archives"]),
-        registered_build(ground, str(arguments["candidate"])),
-        registered_build(ground, str(arguments["baseline"])),
+        archives,
+        candidate,
+        baseline,
         policy,
         workers=arguments.get("workers"),
         progress=progress,
+        minutes=arguments.get("minutes"),
     )

@@ -130,6 +130,12 @@ class RegressionRequest(Comparison):
         default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
     )
     policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
+    minutes: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=1e5,
+        description="Sequential: add passes in the most informative order until the verdict is clear, for so long",
+    )
 
 
 class JudgedBuild(Entity):

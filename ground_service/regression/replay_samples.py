@@ -26,7 +26,7 @@ from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
-from ground_service.regression.gates.samples import PassFrames, TimeTags, pass_frames
+from ground_service.regression.gates.samples import CraterRows, PassFrames, TimeTags, pass_frames
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
@@ -128,7 +128,11 @@ def _viewing(
 
 
 def read_downlink(
-    context: PassContext, octets: bytes, performance: Mapping[str, Any] | None, memory_mib: float
+    context: PassContext,
+    octets: bytes,
+    performance: Mapping[str, Any] | None = None,
+    memory_mib: float = math.nan,
+    cpu_s: float = math.nan,
 ) -> ReadDownlink:
     """What came down, by frame of the archive.
 
@@ -153,25 +157,21 @@ def read_downlink(
     outcomes = _outcomes(tables.get("frame_outcome"), context)
     good = decoded.cut.crc_ok
     ticks = _packet_ticks(tables, len(decoded.cut))
-    frames = pass_frames(
-        context.frame_ticks,
-        context.frame_utc_ns,
+    frames = _frames(
+        context,
         detections,
         _navigation(tables.get("navigation_state"), context),
         outcomes,
         ticks[good],
         decoded.cut.lengths[good],
-        context.reference,
-        context.catalogue,
-        context.camera,
-        context.orientation,
-        context.viewing,
     )
+    latency_ms = _latency_ms(performance, len(context.frame_ticks))
     return ReadDownlink(
         detections,
         replace(
             frames,
-            latency_ms=_latency_ms(performance, len(context.frame_ticks)),
+            latency_ms=latency_ms,
+            cpu_s=cpu_s if latency_ms else math.nan,
             undecodable=decoded.unknown
             + decoded.crc_errors
             + _meaningless(decoded, tables, context.dictionary),
@@ -180,6 +180,27 @@ def read_downlink(
             times=_time_tags(decoded, tables, ticks, context),
         ),
     )
+
+
+def expected_rows(context: PassContext) -> CraterRows:
+    """Return the craters that the frames of a pass should show, whatever a build finds."""
+    nothing = np.zeros(0, np.int64)
+    return _frames(context, no_detections(), {}, {}, nothing, nothing).craters
+
+
+def _frames(context: PassContext, *received: Any) -> PassFrames:
+    """Return the frames of a pass with what was received."""
+    arguments: tuple[Any, ...] = (
+        context.frame_ticks,
+        context.frame_utc_ns,
+        *received,
+        context.reference,
+        context.catalogue,
+        context.camera,
+        context.orientation,
+        context.viewing,
+    )
+    return pass_frames(*arguments)
 
 
 def _digests(decoded: DownlinkDecode, ticks: IntArray, frame_ticks: IntArray) -> tuple[bytes, ...]:

@@ -140,9 +140,10 @@ def start_regression(
     arguments = {
         **compared(ground, request),
         "policy": request.policy,
-        "policy_name": request.policy_name,
+        **request.model_dump(include={"policy_name", "minutes"}),
     }
-    missing = missing_replays(ground, arguments) if request.workers is None else []
+    in_one_job = request.workers or request.minutes
+    missing = [] if in_one_job else missing_replays(ground, arguments)
     replays = {f"{one['archive']} {one['build']}": one for one in missing}
     for job in enter_jobs(ground, replays, "regression", arguments, identity):
         dispatcher.start(job)

@@ -7,15 +7,19 @@ goes on.
 
 from __future__ import annotations
 
-import dataclasses
+import math
 import os
 import platform
 import re
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput, Stopping
@@ -35,10 +39,11 @@ from ground_service.regression.archives import (
 from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
-from ground_service.regression.gates.core import NOT_JUDGED, judge
+from ground_service.regression.gates.core import NOT_JUDGED, ONLY_LOOK, Look, judge
 from ground_service.regression.gates.faults import first_difference
 from ground_service.regression.gates.policy import PolicyFile
-from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.gates.samples import KINDS, PassFrames
+from ground_service.regression.gates.sequence import informative_order, is_clear, planned_looks
 from ground_service.regression.model import (
     COMPLETE,
     OK,
@@ -55,7 +60,13 @@ from ground_service.regression.outcome import (
 )
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.regression.rendering import LIVE_BEGINNING, settle_archive
-from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
+from ground_service.regression.replay_samples import (
+    PassContext,
+    ReadDownlink,
+    expected_rows,
+    pass_context,
+    read_downlink,
+)
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store.stored_files import register_file
 from lunar.errors import LunarError
@@ -73,6 +84,7 @@ def run_regression(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
+    minutes: float | None = None,
 ) -> RegressionOutcome:
     """Fly archives with both builds, where that was not done before, and judge.
 
@@ -84,6 +96,8 @@ def run_regression(
         Number of parallel replays, each in a separate process. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
+    minutes
+        Add passes in the most informative order until the verdict is clear, for so long. Default: all passes.
     """
     if not archives:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
@@ -92,10 +106,56 @@ def run_regression(
     usable = {
         one.digest: one for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)
     }
-    shards = [(digest, build) for digest in usable for build in builds]
-    shards = [shard for shard in shards if not is_done(find_replay(ground, *shard))]
-    fly_shards(ground, shards, workers=workers, progress=progress)
-    return judge_regression(ground, kept, candidate, baseline, policy)
+    if minutes is None:
+        fly_shards(ground, _missing(ground, usable, builds), workers=workers, progress=progress)
+        return judge_regression(ground, kept, candidate, baseline, policy)
+    archives_left = list(usable.values())
+    tracks = np.array([_tracks(ground, one) for one in archives_left]).reshape(-1, len(KINDS))
+    order = informative_order(tracks, [one.frames for one in archives_left])
+    planned: list[PassArchive | PassVerdict] = [archives_left[i] for i in order]
+    others = [one for one in kept if one.digest not in usable]
+    looks = planned_looks([archives_left[i].frames for i in order]) or {0: ONLY_LOOK}
+    size = max((workers or os.cpu_count() or 1) // len(builds), 1)
+    stops = sorted({*looks, *range(size, len(planned), size)})
+    ends, spent, told, start = time.monotonic() + 60.0 * minutes, 0.0, list[str](), 0
+    for stop in progress(iter(stops), len(stops)) if progress else stops:
+        digests = [one.digest for one in planned[start:stop]]
+        fly_shards(ground, _missing(ground, digests, builds), workers=workers)
+        look, start = looks.get(stop), stop
+        if time.monotonic() > ends:
+            look = replace(looks[max(looks)], share=1.0 - spent)
+        if look is None:
+            continue
+        spent += look.share
+        outcome = judge_regression(ground, [*planned[:stop], *others], candidate, baseline, policy, look)
+        told.append(
+            f"{outcome.verdict} after {stop} of {len(planned)} passes ({look.share:.2g} of the level)"
+        )
+        if look.last or is_clear(outcome.verdict, stop, look):
+            break
+    return replace(outcome, remarks=(*outcome.remarks, f"sequential: {', '.join(told)}"))
+
+
+def _missing(ground: Ground, digests: Iterable[str], builds: Sequence[Build]) -> list[tuple[str, Build]]:
+    shards = [(digest, build) for digest in digests for build in builds]
+    return [shard for shard in shards if not is_done(find_replay(ground, *shard))]
+
+
+def _tracks(ground: Ground, archive: PassArchive) -> list[int]:
+    """Return the number of crater tracks in each kind of terrain; 0 of a pass without frames."""
+    if archive.state != COMPLETE:
+        return [0] * len(KINDS)
+    try:
+        rows = expected_rows(_context(ground, archive.digest))
+    except (GroundError, LunarError):
+        return [0] * len(KINDS)  # the verdict states the fault
+    kinds = rows.kind[np.unique(rows.track, return_index=True)[1]]
+    return list(map(int, np.bincount(kinds, minlength=len(KINDS))))
+
+
+def _context(ground: Ground, digest: str) -> PassContext:
+    with working_folder(ground) as folder:
+        return pass_context(check_out(ground, digest, folder / "a", images=False), ground.data)
 
 
 def fly_shards(
@@ -171,7 +231,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
                 pass  # a fault of the archive or of ground data, not of the build; the verdict reports it
             else:
                 try:
-                    read_downlink(context, octets, None, 0.0)
+                    read_downlink(context, octets)
                 except InvalidInput as error:
                     outcome, detail = "garbage", str(error)
             stored["downlink"] = store_of(ground).put_octets(octets).sha256
@@ -213,6 +273,7 @@ def judge_regression(
     candidate: Build,
     baseline: Build,
     policy: PolicyFile,
+    look: Look = ONLY_LOOK,
 ) -> RegressionOutcome:
     """The gates over replays that were done."""
     passes = tuple(
@@ -231,7 +292,7 @@ def judge_regression(
         old, new = one.baseline_read.frames, one.candidate_read.frames
         if not one.baseline.beside(one.candidate):
             apart += baseline != candidate
-            old, new = (dataclasses.replace(frames, latency_ms={}) for frames in (old, new))
+            old, new = (replace(frames, latency_ms={}, cpu_s=math.nan) for frames in (old, new))
         before[name], after[name] = old, new
     if apart:
         remarks.append(
@@ -239,7 +300,7 @@ def judge_regression(
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
     today = format_utc(utc_now_ns())[:10]
-    gates = judge(before, after, policy.policy, imaged=whole, today=today)
+    gates = judge(before, after, policy.policy, imaged=whole, today=today, look=look)
     rows = {name: first_difference(before[name], after[name]) for name in before}
     differing = [f"{name}, frame {row}" for name, row in rows.items() if row is not None]
     if differing:
@@ -337,8 +398,7 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
     reason = _unreplayable(archive, (baseline, candidate))
     if reason:
         return PassVerdict(archive.name, archive.digest, NOT_JUDGED, reason)
-    replays = [find_replay(ground, archive.digest, build) for build in (baseline, candidate)]
-    old, new = replays
+    old, new = (find_replay(ground, archive.digest, one) for one in (baseline, candidate))
     if old is None or new is None:
         return PassVerdict(archive.name, archive.digest, "unusable", "it was not flown", old, new)
     for replay, build, state in ((new, candidate, "candidate failed"), (old, baseline, "baseline failed")):
@@ -348,8 +408,7 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
             )
             return PassVerdict(archive.name, archive.digest, state, told, old, new)
     try:
-        with working_folder(ground) as folder:
-            context = pass_context(check_out(ground, archive.digest, folder / "a"), ground.data)
+        context = _context(ground, archive.digest)
         read = [_read(ground, context, replay) for replay in (old, new)]
     except (GroundError, LunarError) as error:
         return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)
@@ -365,7 +424,8 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
     performance = (
         read_performance(files.path(replay.performance_sha256)) if replay.performance_sha256 else None
     )
-    return read_downlink(context, files.get(replay.downlink_sha256), performance, replay.peak_rss_mib)
+    octets = files.get(replay.downlink_sha256)
+    return read_downlink(context, octets, performance, replay.peak_rss_mib, replay.cpu_s)
 
 
 def _other_camera(build: Build, archive: PassArchive) -> str:

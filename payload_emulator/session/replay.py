@@ -2,8 +2,7 @@
 
 A replay sees its archive and its build, nothing else: no data folder, no clock, no network. The same build on the same
 archive gives the same octets. What it costs is measured around the payload, in the CPU time of this thread, and never
-enters the downlink; with each frame a fixed computation is timed for comparison, so that a busy machine or a slow one
-can be told from a slow build.
+enters the downlink.
 """
 
 from __future__ import annotations
@@ -60,10 +59,6 @@ DETECTIONS = "payload/detections.jsonl"
 STAGES = ("network", "detector", "navigation")
 """The network; the rest of the detector (image preparation, decoding); everything after it, telemetry included."""
 
-YARDSTICK_SIZE = 256
-YARDSTICK_EVERY = 3
-"""The fixed computation is a product of matrices of this size, timed at every third frame."""
-
 
 @dataclass(frozen=True, slots=True)
 class FlightBuild:
@@ -80,12 +75,11 @@ class FlightBuild:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What a replay gave: packets, counts of the payload, CPU milliseconds of stages by frame and of the yardstick."""
+    """What a replay gave: packets, counts of the payload, and CPU milliseconds of stages by frame."""
 
     packets: list[bytes]
     summary: dict[str, Any]
     stages_ms: dict[str, FloatArray]
-    yardstick_ms: FloatArray
 
 
 def load_flight_build(path: Path) -> FlightBuild:
@@ -186,7 +180,6 @@ def replay_archive(
             "clock": "CPU time of the thread",
             "unit": "ms",
             "stages": {name: values.tolist() for name, values in flown.stages_ms.items()},
-            "yardstick": flown.yardstick_ms.tolist(),
         },
     )
     cpu_ms = float(sum(values.sum() for values in flown.stages_ms.values()))
@@ -245,9 +238,7 @@ def replay(
     payload = started()
     packets: list[bytes] = []
     rows: list[tuple[float, float, float]] = []
-    yardstick_ms: list[float] = []
     pairs: Iterable[tuple[StepInput, Image]] = zip(record.inputs, images, strict=True)
-    weights = np.random.default_rng(0).standard_normal((YARDSTICK_SIZE, YARDSTICK_SIZE)).astype(np.float32)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
         if board.enter_step(item) and item is not record.inputs[0]:
             payload = started()
@@ -262,15 +253,8 @@ def replay(
         rows.append(
             (detector.network_s, detector.examine_s - detector.network_s, step_s - detector.examine_s)
         )
-        if item.number % YARDSTICK_EVERY == 0:
-            yardstick_ms.append(1e3 * _yardstick_s(weights, cpu_clock))
     stages = 1e3 * np.array(rows, dtype=np.float64).reshape(-1, len(STAGES))
-    return Replay(
-        packets,
-        payload.summary(),
-        {name: stages[:, i] for i, name in enumerate(STAGES)},
-        np.array(yardstick_ms),
-    )
+    return Replay(packets, payload.summary(), {name: stages[:, i] for i, name in enumerate(STAGES)})
 
 
 def _with_network(build: FlightBuild, manifest: dict[str, Any]) -> FlightBuild:
@@ -455,16 +439,6 @@ class _TimedDetector:
         found = self.onnx.examine(image, sun_in_camera)
         self.examine_s += self.clock() - began
         return found
-
-
-def _yardstick_s(weights: NDArray[np.float32], clock: CpuClock) -> float:
-    """CPU time of a fixed product of matrices: what this machine takes for work of the network's kind just now."""
-    began = clock()
-    product = weights
-    for _ in range(4):
-        product = product @ weights
-        product = product * np.float32(1.0 / YARDSTICK_SIZE)
-    return clock() - began
 
 
 def _ahead(load: Callable[[StepInput], Image], inputs: tuple[StepInput, ...]) -> Iterator[Image]:

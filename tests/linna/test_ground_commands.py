@@ -226,6 +226,11 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("command", "enter", "dance", "--spacecraft-id", 76)
             ask("command", "list", "--limit", 2)
             ask("command", "receiver", "--spacecraft-id", 76)
+            do("command", "hold", "antenna", "--spacecraft-id", 76)
+            ask("command", "hold", "antenna", "--spacecraft-id", 76)
+            do("command", "resume", "--spacecraft-id", 76)
+            do("command", "note", "camera warm", "--spacecraft-id", 76)
+            assert do("command", "handovers")["handovers"][0]["note"] == "camera warm"
             do("ingest", synthetic_archive)
             do("ingest", downlink)
             ask("ingest", tmp_path / "nothing", downlink)
@@ -322,6 +327,8 @@ def steady(value: Any) -> Any:
         "changed",
         "requested",
         "decided",
+        "held",
+        "noted",
         "sent",
         "entered",
         "expires",

@@ -12,7 +12,8 @@ If both bounds hold, fail takes precedence. The level of all fail claims togethe
 gates over all passes, shared by their weights, and half for recall and precision of single passes and kinds of terrain;
 one pass has no second half. A pass needs no correction for the number of gates, since every gate must pass
 (intersection-union test). All other metrics *inform*: their changes are significant under Holm's procedure at a level
-of their own, and never decide. Claims are on the passes that were replayed.
+of their own, and never decide. Claims are on the passes that were replayed. A sequential regression judges several
+times, each time at a share of the levels that was fixed beforehand (`sequence`).
 
 References
 ----------
@@ -37,7 +38,15 @@ from ground_service.regression.gates.faults import (
     counts,
     identical,
 )
-from ground_service.regression.gates.metrics import LATENCY, MEMORY, PRECISION, RECALL, Metric, metrics_of
+from ground_service.regression.gates.metrics import (
+    LATENCY,
+    MEMORY,
+    PRECISION,
+    RECALL,
+    START,
+    Metric,
+    metrics_of,
+)
 from ground_service.regression.gates.samples import KINDS, PassFrames
 from ground_service.regression.gates.statistics import (
     Change,
@@ -55,7 +64,8 @@ from ground_service.regression.gates.statistics import (
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
 
-EXACT_METRICS = (UNDECODABLE, TIMES, FRAMES, WRONG_FIXES, MEMORY, LATENCY)
+COSTS = {MEMORY: "peak memory", LATENCY: "processor time of a frame", START: "processor time of the start"}
+EXACT_METRICS = (UNDECODABLE, TIMES, FRAMES, WRONG_FIXES, *COSTS)
 """Metrics that are compared without chance."""
 
 NEEDS_FRAMES = ("detector.", "latency.", MEMORY)
@@ -75,6 +85,12 @@ FEWEST_TRACKS = 90
 
 FEWEST_PASSES = 10
 """Passes from which position errors are judged by their own spread; fewer inform only, except of a gross change."""
+
+START_FLOOR_S = 0.5
+"""Shorter delays of the start are tolerated."""
+
+PASSES_OF_TIMES = 5
+"""Passes from which the narrower margin of processor times applies to the median of their ratios."""
 
 PASS_SPREAD = 0.33
 """Largest standard deviation between passes of the log ratio of the median errors of two equal builds."""
@@ -157,7 +173,8 @@ class Gate:
     margin, limit
         Tolerated loss, and the baseline with this loss.
     change_low, change_high
-        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse.
+        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse. They are wider
+        at a look that spends a part of the level.
     p_value, level
         Of the test against no loss, and the level of the fail claim; NaN for exact gates.
     resolution
@@ -197,6 +214,19 @@ class Gate:
         return self.outcome == PASS
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Look at the passes so far: its share of all levels, frames and passes of the whole plan (0: those judged)."""
+
+    share: float = 1.0
+    frames: int = 0
+    passes: int = 0
+    last: bool = True
+
+
+ONLY_LOOK = Look()
+
+
 def judge(
     before: Mapping[str, PassFrames],
     after: Mapping[str, PassFrames],
@@ -204,6 +234,7 @@ def judge(
     *,
     imaged: Collection[str] | None = None,
     today: str = "",
+    look: Look = ONLY_LOOK,
 ) -> list[Gate]:
     """Return the gates over the passes replayed by both builds: exact ones, primary ones, metrics that inform.
 
@@ -221,20 +252,20 @@ def judge(
         return []
     before, after = ({name: side[name] for name in names} for side in (before, after))
     pictured = names if imaged is None else [name for name in names if name in imaged]
-    same = identical(before, after)
+    same = look.last and identical(before, after)
     metrics = {one.name: one for one in metrics_of([*before.values(), *after.values()])}
     tests = _local_tests(before, after, pictured, policy, metrics)
-    level = policy.fail_level / 2.0 if tests else policy.fail_level
+    level = policy.fail_level * look.share / (2.0 if tests else 1.0)
     gates = [
         _exact_gate(before, after, rule, pictured, metrics) for rule in policy.rules if rule.weight == 0.0
     ]
     for rule in policy.rules:
         if rule.weight > 0.0:
             chosen = pictured if rule.metric.startswith(NEEDS_FRAMES) else names
-            gates.append(_primary(before, after, chosen, rule, metrics, level * rule.weight, same))
-    local = [_decided(*test, level / len(tests), window=True) for test in tests]
+            gates.append(_primary(before, after, chosen, rule, metrics, level * rule.weight, same, look))
+    local = [_decided(*test, level / len(tests), look, window=True) for test in tests]
     gates += [gate for gate in local if gate.outcome == FAIL]
-    gates += _informing(before, after, names, pictured, policy, metrics)
+    gates += _informing(before, after, names, pictured, policy, metrics, INFORM_LEVEL * look.share)
     return [_with_waiver(gate, policy.waivers, today) for gate in gates]
 
 
@@ -255,22 +286,8 @@ def _exact_gate(
     metrics: Mapping[str, Metric],
 ) -> Gate:
     frames = sum(len(one) for one in before.values())
-    if rule.metric in (MEMORY, LATENCY):
-        metric = metrics[rule.metric]
-        then, now = (
-            float(np.fmax.reduce([metric.value(side[name]) for name in pictured], initial=-math.inf))
-            for side in (before, after)
-        )
-        known = math.isfinite(then) and math.isfinite(now)
-        limit = then * (1.0 + rule.margin)
-        outcome = NOT_JUDGED if not known else FAIL if now > limit else PASS
-        told = "" if known else "it was not measured for both builds"
-        if outcome == FAIL:
-            what = "peak memory" if rule.metric == MEMORY else "processor time of a frame"
-            told = f"{what} rises from {then:.4g} to {now:.4g} {metric.unit}"
-        return Gate(
-            metric.name, outcome, then, now, rule.margin, limit, metric.unit, frames=frames, reason=told
-        )
+    if rule.metric in COSTS:
+        return _cost_gate(before, after, rule, pictured, metrics[rule.metric], frames)
     found = {name: counts(before[name], after[name])[rule.metric] for name in before}
     found = {name: one for name, one in found.items() if math.isfinite(one.baseline + one.candidate)}
     then, now = sum(one.baseline for one in found.values()), sum(one.candidate for one in found.values())
@@ -289,6 +306,35 @@ def _exact_gate(
     limit = then + tolerated
     outcome = FAIL if failed else PASS if found else NOT_JUDGED
     return Gate(rule.metric, outcome, then, now, tolerated, limit, unit, frames=frames, reason=told)
+
+
+def _cost_gate(
+    before: Mapping[str, PassFrames],
+    after: Mapping[str, PassFrames],
+    rule: GateRule,
+    pictured: Sequence[str],
+    metric: Metric,
+    frames: int,
+) -> Gate:
+    """Compare the peak memory over the passes, or the median of the ratios of their processor times."""
+    old, new = (np.array([metric.value(side[name]) for name in pictured]) for side in (before, after))
+    known = np.isfinite(old + new)
+    if not known.any():
+        told = "it was not measured for both builds"
+        return Gate(
+            metric.name, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, metric.unit, reason=told
+        )
+    if metric.name == MEMORY:
+        margin, then, now = rule.margin, old[known].max(), new[known].max()
+    else:
+        _, margin = rule.sizes(int(known.sum()) < PASSES_OF_TIMES)
+        then = float(np.median(old[known]))
+        now = then * float(np.median(new[known] / old[known]))
+    # A program that starts in a tenth of a second has no start to speak of.
+    limit = max(then * (1.0 + margin), then + START_FLOOR_S * (metric.name == START))
+    told = f"{COSTS[metric.name]} rises from {then:.4g} to {now:.4g} {metric.unit}" if now > limit else ""
+    outcome = FAIL if told else PASS
+    return Gate(metric.name, outcome, then, now, margin, limit, metric.unit, frames=frames, reason=told)
 
 
 def _sums(
@@ -342,6 +388,7 @@ def _primary(
     metrics: Mapping[str, Metric],
     level: float,
     same: bool,
+    look: Look,
 ) -> Gate:
     frames = sum(len(before[name]) for name in names)
     nothing = Gate(rule.metric, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, resolution=math.inf)
@@ -355,7 +402,8 @@ def _primary(
         change = mean_change(values[0], values[1], metric.relative)
     else:
         change = ratio_change(*_sums(before, after, names, metric))
-    gate = _decided("", change, metric, rule, frames, level, window=frames < WINDOW_FRAMES)
+    window = max(frames, look.frames) < WINDOW_FRAMES
+    gate = _decided("", change, metric, rule, frames, level, look, window=window)
     if same and math.isfinite(change.baseline):
         return replace(
             gate,
@@ -370,7 +418,15 @@ def _primary(
 
 
 def _decided(
-    place: str, change: Change, metric: Metric, rule: GateRule, frames: int, level: float, *, window: bool
+    place: str,
+    change: Change,
+    metric: Metric,
+    rule: GateRule,
+    frames: int,
+    level: float,
+    look: Look,
+    *,
+    window: bool,
 ) -> Gate:
     """Return the claim of one gate."""
     materiality, margin = rule.sizes(window)
@@ -394,7 +450,8 @@ def _decided(
     if freedom < 1.0:
         return replace(gate, reason=f"{change.units} {metric.evidence} have no spread")
     reach, ahead, power = (
-        student_quantile(at, min(freedom, 1e9)) for at in (1.0 - level, PASS_CONFIDENCE, POWER)
+        student_quantile(at, min(freedom, 1e9))
+        for at in (1.0 - level, 1.0 - look.share * (1.0 - PASS_CONFIDENCE), POWER)
     )
     few = metric.evidence in ("tracks", "ground cells") and change.units < FEWEST_TRACKS
     claim = max(materiality, margin) if few else materiality
@@ -434,6 +491,7 @@ def _informing(
     pictured: Sequence[str],
     policy: GatePolicy,
     metrics: Mapping[str, Metric],
+    family_level: float,
 ) -> list[Gate]:
     """Return the metrics without a gate: values, and significance over the passes, which are the units."""
     decided = {rule.metric for rule in policy.rules}
@@ -447,7 +505,7 @@ def _informing(
         if math.isfinite(change.baseline) or math.isfinite(change.candidate):
             rows.append((metric, change, sum(len(before[name]) for name in chosen)))
     p_values = [_two_sided(change) for _, change, _ in rows]
-    levels = holm_levels(p_values, INFORM_LEVEL)
+    levels = holm_levels(p_values, family_level)
     gates = []
     for (metric, change, frames), p, level in zip(rows, p_values, levels, strict=True):
         told = ""

@@ -11,14 +11,14 @@ from ground_service.regression.gates.samples import BAD_OUTCOMES, EstimatorFrame
 from ground_service.regression.gates.statistics import UnitSums, joined_sums, quantile, unit_sums
 from lunar.arrays import FloatArray
 
-LATENCY_LEVEL = 0.25
-"""Level of the percentile of CPU times: the lower quartile, because other load on the machine only increases them."""
+START_FRAMES = 2
+"""First frames, which belong to the start: code is compiled and buffers are made in them."""
 
 BLOCK_FRAMES = 6
 """Successive frames share the state of the filter: a block of them is one unit."""
 
 RECALL, PRECISION = "detector.recall", "detector.precision"
-MEMORY, LATENCY = "memory", "latency.total"
+MEMORY, LATENCY, START = "memory", "latency.total", "latency.start"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,10 @@ def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
         Metric("telemetry.packets_per_frame", "", False, True, lambda f: _mean(f.packets)),
         Metric("telemetry.octets_per_frame", "octets", False, True, lambda f: _mean(f.octets)),
         Metric(MEMORY, "MiB", False, True, lambda f: f.memory_mib),
-        Metric(LATENCY, "ms", False, True, _frame_ms),
+        Metric(LATENCY, "ms", False, True, lambda f: _mean(frame_ms(f)[START_FRAMES:])),
+        Metric(
+            START, "s", False, True, lambda f: f.cpu_s - float(np.nansum(frame_ms(f)[START_FRAMES:])) / 1e3
+        ),
     ]
     for name in estimators:
         place = f"navigation.{name}"
@@ -161,9 +164,7 @@ def _of(estimator: str, value: Callable[[EstimatorFrames], float]) -> Callable[[
     return lambda frames: value(_estimator(frames, estimator))
 
 
-def _frame_ms(frames: PassFrames) -> float:
-    """Return the processor time of all stages of a frame."""
-    if not frames.latency_ms:
-        return float("nan")
-    total = np.nansum(list(frames.latency_ms.values()), axis=0)
-    return quantile(total[total > 0.0], LATENCY_LEVEL)
+def frame_ms(frames: PassFrames) -> FloatArray:
+    """Return the processor time of all stages by frame (n,); NaN where none is known."""
+    total = np.nansum([np.full(len(frames), np.nan), *frames.latency_ms.values()], axis=0)
+    return np.where(total > 0.0, total, np.nan)

@@ -121,8 +121,6 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
                 f"more than the materiality {item.materiality:g}",
                 f"{item.margin:g}",
             )
-        if (item.window_margin is None) != (item.window_materiality is None):
-            raise InvalidInput(source, f"gate.{i}", "window_materiality and window_margin", "one of them")
     weights = sum(item.weight for item in read.gate)
     if not 0.0 < weights <= 1.0 + 1e-9:
         raise InvalidInput(source, "gate", "weights above 0 that sum to at most 1", f"{weights:g}")
@@ -139,10 +137,9 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
 
 
 def _rule(item: GateTable) -> GateRule:
-    window = (item.margin, item.materiality)
-    if item.window_margin is not None and item.window_materiality is not None:
-        window = (item.window_margin, item.window_materiality)
-    return GateRule(item.metric, item.margin, item.weight, item.materiality, *window, item.reason)
+    pairs = ((item.window_margin, item.margin), (item.window_materiality, item.materiality))
+    margin, materiality = (value if own is None else own for own, value in pairs)
+    return GateRule(item.metric, item.margin, item.weight, item.materiality, margin, materiality, item.reason)
 
 
 def _day(text: str) -> datetime.date | str:

@@ -155,6 +155,8 @@ class PassFrames:
         CPU time of each stage, and of all together.
     digests
         Hash of the packets since each frame, in the order received; the first one of packets before all frames.
+    cpu_s
+        CPU time of the whole run; NaN without the times of its frames.
     times
         Time tags of the packets.
     """
@@ -168,6 +170,7 @@ class PassFrames:
     latency_ms: Mapping[str, FloatArray] = field(default_factory=dict)
     undecodable: int = 0
     memory_mib: float = float("nan")
+    cpu_s: float = float("nan")
     digests: tuple[bytes, ...] = ()
     times: TimeTags = TimeTags()
 

@@ -82,33 +82,16 @@ def test_a_build_is_registered_held_against_another_and_judged(
 
 
 @pytest.mark.parametrize(
-    ("body", "status"),
+    "body",
     [
-        ({"candidate": "../../etc/passwd"}, 422),
-        ({"candidate": "0" * 64}, 422),
-        ({"candidate": "current", "archives": ["0" * 64]}, 422),
-        ({}, 422),
+        {"candidate": "../../etc/passwd"},
+        {"candidate": "0" * 64},
+        {"candidate": "current", "archives": ["0" * 64]},
+        {},
     ],
 )
-def test_a_regression_of_nothing_known_is_refused(
-    client: TestClient, body: dict[str, Any], status: int
-) -> None:
-    assert client.post(f"{V1}/regressions", json=body).status_code == status
-
-
-def test_a_verdict_that_is_not_there_is_not_found(client: TestClient) -> None:
-    assert client.get(f"{V1}/regressions/{'0' * 32}").status_code == 404
-
-
-def test_the_list_of_verdicts_is_empty_at_first(client: TestClient) -> None:
-    assert client.get(f"{V1}/regressions").json() == {
-        "items": [],
-        "total": 0,
-        "limit": 100,
-        "offset": 0,
-        "next": None,
-        "previous": None,
-    }
+def test_a_regression_of_nothing_known_is_refused(client: TestClient, body: dict[str, Any]) -> None:
+    assert client.post(f"{V1}/regressions", json=body).status_code == 422
 
 
 def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:

@@ -14,6 +14,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from benchmarks.gate_error_rates import each, late_headers, late_states, longer_packet, with_values
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
@@ -47,46 +48,25 @@ from ground_service.regression.store import ARCHIVES
 from ground_service.settings import Settings
 from ground_service.store.states import change_if
 from ground_service.worker.upkeep import DAY_NS, remove_archives
-from tmtc.crc import append_crc
 from tmtc.dictionary import DICTIONARY
 
 Packets = dict[str, list[bytes]]
 
 
-def altered(packets: Packets, change: Callable[[str, bytes], bytes]) -> Packets:
-    """Packets changed one by one; `change` gets the name of each."""
-    return {
-        name: [change(DICTIONARY.unpack(packet)[0], packet) for packet in some]
-        for name, some in packets.items()
-    }
+def altered(packets: Packets, change: Callable[[int, str, bytes], bytes]) -> Packets:
+    """Packets changed one by one; `change` gets the number and name of each."""
+    return {name: each(change)(some) for name, some in packets.items()}
 
 
 def with_detections(packets: Packets, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Packets:
     """Packets with the detections of each frame changed."""
 
-    def changed(name: str, packet: bytes) -> bytes:
+    def changed(_: int, name: str, packet: bytes) -> bytes:
         if name != "detections":
             return packet
-        decoded = DICTIONARY.unpack_packet(packet)
-        values = dict(decoded.values)
-        values["items"] = change(dict(values["items"]))
-        del values["count"]
-        return DICTIONARY.pack(
-            "detections",
-            values,
-            ticks=decoded.ticks,
-            sequence_count=int.from_bytes(packet[2:4], "big") & 0x3FFF,
-        )
+        return with_values(name, packet, items=change(DICTIONARY.unpack_packet(packet).values["items"]))
 
     return altered(packets, changed)
-
-
-def longer(name: str, packet: bytes) -> bytes:
-    """A packet with one more octet of data and a right checksum: another layout."""
-    if name != "navigation_state":
-        return packet
-    body = packet[:-2] + b"\0"
-    return append_crc(body[:4] + (len(body) + 2 - 7).to_bytes(2, "big") + body[6:])
 
 
 @pytest.fixture(scope="module")
@@ -153,14 +133,6 @@ def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packet
     assert told.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
 
 
-def test_lost_detections_fail_as_recall(judge, packets: Packets) -> None:
-    def thinned(items: dict[str, Any]) -> dict[str, Any]:
-        kept = np.arange(len(items["u_px"])) % 8 != 0
-        return {name: values[kept] for name, values in items.items()}
-
-    assert "detector.recall" in failed(judge(with_detections(packets, thinned)))
-
-
 def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) -> None:
     judge()  # the baseline is replayed before
     outcome = judge(network_ms=20.0)
@@ -176,71 +148,32 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) ->
     assert beside == [True, False, False]
 
 
-def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(judge, packets) -> None:
-    """The telemetry is otherwise the same: every metric is that of the baseline."""
-
-    def late(name: str, packet: bytes) -> bytes:
-        if name == "navigation_state":
-            return packet
-        seconds = int.from_bytes(packet[14:18], "big") + 7
-        return append_crc(packet[:14] + seconds.to_bytes(4, "big") + packet[18:-2])
-
-    outcome = judge(altered(packets, late))
-    assert failed(outcome) == {"telemetry.times"}
-    every = [packet for some in packets.values() for packet in some]
-    moved = sum(DICTIONARY.unpack(packet)[0] != "navigation_state" for packet in every)
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (late_headers, "contradict the image or step that they report, by up to 7.0 s"),
+        (late_states, "navigation_state packets name a time at which no image was taken"),
+    ],
+)
+def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(
+    judge, packets: Packets, fault: Any, told: str
+) -> None:
+    outcome = judge(altered(packets, fault))
+    assert failed(outcome) - {"telemetry.frames_without_value"} == {"telemetry.times"}
     times = next(gate for gate in outcome.gates if gate.name == "telemetry.times")
-    assert (times.baseline, times.candidate) == (0, moved)
-    assert (
-        "contradict the image or step that they report, by up to 7.0 s" in verdict_document(outcome).headline
+    moved = sum(
+        a != b
+        for name, some in altered(packets, fault).items()
+        for a, b in zip(some, packets[name], strict=True)
     )
-
-
-def test_states_that_name_no_image_fail_in_one_sentence(judge, packets: Packets) -> None:
-    def renamed(name: str, packet: bytes) -> bytes:
-        if name != "navigation_state":
-            return packet
-        decoded = DICTIONARY.unpack_packet(packet)
-        values = {**decoded.values, "image_ticks": decoded.values["image_ticks"] + 7 * 65536}
-        count = int.from_bytes(packet[2:4], "big") & 0x3FFF
-        return DICTIONARY.pack(name, values, ticks=decoded.ticks + 7 * 65536, sequence_count=count)
-
-    outcome = judge(altered(packets, renamed))
-    assert {"telemetry.times", "telemetry.frames_without_value"} <= failed(outcome)
-    told = verdict_document(outcome).headline
-    assert "90 of 90 navigation_state packets name a time at which no image was taken" in told
+    assert times.baseline == 0 < moved <= times.candidate
+    assert told in verdict_document(outcome).headline
 
 
 def test_packets_out_of_order_fail_in_one_sentence(judge, packets: Packets) -> None:
     outcome = judge({name: [*some[40:], *some[:40]] for name, some in packets.items()})
     assert failed(outcome) == {"telemetry.times"}
     assert "packets more than in the baseline are out of order in time" in verdict_document(outcome).headline
-
-
-def test_another_packet_layout_fails_as_telemetry(judge, packets: Packets) -> None:
-    outcome = judge(altered(packets, longer))
-    assert "telemetry.undecodable" in failed(outcome)
-    gate = next(gate for gate in outcome.gates if gate.name == "telemetry.undecodable")
-    assert gate.candidate == sum(
-        DICTIONARY.unpack(packet)[0] == "navigation_state" for some in packets.values() for packet in some
-    )
-
-
-def test_a_wrong_position_fails_as_navigation(judge, packets: Packets) -> None:
-    def displaced(name: str, packet: bytes) -> bytes:
-        if name != "navigation_state":
-            return packet
-        decoded = DICTIONARY.unpack_packet(packet)
-        values = {**decoded.values, "altitude_m": decoded.values["altitude_m"] + 400.0}
-        count = int.from_bytes(packet[2:4], "big") & 0x3FFF
-        return DICTIONARY.pack(name, values, ticks=decoded.ticks, sequence_count=count)
-
-    outcome = judge(altered(packets, displaced))
-    names = failed(outcome)
-    # Ten times the error on two passes is beyond what equal builds differ by; the odometries inform only.
-    assert "navigation.anchored.p50" in names
-    assert not any(name.startswith(("detector", "navigation.spherical")) for name in names)
-    assert {gate.outcome for gate in outcome.gates if "spherical" in gate.name} == {"informs"}
 
 
 @pytest.mark.parametrize(
@@ -282,6 +215,26 @@ def copy(passes: list[Any], tmp_path: Path) -> Path:
     folder = tmp_path / "copy"
     shutil.copytree(passes[0].folder, folder)
     return folder
+
+
+def test_a_sequence_ends_when_the_verdict_is_clear_or_the_time_is_used(
+    home, passes, packets, make_build, policy
+) -> None:
+    names = ("sequence", "first", "second")
+    programs = [{}, {"program": "raise SystemExit(4)"}, {"network_ms": 7.0}]
+    base, crash, same = (
+        register_build(home, load_build(make_build(name, packets, **options)))
+        for name, options in zip(names, programs, strict=True)
+    )
+    folders = [one.folder for one in passes]
+    failing = run_regression(home, folders, crash, base, policy, workers=2, minutes=60.0)
+    assert (failing.verdict, len(failing.passes)) == ("fail", 1)
+    assert failing.remarks[-1] == "sequential: fail after 1 of 2 passes (0.25 of the level)"
+    late = run_regression(home, folders, same, base, policy, workers=2, minutes=1e-9)
+    assert len(late.passes) == 1 and late.remarks[-1].endswith("after 1 of 2 passes (1 of the level)")
+    whole = run_regression(home, folders, same, base, policy, workers=2, minutes=60.0)
+    assert (whole.verdict, len(whole.passes)) == ("pass", 2)
+    assert whole.remarks[-1].endswith("pass after 2 of 2 passes (0.75 of the level)")
 
 
 def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy: Path) -> None:
@@ -476,7 +429,12 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     monkeypatch.setenv("LINNA_ARCHIVE_DAYS", "400")
     monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
     kept = Settings(home=tmp_path).kept
-    assert kept == {"retention_days": 90, "archive_days": 400, "archive_limit_mib": 2000, "audit_heads": None}
+    assert kept == {
+        "retention_days": 90,
+        "archive_days": 400,
+        "archive_limit_mib": 2000,
+        "audit_heads": None,
+    }
     with pytest.MonkeyPatch.context() as patched:
         called = MagicMock(return_value=[])
         patched.setattr("ground_service.worker.upkeep.let_go", called)
@@ -525,10 +483,6 @@ def test_a_registered_build_is_found_by_the_beginning_of_its_identity(
         (
             "[[gate]]\nmetric = 'x'\nweight = 0.1\nmateriality = 0.1\nmargin = 0.1\nreason = 'y'",
             "gate.1.margin: expected more than the materiality 0.1, found 0.1",
-        ),
-        (
-            "[[gate]]\nmetric = 'x'\nweight = 0.1\nwindow_margin = 1\nmargin = 0.1\nreason = 'y'",
-            "gate.1: expected window_materiality and window_margin, found one of them",
         ),
         (
             "[[gate]]\nmetric = 'x'\nweight = 0.1\nmargin = 0.1\nreason = 'y'",
@@ -624,28 +578,6 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
         assert case is not None and "frames decide it, 60 compared" in case.attrib["message"]
 
 
-def test_recall_that_falls_to_a_third_fails_on_two_passes_of_twelve_frames(
-    home, make_flyable, make_build, policy
-) -> None:
-    flown = {seed: make_flyable(frames=12, seed=seed) for seed in (43, 44)}
-    packets = {f"synthetic pass {seed}": one.packets for seed, one in flown.items()}
-
-    def thinned(items: dict[str, Any]) -> dict[str, Any]:
-        return {name: values[::3] for name, values in items.items()}
-
-    worse = with_detections(packets, thinned)
-    builds = [
-        register_build(home, load_build(make_build(name, some)))
-        for name, some in (("worse", worse), ("flown", packets))
-    ]
-    outcome = run_regression(home, [one.folder for one in flown.values()], *builds, policy, workers=2)
-    recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_name)
-    assert recall.candidate < 0.4 * recall.baseline
-    assert (recall.outcome, recall.frames) == ("fail", 24)
-    assert recall.limit == pytest.approx(recall.baseline - 0.1)
-    assert (outcome.verdict, verdict_document(outcome).exit_status) == ("fail", 1)
-
-
 def test_a_regression_without_a_gate_is_never_a_pass(judge, home, policy, passes, tmp_path: Path) -> None:
     outcome = judge()
     nothing = dataclasses.replace(outcome, gates=())
@@ -662,9 +594,7 @@ def waived_outcome(tmp_path: Path, home: Ground, make_build, passes, packets) ->
         f"{SHIPPED['ci'].read_text()}\n[[waiver]]\ngate = 'telemetry.*'\nreason = 'new <layout> & agreed'\n"
         "until = 9999-12-31\n"
     )
-    some = altered(
-        packets, lambda name, packet: longer(name, packet) if packet[2:4] == b"\xc0\x05" else packet
-    )
+    some = altered(packets, longer_packet)
     builds = [
         register_build(home, load_build(make_build(name, given)))
         for name, given in (("new", some), ("old", packets))

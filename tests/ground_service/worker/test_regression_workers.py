@@ -1,15 +1,10 @@
-"""A regression as jobs, one for each replay and one for the verdict; run here, and by a worker in a campaign."""
+"""A regression as jobs, one for each replay and one for the verdict."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from ground_service.ground import Ground, open_ground
 from ground_service.regression.archives import keep_archive
@@ -19,38 +14,6 @@ from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import run_job
-from tests.serving import wait_for
-
-
-@pytest.fixture
-def work(request: pytest.FixtureRequest) -> Callable[[Ground, str, list[str]], None]:
-    """A function that has the jobs run: in this process, or by a worker that Redis gives them to."""
-    return {"here": run_here, "worker": run_by_worker}[request.param]
-
-
-def run_here(ground: Ground, _broker: str, jobs: list[str]) -> None:
-    for job in jobs:
-        run_job(ground, job)
-
-
-def run_by_worker(ground: Ground, broker: str, jobs: list[str]) -> None:
-    environment = {
-        **os.environ,
-        "LINNA_HOME": str(ground.home),
-        "LINNA_BROKER_URL": broker,
-        "LINNA_DATA": "",
-    }
-    worker = subprocess.Popen(
-        [sys.executable, "-m", "linna", "worker", "--concurrency", "2"],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        wait_for(lambda: states_of(ground, jobs) == {"done"}, "the regression", 200.0)
-    finally:
-        worker.terminate()
-        worker.wait(30)
 
 
 def rows_of(ground: Ground, jobs: list[str]) -> list[dict[str, Any]]:
@@ -58,13 +21,8 @@ def rows_of(ground: Ground, jobs: list[str]) -> list[dict[str, Any]]:
         return [repository.get(connection, repository.JOBS, job, "job") for job in jobs]
 
 
-def states_of(ground: Ground, jobs: list[str]) -> set[str]:
-    return {row["state"] for row in rows_of(ground, jobs)}
-
-
-@pytest.mark.parametrize("work", ["here", pytest.param("worker", marks=pytest.mark.campaign)], indirect=True)
 def test_replays_are_separate_jobs_and_the_verdict_follows(
-    work: Callable[..., None], redis_url: str, make_flyable: Callable, make_build: Callable, tmp_path: Path
+    redis_url: str, make_flyable: Callable, make_build: Callable, tmp_path: Path
 ) -> None:
     flown = {f"synthetic pass {seed}": make_flyable(frames=10, seed=seed) for seed in (61, 62)}
     packets = {name: one.packets for name, one in flown.items()}
@@ -80,7 +38,8 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(
         replays = [dispatcher.submit("replay", replay) for replay in missing_replays(ground, arguments)]
         assert len(replays) == 4
         verdict = dispatcher.submit("regression", arguments)
-        work(ground, redis_url, [*replays, verdict])
+        for job in (*replays, verdict):
+            run_job(ground, job)
         rows = rows_of(ground, [*replays, verdict])
         assert [row["state"] for row in rows] == ["done"] * 5
         assert rows[-1]["result"] == {"regression_id": verdict, "verdict": "pass"}

@@ -1,4 +1,4 @@
-"""The whole chain from passes to a new catalogue, network and table on board, with a small network."""
+"""The chain from passes to a new catalogue and table on board."""
 
 from __future__ import annotations
 
@@ -19,18 +19,12 @@ from ground_service.evaluation.landmarks.service import decide_landmark
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
-from ground_service.regression.builds import load_build
 from linna import cli
 from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.replay import FlightBuild, replay_archive
 from payload_emulator.session.suite import suite_scenarios, write_suite
-from payload_emulator.training.data.feeder import TrainParameters
-from payload_emulator.training.data.landmarks import load_landmarks
-from payload_emulator.training.model.export import export
-from payload_emulator.training.model.train import train
 from tests.ground_service.conftest import write_manifest
-from tests.payload_emulator.training.conftest import write_blob_dataset
 from tmtc.dictionary import DICTIONARY
 from tmtc.large_data import LargeDataReceiver
 from tmtc.packets import TYPE_TELECOMMAND
@@ -45,7 +39,7 @@ KEPT = 6
 
 @dataclass(frozen=True)
 class Learned:
-    """A service that has searched two passes, and the files of the chain up to the labels.
+    """A service that has searched two passes, and the files of the chain.
 
     `archive` is an emulated pass with its frames, `thin` the catalogue of the service, which has every sixth
     crater.
@@ -98,29 +92,7 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     shown = linna("landmarks", "show", proposed[1]["id"])
     assert (shown["state"], shown["decided_by"], len(shown["evidence"])) == ("accepted", "ann", 2)
     linna("landmarks", "export", "--catalogue", folder / "old.csv", "--out", folder / "new.csv")
-    linna("landmarks", "export", "--labels", "--out", folder / "labels.csv")
     return Learned(folder, written.folder, thin, len(proposed), before["unmatched"], linna)
-
-
-@pytest.fixture(scope="module")
-def build(learned: Learned) -> Path:
-    """A build of a small network that was trained with the labels."""
-    return _trained(learned.folder)
-
-
-@pytest.mark.campaign
-def test_the_gate_judges_the_network_trained_with_the_labels_on_an_archived_pass(
-    learned: Learned, build: Path
-) -> None:
-    learned.linna("regress", "build", "register", build)
-    [registered] = learned.linna("regress", "build", "list")["builds"]
-    assert registered["name"] == "learned"
-    # two steps of training give no detector, and the gate says so
-    words = ("regress", "run", "--archive", learned.archive, "--build", build, "--baseline", "current")
-    judged = learned.linna(*words, status=1)
-    assert judged["verdict"] == "fail" and judged["candidate"]["name"] == "learned"
-    recall = next(one for one in judged["gates"] if one["name"] == "detector.recall")
-    assert recall["candidate"] < 0.05 < 0.5 < recall["baseline"]
 
 
 def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) -> None:
@@ -182,21 +154,6 @@ def _matched(ground: Ground, pass_id: int) -> int:
     """Return the number of landmarks that the anchored estimator used in all frames."""
     [anchored] = [one for one in load_pass_inputs(ground, pass_id).navigation if one.estimator == "anchored"]
     return int(anchored.matched.sum())
-
-
-def _trained(folder: Path) -> Path:
-    dataset = write_blob_dataset(folder / "set", {"train": 4, "val": 2})
-    parameters = TrainParameters(
-        minutes=0.0, steps=2, batch=2, crop_px=128, warm_up_steps=1, validation_frames=1, replicas=1,
-        detail_blocks=0,
-    )  # fmt: skip
-    landmarks = load_landmarks(folder / "labels.csv")
-    train([dataset], folder / "run", parameters, landmarks=landmarks)
-    export(folder / "run" / "checkpoint.pt", folder / "learned.onnx", [dataset])
-    build = folder / "build.toml"
-    build.write_text('schema_version = 1\nname = "learned"\nversion = "1"\nmodel = "learned.onnx"\n')
-    assert load_build(build).name == "learned"
-    return build
 
 
 def _received(octets: bytes) -> bytes:
