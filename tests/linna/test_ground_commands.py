@@ -227,7 +227,6 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("command", "list", "--limit", 2)
             ask("command", "receiver", "--spacecraft-id", 76)
             do("command", "hold", "antenna", "--spacecraft-id", 76)
-            ask("command", "hold", "antenna", "--spacecraft-id", 76)
             do("command", "resume", "--spacecraft-id", 76)
             do("command", "note", "camera warm", "--spacecraft-id", 76)
             assert do("command", "handovers")["handovers"][0]["note"] == "camera warm"
