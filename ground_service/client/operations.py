@@ -543,16 +543,16 @@ class Operations(Connection):
         """List the notes of the last shift and the holds, by spacecraft."""
 
     @operation("PUT /spacecraft/{spacecraft_id}/handover", body=("note",))
-    def note_handover(
+    def change_handover(
         self, spacecraft_id: int, note: str, *, instance: str = "flight"
     ) -> commanding.Handover:
-        """Write the note for the next shift."""
+        """Change the note for the next shift."""
 
     @operation("POST /spacecraft/{spacecraft_id}/hold", body=("reason",))
     def hold_spacecraft(
         self, spacecraft_id: int, reason: str, *, instance: str = "flight"
     ) -> commanding.Handover:
-        """Stop the release and the transmission of telecommands of a spacecraft at once, automatic ones included."""
+        """Suppress release and transmission of telecommands of a spacecraft at once, automatic ones included."""
 
     @operation("DELETE /spacecraft/{spacecraft_id}/hold")
     def resume_spacecraft(self, spacecraft_id: int, *, instance: str = "flight") -> commanding.Handover:

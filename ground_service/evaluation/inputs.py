@@ -324,7 +324,7 @@ def _clock_step_s(connection: Connection, record: PassRecord, span: PassSpan) ->
 
 def _experiment(mission: Mission, manifest: Mapping[str, Any]) -> StartOrbit | None:
     """Return the orbit that a pass of the experiment starts from; an archive belongs to it if the mission has one."""
-    if "window_id" in manifest:
+    if "window_id" in manifest or "experiment" in manifest:
         stated = manifest.get("experiment") or {}
     else:
         stated = mission.experiment.model_dump(include={"orbit_error_m", "orbit_age_h"})

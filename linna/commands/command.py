@@ -170,7 +170,7 @@ COMMANDS: Commands = {
         _handover,
     ),
     "note": Command(
-        "note_handover",
+        "change_handover",
         "write the note for the next shift",
         _handover,
         options={"note": "replaces the one before"},

@@ -109,9 +109,7 @@ def fly_until(live: LiveSession, utc_ns: int) -> None:
     raise AssertionError("the console ended")
 
 
-def write_archive(
-    folder: Path, octets: bytes, mission: str, window: Window, start_state: dict[str, Any]
-) -> Path:
+def write_archive(folder: Path, octets: bytes, mission: str, window: Window, uploads: dict[str, Any]) -> Path:
     folder.mkdir()
     (folder / "downlink.cadu").write_bytes(octets)
     for name in ("reference.oem", "catalogue.csv"):
@@ -126,7 +124,7 @@ def write_archive(
         "stop_utc": format_utc(LAST),
         "cadence_s": window.cadence_s,
         "frames_expected": window.predicted.frames,
-        "start_state": start_state,
+        **uploads,
         "files": {name: {"sha256": sha256} for name, sha256 in files.items()},
     }
     (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
@@ -191,12 +189,13 @@ def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
             wait_for(lambda: api.get_window(window).state == "processed", "the report of the window")
             planned = api.get_window(window)
             of_live = report_of(api, planned.pass_id, folder / "live.json")
+            flown = api.get_pass(planned.pass_id).manifest
             archive = write_archive(
                 folder / "archive",
                 without_headers(bytes(captured)),
                 mission,
                 planned,
-                api.get_pass(planned.pass_id).manifest["start_state"],
+                {key: flown[key] for key in ("start_state", "experiment")},
             )
             imported = api.import_archive(archive)
             of_archive = report_of(api, imported, folder / "archive.json")

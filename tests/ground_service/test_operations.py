@@ -18,8 +18,8 @@ from tests.serving import TestClient
 
 VERBS = {
     "accept", "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export",
-    "find", "get", "import", "keep", "list", "refuse", "reject", "release", "render", "repeat", "request",
-    "revoke", "run",
+    "find", "get", "hold", "import", "keep", "list", "refuse", "reject", "release", "render", "repeat", "request",
+    "resume", "revoke", "run",
     "search", "send", "shelve", "start", "take", "uplink", "upload", "withdraw",
 }  # fmt: skip
 SUMMARY_VERBS = {

@@ -98,15 +98,15 @@ add_list(telecommands, "/handovers", store.list_handovers)
 
 
 @telecommands.put("/spacecraft/{spacecraft_id}/handover")
-def note_handover(
+def change_handover(
     ground: GroundOf,
     caller: Operator,
     spacecraft_id: SpacecraftId,
     given: HandoverNote,
     instance: Instance = FLOWN,
 ) -> Handover:
-    """Write the note for the next shift."""
-    return commanding.note_handover(ground, spacecraft_id, instance, given.note, actor=caller.name)
+    """Change the note for the next shift."""
+    return commanding.change_handover(ground, spacecraft_id, instance, given.note, actor=caller.name)
 
 
 @telecommands.post("/spacecraft/{spacecraft_id}/hold", responses=problems(409))
@@ -117,7 +117,7 @@ def hold_spacecraft(
     given: Rejection,
     instance: Instance = FLOWN,
 ) -> Handover:
-    """Stop the release and the transmission of telecommands of a spacecraft at once, automatic ones included."""
+    """Suppress release and transmission of telecommands of a spacecraft at once, automatic ones included."""
     return commanding.hold_spacecraft(ground, spacecraft_id, instance, reason=given.reason, actor=caller.name)
 
 

@@ -251,7 +251,7 @@ def _change_hold(
         return _handed_over(connection, vehicle, "resume" if reason is None else "hold", actor)
 
 
-def note_handover(ground: Ground, spacecraft_id: int, instance: str, note: str, *, actor: str) -> Handover:
+def change_handover(ground: Ground, spacecraft_id: int, instance: str, note: str, *, actor: str) -> Handover:
     """Replace the note for the next shift."""
     with ground.database.writing() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id

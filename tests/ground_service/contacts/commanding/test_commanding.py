@@ -13,11 +13,11 @@ from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.core import SentCommand, VerificationReport, fate_of
 from ground_service.contacts.commanding.model import HandoverFilter, TelecommandFilter
 from ground_service.contacts.commanding.service import (
+    change_handover,
     enter_command,
     get_command,
     hold_spacecraft,
     list_telecommands,
-    note_handover,
     note_timeouts,
     reject_command,
     release_command,
@@ -700,9 +700,9 @@ def test_nothing_is_released_or_sent_while_a_spacecraft_is_on_hold(either: Groun
 
 def test_a_hold_keeps_the_note_and_a_note_keeps_the_hold(ground: Ground) -> None:
     entered(ground)
-    note_handover(ground, SPACECRAFT, "flight", "camera warm", actor="ann")
+    change_handover(ground, SPACECRAFT, "flight", "camera warm", actor="ann")
     hold_spacecraft(ground, SPACECRAFT, "flight", reason="antenna", actor="bob")
-    note_handover(ground, SPACECRAFT, "flight", "camera cold", actor="eva")
+    change_handover(ground, SPACECRAFT, "flight", "camera cold", actor="eva")
     (found,) = ground.read(list_handovers, HandoverFilter(spacecraft_id=SPACECRAFT)).items
     assert (found.note, found.noted_by, found.held_by, found.hold_reason) == (
         "camera cold", "eva", "bob", "antenna",
