@@ -241,10 +241,8 @@ def _change_hold(
     with ground.database.writing() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id
         lock_spacecraft(connection, vehicle)  # what is being released or taken now comes before the hold
-        if reason is None:
-            changed = store.set_hold(connection, vehicle, actor=None)
-        else:
-            changed = store.set_hold(connection, vehicle, actor=actor, reason=reason, now_utc_ns=utc_now_ns())
+        holder = None if reason is None else actor
+        changed = store.set_hold(connection, vehicle, holder, reason or "", now_utc_ns=utc_now_ns())
         if not changed:
             _require_not_held(connection, vehicle)
             raise Conflict(f"spacecraft {spacecraft_id} ({instance}): expected a hold, found none")

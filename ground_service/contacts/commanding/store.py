@@ -107,17 +107,12 @@ def note_handover(connection: Connection, vehicle: int, note: str, *, actor: str
 
 
 def set_hold(
-    connection: Connection,
-    vehicle: int,
-    *,
-    actor: str | None,
-    reason: str = "",
-    now_utc_ns: int | None = None,
+    connection: Connection, vehicle: int, held_by: str | None, reason: str, *, now_utc_ns: int
 ) -> bool:
-    """Hold a vehicle, or end its hold if `actor` is None; return whether this has changed anything."""
+    """Hold a vehicle, or end its hold if `held_by` is None; return whether this has changed anything."""
     repository.add_new(connection, HANDOVERS, vehicle_id=vehicle, note="", hold_reason="")
-    before = HANDOVERS.c.held_by.is_not(None) if actor is None else HANDOVERS.c.held_by.is_(None)
-    values = {"held_by": actor, "held_utc_ns": now_utc_ns, "hold_reason": reason}
+    before = HANDOVERS.c.held_by.is_not(None) if held_by is None else HANDOVERS.c.held_by.is_(None)
+    values = {"held_by": held_by, "held_utc_ns": held_by and now_utc_ns, "hold_reason": reason}
     changed = update(HANDOVERS).where(HANDOVERS.c.vehicle_id == vehicle, before).values(**values)
     return connection.execute(changed).rowcount == 1
 

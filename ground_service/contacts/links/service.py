@@ -404,6 +404,8 @@ def take_transmissions(ground: Ground, declared: DeclaredLink, owner: str) -> li
         octets, ids = commanding.take_released(
             connection, vehicle, declared.spacecraft_id, framed=declared.link.format == "cltu", actor=ACTOR
         )
+        if commanding.is_held(connection, declared.spacecraft_id, declared.link.instance):
+            return []
         if ids:
             store.add_transmission(
                 connection,

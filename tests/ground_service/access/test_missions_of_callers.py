@@ -150,7 +150,7 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: API
             assert answer.status_code == 403, answer.text
             assert "expected a spacecraft of the missions ours, found" in answer.json()["detail"]
     state = SimpleNamespace(ground=fleet.client.app.state.ground)
-    asked = SimpleNamespace(
+    asked: Any = SimpleNamespace(
         scope={"route": route},
         path_params=values,
         query_params=query,
@@ -160,9 +160,9 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: API
     for caller in (Caller("eve", "viewer"), fleet.theirs):
         if scope.decision == "service" and caller.missions is not None:
             with pytest.raises(Forbidden, match="found an operation of the whole service"):
-                check_scope(asked, caller)  # type: ignore[arg-type]
+                check_scope(asked, caller)
         else:
-            check_scope(asked, caller)  # type: ignore[arg-type]
+            check_scope(asked, caller)
 
 
 @pytest.mark.parametrize("name", sorted(DECIDED["list"]))

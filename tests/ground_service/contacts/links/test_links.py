@@ -234,14 +234,21 @@ def test_manual_links_send_on_request_only(ground: Ground, station: Station, str
         service.request_send(ground, "other", actor="ann")
 
 
+def taken_and_not_sent(ground: Ground, station: Station) -> tuple[list[int], service.DeclaredLink]:
+    """Two telecommands that a process took and did not send; its lease of 1 ns has ended."""
+    declare(ground, station.link())
+    keys = released(ground, 2)
+    declared = service.declared_links(ground)["lab"]
+    assert service.acquire(ground, declared, "dead", 1)
+    assert len(service.take_transmissions(ground, declared, "dead")) == 1
+    time.sleep(0.01)
+    return keys, declared
+
+
 def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(
     either: Ground, station: Station, stream: bytes
 ) -> None:
-    declare(either, station.link())
-    keys = released(either, 2)
-    declared = service.declared_links(either)["lab"]
-    assert service.acquire(either, declared, "dead", 1)
-    assert len(service.take_transmissions(either, declared, "dead")) == 1  # taken, and not on the wire
+    keys, declared = taken_and_not_sent(either, station)
     hold_spacecraft(either, 76, "flight", reason="antenna", actor="ann")
     assert service.take_transmissions(either, declared, "dead") == []
     with operated(either) as runner:
@@ -260,12 +267,7 @@ def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(
 def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
     either: Ground, station: Station, stream: bytes
 ) -> None:
-    declare(either, station.link())
-    keys = released(either, 2)
-    declared = service.declared_links(either)["lab"]
-    assert service.acquire(either, declared, "dead", 1)
-    assert len(service.take_transmissions(either, declared, "dead")) == 1
-    time.sleep(0.01)  # the lease of 1 ns has ended
+    keys, declared = taken_and_not_sent(either, station)
     assert service.take_transmissions(either, declared, "nobody") == service.take_transmissions(
         either, declared, "dead"
     )
