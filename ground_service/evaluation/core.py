@@ -333,6 +333,7 @@ def summary_of(report: PassReport) -> dict[str, Any]:
                 "margin": one.margin,
                 "status": one.status,
                 "note": one.note,
+                "question": one.question,
             }
             for one in report.requirements
         ],

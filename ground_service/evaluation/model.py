@@ -140,6 +140,7 @@ class RequirementFigures(Entity):
     margin: float | None
     status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
     note: str
+    question: str = Field(default="operations", description="operations or experiment")
 
 
 class ResidualFigures(Entity):

@@ -88,7 +88,8 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
         degree=3,
         comments=(
             "states of the on-board navigation filter after each frame, downlinked;",
-            f"turned into ICRF with the orientation {inputs.orientation.name}",
+            f"turned into ICRF with the orientation {inputs.orientation.name};",
+            f"evidence level: {inputs.evidence_level or 'not stated'}",
         ),
         covariances=covariances,
     )

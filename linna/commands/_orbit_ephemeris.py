@@ -158,7 +158,8 @@ def run_convert(arguments: argparse.Namespace) -> int:
         ephemeris = ephemeris_from_states(epochs, *ephemeris.at(epochs), object_name=name)
     written = writers[out.suffix.lower()](ephemeris)
     save(out, written if isinstance(written, bytes) else written.encode())
-    figures = {"out": str(out), "states": len(ephemeris.utc_ns), "segments": len(ephemeris.segments)}
+    states = sum(len(segment.utc_ns) for segment in ephemeris.segments)
+    figures = {"out": str(out), "states": states, "segments": len(ephemeris.segments)}
     return emit(arguments, figures, text=f"{figures['states']} states -> {out}")
 
 

@@ -47,11 +47,15 @@ def describe(found: PassFigures) -> str:
 
 
 def requirement_lines(requirements: list[dict[str, Any]]) -> list[str]:
-    """Return the judged requirements as lines of text, failures first, with what is noted on those not met."""
+    """Return the judged requirements as lines of text, failures first, with what is noted on those not met.
+
+    Those of the experiment are marked: the verdict of operations does not count them.
+    """
     order = ("not met", "unknown", "met")
     judged = [one for one in requirements if one["status"] in order]
+    marks = {"experiment": "experiment, "}
     return [
-        f"  {one['status']:<8} {one['name']}: {_figure(one['value'], one['unit'])}, "
+        f"  {one['status']:<8} {marks.get(one['question'], '')}{one['name']}: {_figure(one['value'], one['unit'])}, "
         f"limit {one['relation']} {_figure(one['limit'], one['unit'])}"
         + (f" ({one['note']})" if one["note"] and one["status"] != "met" else "")
         for one in sorted(judged, key=lambda one: order.index(one["status"]))

@@ -247,6 +247,7 @@ def _kept(service: Client, given: list[str]) -> list[str]:
     for item in given:
         path = Path(item)
         if path.exists():
+            log(f"checking {item} ...")
             digests.append(_upload(service, path, known))
         elif item in known:
             digests.append(known[item])
@@ -275,7 +276,7 @@ def _upload(service: Client, path: Path, known: Container[str]) -> str:
 
 def _percent() -> Callable[[Job], None]:
     """Return a function that logs the progress of a job when it has changed."""
-    shown = 0.0
+    shown = -PROGRESS_STEP
 
     def show(job: Job) -> None:
         nonlocal shown

@@ -39,6 +39,6 @@ def detectable(policy: GatePolicy, frames: int, passes: int) -> list[dict[str, A
 
 
 def power_text(found: Sequence[dict[str, Any]]) -> str:
-    """Return the detectable losses as one line."""
+    """Return the losses that all passes together detect, as one line."""
     told = ", ".join(f"{one['metric']} {one['change']:.2g}" for one in found)
-    return f"found with a power of {POWER:g}, a loss of: {told}"
+    return f"all passes together find with a power of {POWER:g} a loss of: {told}"

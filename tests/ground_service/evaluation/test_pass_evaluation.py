@@ -811,7 +811,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
     assert summary["requirements"][0] == {
         "key": "accuracy.median", "name": "median 3-D error", "value": pytest.approx(500.0, abs=0.01),
         "limit": 1000.0, "relation": "<=", "unit": "m", "margin": pytest.approx(500.0, abs=0.01),
-        "status": "met", "note": "paper, 12 samples",
+        "status": "met", "note": "paper, 12 samples", "question": "operations",
     }  # fmt: skip
     relations = {one["key"]: one["relation"] for one in summary["requirements"]}
     assert relations["detector.recall"] == ">="

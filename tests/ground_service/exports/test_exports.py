@@ -67,6 +67,7 @@ def test_oem_is_the_reference_in_the_interval_of_the_pass(rich_ground: Ground, r
 
 def test_oem_of_the_filter_has_its_states_and_covariances(rich_ground: Ground, rich_pass: RichPass) -> None:
     segment = parse_oem(export(rich_ground, "oem", "anchored").decode()).segments[0]
+    assert segment.comments[-1] == "evidence level: not stated"
     reference = load_ephemeris(rich_pass.folder / "reference.oem")
     np.testing.assert_array_equal(segment.utc_ns, rich_pass.utc_ns)
     np.testing.assert_allclose(
