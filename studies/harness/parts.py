@@ -234,11 +234,13 @@ class PostgresServer:
 
     Parameters
     ----------
+    superuser
+        Role that `initdb` makes and that owns the database.
     settings
         Settings of the server, such as `shared_buffers`.
     """
 
-    def __init__(self, folder: Path, **settings: str) -> None:
+    def __init__(self, folder: Path, superuser: str = "linna", **settings: str) -> None:
         found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
         if not found:
             raise GroundError("expected PostgreSQL on this machine, found none under /usr/lib/postgresql")
@@ -252,7 +254,7 @@ class PostgresServer:
             self.place = Path(tempfile.mkdtemp(prefix="linna-postgres-", dir=None if self._user else folder))
             if self._user:
                 shutil.chown(self.place, "postgres", "postgres")
-            self.run("initdb", "-D", str(self.place / "data"), "-U", "linna", "-A", "trust", "--no-sync")
+            self.run("initdb", "-D", str(self.place / "data"), "-U", superuser, "-A", "trust", "--no-sync")
         else:
             self.place = Path(note.read_text())
         words = ["-p", str(self.port), "-k", str(self.place), "-h", "127.0.0.1", "-c", "fsync=off"]
@@ -261,7 +263,7 @@ class PostgresServer:
         self.part = Part(server, folder / "postgres.log", self._answers, cwd=self.place)
         self.part.start()
         if is_new:
-            self.run("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", "linna", "linna")
+            self.run("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", superuser, "linna")
             note.write_text(str(self.place))
 
     def __enter__(self) -> PostgresServer:

@@ -3,154 +3,214 @@
 from __future__ import annotations
 
 import os
+import re
+import ssl
+import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
+from ground_service.regression.runner import alive
 from studies.harness.parts import Part, PostgresServer, answers_http, bare_environment, free_port, listens
 from tests.ground_service.access.openid import CLIENT, running_provider
 from tests.ground_service.archive_hash import hash_of
 from tests.ground_service.object_server import running_objects
 from tests.ground_service.test_deployment import ROOT, SERVICES, default_of, environment_of
+from tests.ground_service.test_proxy import configured_proxy
 from tests.serving import wait_for
 
 PIECES = 8
+APIS = ("api", "api2")
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Settings of one deployment, and the server that they name: how it is lost, and what an upload gets meanwhile."""
+
+    settings: dict[str, str] = field(default_factory=dict)
+    stop: Callable[[], None] = lambda: None
+    start: Callable[[], None] = lambda: None
+    meanwhile: int = 202
+
+
+@dataclass(frozen=True)
+class Deployed:
+    """What runs: the parts by their names in the compose file, the addresses and the token of the administrator."""
+
+    parts: dict[str, Part]
+    addresses: dict[str, str]
+    secrets: Path
+    database_url: str
+
+    def client(self, name: str) -> httpx.Client:
+        """Return a client of the proxy or of one API process."""
+        token = (self.secrets / "admin_token").read_text()
+        return httpx.Client(
+            base_url=self.addresses[name],
+            headers={"Authorization": f"Bearer {token}"},
+            verify=ssl.create_default_context(cafile=str(self.secrets / "tls/certificate")),
+            timeout=30.0,
+        )
 
 
 @contextmanager
-def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Iterator[dict[str, Part]]:
-    """Run the processes with the declared settings, `overlay` for all of them, and private ports and folders.
+def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Iterator[Deployed]:
+    """Run every process that stays, after the migration; only addresses and folders are not the declared ones.
 
     The volume of the archive is one folder, or with an object store a folder for each process.
     """
-    for name in ("secret", "broker_password"):
-        (folder / name).write_text("secret")
-    with PostgresServer(folder) as database, ExitStack() as running:
-        service, broker, ports = database.prepare_service(), free_port(), {}
-        places = {
-            "LINNA_DATABASE_URL": service,
-            "LINNA_BROKER_URL": f"redis://linna@127.0.0.1:{broker}/0",
-            **{f"LINNA_{name}": str(folder / name) for name in ("DATA", "RUNNER_EXCHANGE", "BACKUPS")},
-            **{f"LINNA_{name}_PASSWORD_FILE": str(folder / "secret") for name in ("DATABASE", "BROKER")},
+    secrets, broker = folder / "secrets", free_port()
+    programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    run = {"PATH": programs, "LINNA_SECRETS_DIR": str(secrets), "LINNA_SECRETS": str(secrets)}
+    subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=run, capture_output=True)
+    with PostgresServer(folder, superuser="postgres") as database, ExitStack() as running:
+        here = {
+            "/run/secrets": str(secrets),
+            "@db:5432": f"@127.0.0.1:{database.port}",
+            "@broker:6379": f"@127.0.0.1:{broker}",
+            default_of("${LINNA_FRONT_SUBNET:-172.30.42.0/24}"): "127.0.0.1/32",
         }
-        (folder / "DATA").mkdir()
+        volumes = {f"/{name}": folder / name for name in ("data", "exchange", "backup")}
+        for volume in volumes.values():
+            volume.mkdir()
+
+        def local(text: str) -> str:
+            found = "|".join(re.escape(one) for one in here)
+            text = re.sub(found, lambda match: here[match[0]], default_of(text)).replace("$$", "$")
+            return str(volumes.get(text, text))
+
+        def environment(name: str) -> dict[str, str]:
+            home = folder / ("home" if is_shared else name)
+            home.mkdir(exist_ok=True)
+            declared = {key: local(value) for key, value in environment_of(name).items()}
+            return bare_environment(**declared, PATH=programs) | {"LINNA_HOME": str(home)} | overlay
+
+        server = {"PGHOST": "127.0.0.1", "PGPORT": str(database.port)}
+        roles = {**run, **server, "POSTGRES_USER": "postgres", "POSTGRES_DB": "linna"}
+        subprocess.run(["sh", str(ROOT / "deploy/postgres-roles.sh")], check=True, env=roles)
+        migration = [local(word) for word in SERVICES["migrate"]["entrypoint"]]
+        subprocess.run(migration, check=True, env=environment("migrate"))
         words = ["--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder)]
-        with open_ground(folder, database_url=service) as ground:
-            (folder / "token").write_text(add_user(ground, "ann", "operator"))
-        (folder / "url").write_text(service)
         parts = {"db": database.part}
         parts["broker"] = Part(
             ["sh", str(ROOT / "deploy/redis.sh"), *words],
             folder / "broker.log",
             lambda: listens(broker),
-            env={**os.environ, "LINNA_SECRETS": str(folder), "LINNA_REDIS_USERS": f"{folder}/users"},
+            env={**run, "LINNA_REDIS_USERS": f"{folder}/users"},
         )
-        for name in ("api", "api2", "worker", "scheduler"):
-            home, log, ports[name] = (
-                folder / ("home" if is_shared else name),
-                folder / f"{name}.log",
-                free_port(),
-            )
-            home.mkdir(exist_ok=True)
-            declared = {key: default_of(value) for key, value in environment_of(name).items()}
-            there = {key: value for key, value in places.items() if key in declared}
-            declared |= there | {"LINNA_HOME": str(home)} | overlay
-            command = [*SERVICES[name]["command"]]
-            if name.startswith("api"):
+        ports = {name: free_port() for name in (*APIS, "proxy")}
+        for name in (*APIS, "worker", "scheduler", "runner"):
+            command, log = [local(word) for word in SERVICES[name]["command"]], folder / f"{name}.log"
+            if name in APIS:
                 command[command.index("--host") + 1] = "127.0.0.1"
                 command[command.index("--port") + 1] = str(ports[name])
-            ready = (
-                (lambda port=ports[name]: answers_http(f"http://127.0.0.1:{port}/readyz"))
-                if name.startswith("api")
-                else (lambda log=log: log.exists() and log.stat().st_size > 0)
-            )
-            parts[name] = Part(
-                [sys.executable, "-m", "linna", *command], log, ready, env=bare_environment(**declared)
-            )
-            (folder / f"{name}.port").write_text(str(ports[name]))
+            ready: Callable[[], bool] = {
+                **{
+                    api: lambda api=api: answers_http(f"http://127.0.0.1:{ports[api]}/readyz") for api in APIS
+                },
+                "runner": lambda: alive(folder / "exchange"),
+            }.get(name, lambda log=log: log.exists() and log.stat().st_size > 0)
+            parts[name] = Part([sys.executable, "-m", "linna", *command], log, ready, env=environment(name))
+        proxy = configured_proxy(folder, secrets, ports["proxy"], (ports["api"], ports["api2"]))
+        parts["proxy"] = Part(
+            ["nginx", "-c", str(proxy), "-e", f"{folder}/error.log", "-g", "daemon off;"],
+            folder / "proxy.log",
+            lambda: listens(ports["proxy"]),
+        )
         for name, part in parts.items():
             running.callback(part.end)
             if name != "db":
                 part.start()
-        yield parts
-
-
-def carried(folder: Path, downlink: bytes, parts: dict[str, Part]) -> str:
-    """Give pieces to both API processes in turn while broker and database are killed; return the page of sign-in."""
-    token = (folder / "token").read_text()
-    apis = [
-        httpx.Client(
-            base_url=f"http://127.0.0.1:{(folder / f'{name}.port').read_text()}",
-            headers={"Authorization": f"Bearer {token}"},
-            timeout=30.0,
+        addresses = {name: f"http://127.0.0.1:{ports[name]}" for name in APIS}
+        yield Deployed(
+            parts,
+            {**addresses, "proxy": f"https://localhost:{ports['proxy']}"},
+            secrets,
+            local("postgresql+psycopg://linna@db:5432/linna"),
         )
-        for name in ("api", "api2")
-    ]
+
+
+def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
+    """Give pieces to the proxy while broker, database, an API process and the overlay's server are lost.
+
+    Returns
+    -------
+    str
+        Page of sign-in that both API processes name.
+    """
     size, jobs = -(-len(downlink) // PIECES), []
-    for k in range(PIECES):
-        if k in (3, 5):
-            parts["broker" if k == 3 else "db"].kill()
-            parts["broker" if k == 3 else "db"].start()
+    with service.client("proxy") as proxy:
 
-        def accepted(k: int = k) -> bool:
+        def answer(k: int) -> httpx.Response:
             path = f"/api/v1/telemetry?spacecraft_id=76&stream=downlink&offset={k * size}"
-            answer = apis[k % 2].post(
-                path, content=downlink[k * size : (k + 1) * size], headers={"Idempotency-Key": f"piece {k}"}
-            )
-            assert answer.status_code in (202, 503), answer.text
-            if answer.status_code == 202:
-                jobs.append(answer.json()["job_id"])
-            return answer.status_code == 202
+            piece = downlink[k * size : (k + 1) * size]
+            return proxy.post(path, content=piece, headers={"Idempotency-Key": f"piece {k}"})
 
-        wait_for(accepted, f"piece {k}")
-    for job in jobs:
-        wait_for(lambda job=job: apis[0].get(f"/api/v1/jobs/{job}").json()["state"] == "done", job, 120.0)
-    assert not [name for name, part in parts.items() if part.has_ended]
+        def accepted(k: int) -> bool:
+            found = answer(k)
+            assert found.status_code in (202, 502, 503), found.text
+            if found.status_code == 202:
+                jobs.append(found.json()["job_id"])
+            return found.status_code == 202
+
+        lost = {3: "broker", 5: "db", 6: "api"}
+        for k in range(PIECES):
+            if k in lost:
+                service.parts[lost[k]].kill()
+                service.parts[lost[k]].start()
+            if k == 2:
+                overlay.stop()
+                assert answer(k).status_code == overlay.meanwhile
+                overlay.start()
+            wait_for(lambda k=k: accepted(k), f"piece {k}")
+        for job in jobs:
+            wait_for(lambda job=job: proxy.get(f"/api/v1/jobs/{job}").json()["state"] == "done", job, 120.0)
+    assert not [name for name, part in service.parts.items() if part.has_ended]
     # Both API processes answer the same, also for what a provider needs.
-    signed = {tuple(api.get("/sign-in/provider").headers.get("location", "").split("?")[:1]) for api in apis}
-    assert len(signed) == 1
-    found = [api.get("/api/v1/ingests").json()["items"] for api in apis]
+    found, signed = [], set()
+    for name in APIS:
+        with service.client(name) as api:
+            signed.add(api.get("/sign-in/provider").headers.get("location", "").split("?")[0])
+            found.append(api.get("/api/v1/ingests").json()["items"])
     assert found[0] == found[1] and len(found[0]) == PIECES
-    for api in apis:
-        api.close()
-    return signed.pop()[0]
+    assert len(signed) == 1
+    return signed.pop()
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "overlay", ["base", *(pytest.param(one, marks=pytest.mark.campaign) for one in ("objects", "provider"))]
+    "kind", ["base", *(pytest.param(one, marks=pytest.mark.campaign) for one in ("objects", "provider"))]
 )
-def test_no_acknowledged_piece_is_lost_with_broker_and_database_killed(
-    overlay: str, synthetic_pass: Any, tmp_path: Path
+def test_no_acknowledged_piece_is_lost_with_any_server_lost(
+    kind: str, synthetic_pass: Any, tmp_path: Path
 ) -> None:
     downlink = synthetic_pass.folder / "downlink.cadu"
     with open_ground(tmp_path / "reference") as ground:
         ingest_file(ground, downlink)
         expected = hash_of(ground)
     with ExitStack() as stack:
-        given: dict[str, str] = {}
-        if overlay == "objects":
-            given = stack.enter_context(running_objects("deployed")).environment()
-        if overlay == "provider":
+        overlay = Overlay()
+        if kind == "objects":
+            objects = stack.enter_context(running_objects("deployed"))
+            overlay = Overlay(objects.environment(), objects.stop, objects.start, 503)
+        if kind == "provider":
             provider = stack.enter_context(running_provider())
-            given = {
-                "LINNA_OIDC_ISSUER": provider.issuer,
-                "LINNA_OIDC_CLIENT_ID": CLIENT,
-                "LINNA_OIDC_ROLES": "operator=linna-operators",
-            }
+            settings = {"ISSUER": provider.issuer, "CLIENT_ID": CLIENT, "ROLES": "operator=linna-operators"}
+            named = {f"LINNA_OIDC_{name}": value for name, value in settings.items()}
+            overlay = Overlay(named, provider.stop, provider.start)
         (tmp_path / "run").mkdir()
-        parts = stack.enter_context(deployed(tmp_path / "run", given, is_shared=overlay != "objects"))
-        page = carried(tmp_path / "run", downlink.read_bytes(), parts)
-        assert (page != "") == (overlay == "provider")
-        url = (tmp_path / "run/url").read_text()
-        with open_ground(tmp_path / "run", database_url=url) as ground:
+        running = deployed(tmp_path / "run", overlay.settings, is_shared=kind != "objects")
+        service = stack.enter_context(running)
+        page = carried(downlink.read_bytes(), service, overlay)
+        assert (page != "") == (kind == "provider")
+        with open_ground(tmp_path / "run", database_url=service.database_url) as ground:
             assert hash_of(ground) == expected

@@ -59,6 +59,24 @@ class Proxied:
             process.wait(60)
 
 
+def configured_proxy(folder: Path, secrets: Path, port: int, upstreams: tuple[int, int]) -> Path:
+    """Write the configuration of the compose file's proxy, with private ports and folders; return its file."""
+    text = (ROOT / "deploy/nginx.conf").read_text()
+    for old, new in (
+        (" /tmp/", f" {folder}/"),
+        ("worker_processes 2;", "worker_processes 1;" + ("user root;" if os.geteuid() == 0 else "")),
+        ("server api:8042 ", f"server 127.0.0.1:{upstreams[0]} "),
+        ("server api2:8042 ", f"server 127.0.0.1:{upstreams[1]} "),
+        ("listen 8443 ssl;", f"listen 127.0.0.1:{port} ssl;"),
+        ("/run/tls/", f"{secrets}/tls/"),
+        ("error_log /dev/stderr", f"error_log {folder}/error.log"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "nginx.conf").write_text(text)
+    return folder / "nginx.conf"
+
+
 @pytest.fixture(scope="module")
 def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     if shutil.which("nginx") is None:
@@ -67,19 +85,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     secrets, upstream, port = folder / "secrets", free_port(), free_port()
     environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(secrets)}
     subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=environment, capture_output=True)
-    text = (ROOT / "deploy/nginx.conf").read_text()
-    for old, new in (
-        (" /tmp/", f" {folder}/"),
-        ("worker_processes 2;", "worker_processes 1;" + ("user root;" if os.geteuid() == 0 else "")),
-        ("server api:8042 ", f"server 127.0.0.1:{upstream} "),
-        ("server api2:8042 ", f"server 127.0.0.1:{upstream} "),
-        ("listen 8443 ssl;", f"listen 127.0.0.1:{port} ssl;"),
-        ("/run/tls/", f"{secrets}/tls/"),
-        ("error_log /dev/stderr", f"error_log {folder}/error.log"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "nginx.conf").write_text(text)
+    configuration = configured_proxy(folder, secrets, port, (upstream, upstream))
     with open_ground(folder / "home") as ground:
         token = add_user(ground, "ann", "operator")
     settings = {
@@ -105,7 +111,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
                 return False
 
     try:
-        with made.running(folder / "nginx.conf"):
+        with made.running(configuration):
             wait_for(answers, "the service behind the proxy", 120.0)
             yield made
     finally:

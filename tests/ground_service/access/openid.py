@@ -38,8 +38,21 @@ class OpenIdProvider:
         self.codes_once = True
         self.metadata: dict[str, Any] = {}
         self.requests: list[str] = []
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
-        self.issuer = f"http://127.0.0.1:{self.server.server_port}/realms/ops"
+        self.start()
+        self.issuer = f"http://127.0.0.1:{self.port}/realms/ops"
+
+    def start(self) -> None:
+        """Answer, on the port of before after a stop."""
+        self._server = ThreadingHTTPServer(("127.0.0.1", getattr(self, "port", 0)), self._handler())
+        self.port = self._server.server_port
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Answer no more."""
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
 
     def authorise(self, address: str) -> str:
         """Return where the provider sends the browser that opens its sign-in page."""
@@ -133,11 +146,7 @@ class OpenIdProvider:
 def running_provider() -> Iterator[OpenIdProvider]:
     """Yield a provider that answers on a private port."""
     provider = OpenIdProvider()
-    thread = threading.Thread(target=provider.server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
     try:
         yield provider
     finally:
-        provider.server.shutdown()
-        thread.join()
-        provider.server.server_close()
+        provider.stop()

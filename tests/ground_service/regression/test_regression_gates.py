@@ -506,5 +506,7 @@ def test_what_the_frames_can_detect_is_stated_before_a_run() -> None:
     weighted = [rule.metric for rule in POLICY.rules if rule.weight]
     assert [one["metric"] for one in few] == weighted[:-1]  # position errors need ten passes
     assert all(a["change"] > b["change"] for a, b in zip(few, many, strict=True))
-    assert power_text(few).startswith("all passes together find with a power of 0.8 a loss of: detector.recall 0.")
+    assert power_text(few).startswith(
+        "all passes together find with a power of 0.8 a loss of: detector.recall 0."
+    )
     assert detectable(POLICY, 0, 0) == []
