@@ -1,4 +1,4 @@
-"""`linna demo`: one observation window from the orbit to the report."""
+"""`linna demo`: one observation window from the orbit to the report, or a spacecraft that flies on."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from linna.commands._ground import local_actor
+from linna.commands._ground import event_of_signals, local_actor
 from linna.commands.pass_ import requirement_lines
 from linna.output import emit, finish, log, progress
 from linna.parser import option
@@ -21,8 +21,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "folder for the pass archive, the ground database and the report",
         Path("linna-demo"),
     )
-    option(parser, "--scenario", str, "scenario file or name", "selenita")
+    option(parser, "--scenario", str, "scenario file or name (default: selenita; live: live-demo)")
     option(parser, "--seed", int, "another seed than the scenario's")
+    option(parser, "--live", bool, "fly and operate a spacecraft until Ctrl-C, with the pages of the service")
+    option(parser, "--rate R", float, "live: simulated seconds per second", 60.0)
+    option(parser, "--port P", int, "live: port of the service", 8042)
     finish(parser, run)
 
 
@@ -35,7 +38,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     started = time.monotonic()
     data = data_folder()
-    scenario = load_scenario(arguments.scenario).with_choices(seed=arguments.seed)
+    chosen = arguments.scenario or ("live-demo" if arguments.live else "selenita")
+    scenario = load_scenario(chosen).with_choices(seed=arguments.seed)
+    if arguments.live:
+        from studies.mission_run.living import living_demo
+
+        stopping = event_of_signals()
+        living_demo(scenario, data, arguments.out, arguments.rate, arguments.port, log, stopping)
+        return 0
     archive = arguments.out / "pass"
     log("emulating the payload ...")
     emulated = emulate(

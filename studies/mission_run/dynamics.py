@@ -112,11 +112,17 @@ class FlightDynamics:
 
 
 def write_flight(
-    scenario: Scenario, data: DataFolder, mission: Path, windows_per_day: int, window_s: float
+    scenario: Scenario,
+    data: DataFolder,
+    mission: Path,
+    windows_per_day: int,
+    window_s: float,
+    ports: dict[str, tuple[int, int]] | None = None,
 ) -> str:
     """Write what the ground posts to fly a scenario, beside its mission description; return the description.
 
-    The files are `craters.csv`, `reference.oem` and `request.json`.
+    The files are `craters.csv`, `reference.oem` and `request.json`. `ports` are those of the stations for telemetry
+    and telecommands (default: as `linna emulate --live` opens them).
     """
     dynamics, folder = FlightDynamics(open_world(scenario, data)), mission.parent
     craters = folder / "craters.csv"
@@ -124,5 +130,5 @@ def write_flight(
     dynamics.save_reference(scenario.epoch_utc_ns, folder / "reference.oem")
     request = dynamics.request(windows_per_day, window_s)
     (folder / "request.json").write_text(json.dumps(request, indent=2) + "\n", encoding="utf-8")
-    ports = default_ports(station_names(scenario, has_operator=False))
+    ports = ports or default_ports(station_names(scenario, has_operator=False))
     return live_mission_text(dynamics.world, data, "127.0.0.1", ports, OPERATIONS, catalogue=craters)
