@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -32,7 +32,7 @@ from lunar.timescales import parse_utc
 CHROMIUM = "/usr/bin/chromium"
 OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
 START_S = 180.0
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 NS = 1_000_000_000
 # Counts the requests of a page's scripts until their answers are read, and notes what was refused.
 COUNT_REQUESTS = """
@@ -273,12 +273,17 @@ def browser() -> Iterator[Browser]:
         chromium.close()
 
 
+def patient(context: BrowserContext) -> BrowserContext:
+    """Let the pages of a context wait long."""
+    context.set_default_timeout(PATIENCE_S * 1e3)
+    return context
+
+
 @contextmanager
 def strict_page(browser: Browser, url: str) -> Iterator[Page]:
     """Open a page that permits no error in the console, no violation of the policy and no request to another host."""
-    context = browser.new_context(base_url=url, viewport={"width": 1280, "height": 900})
+    context = patient(browser.new_context(base_url=url, viewport={"width": 1280, "height": 900}))
     opened = context.new_page()
-    opened.set_default_timeout(PATIENCE_S * 1e3)
     opened.add_init_script(
         "document.addEventListener('securitypolicyviolation', (event) =>"
         " console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"
@@ -297,9 +302,8 @@ def strict_page(browser: Browser, url: str) -> Iterator[Page]:
 @pytest.fixture
 def page(browser: Browser, service: Service) -> Iterator[Page]:
     """A fresh page of the service; the test fails if a script of it did, or if it asked another host."""
-    context = browser.new_context(base_url=service.url, viewport={"width": 1280, "height": 900})
+    context = patient(browser.new_context(base_url=service.url, viewport={"width": 1280, "height": 900}))
     opened = context.new_page()
-    opened.set_default_timeout(PATIENCE_S * 1e3)
     opened.add_init_script(COUNT_REQUESTS)
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))

@@ -7,6 +7,7 @@ from playwright.sync_api import expect
 
 from ground_service.access.service import add_user, list_tokens, list_users
 from ground_service.ground import open_ground
+from tests.ground_service.web.conftest import patient
 from tests.serving import token_valid
 
 
@@ -25,7 +26,7 @@ def managed(tmp_path_factory, serve, console):
 @pytest.fixture
 def admin(browser, managed):
     """The page of users, of an administrator who has signed in."""
-    context = browser.new_context(base_url=managed[0])
+    context = patient(browser.new_context(base_url=managed[0]))
     page = context.new_page()
     page.goto("/users")
     page.get_by_label("Token", exact=True).fill(managed[2])

@@ -4,6 +4,7 @@ from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
+from tests.ground_service.web.conftest import patient
 
 
 def test_the_api_page_shows_and_calls_operations_without_console_errors(page):
@@ -26,7 +27,7 @@ def test_the_api_page_uses_the_session_of_the_signed_in_user(browser, serve, con
     with open_ground(tmp_path / "home") as ground:
         token = add_user(ground, "ann", "viewer")
     running = serve(tmp_path / "home", tmp_path / "serve.log", console.port)
-    context = browser.new_context(base_url=running.url)
+    context = patient(browser.new_context(base_url=running.url))
     try:
         page = context.new_page()
         page.goto("/licences")

@@ -10,7 +10,7 @@ from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
-from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S
+from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered, colour_of, settled
 
 
@@ -34,9 +34,8 @@ def compared(tmp_path_factory, make_pass, console, serve):
 @pytest.fixture
 def view(browser, compared):
     """A page of the service; the test fails if a script of it fails."""
-    context = browser.new_context(base_url=compared.url, viewport={"width": 1280, "height": 900})
+    context = patient(browser.new_context(base_url=compared.url, viewport={"width": 1280, "height": 900}))
     page = context.new_page()
-    page.set_default_timeout(PATIENCE_S * 1e3)
     page.add_init_script(COUNT_REQUESTS)
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))

@@ -20,7 +20,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.web.conftest import Pictures, strict_page, wait_until
+from tests.ground_service.web.conftest import Pictures, patient, strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -201,7 +201,7 @@ def test_a_notebook_keeps_entries_with_their_author_for_other_browsers(mct, show
     name = json.loads(ask(f"{shown.url}/api/v1/session")[1])["name"]
     assert notebook["created_by"] == name and notebook["document"]["createdBy"] == name
     assert f"'createdBy': '{name}'" in str(notebook["document"]["configuration"]["entries"])
-    other = browser.new_context(base_url=shown.url).new_page()
+    other = patient(browser.new_context(base_url=shown.url)).new_page()
     try:
         other.goto(f"/mct#/browse/linna.stored:layouts/linna.stored:{notebook['key']}")
         expect(other.get_by_text("The camera fault began after the slew.").first).to_be_visible(
@@ -269,7 +269,9 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser, 
     assert kept["document"]["tags"] == ["anomaly"]
     (target,) = kept["document"]["targets"]
     assert target["keyString"].endswith("~temperature_c") and target["minX"] < target["maxX"]
-    other = browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900}).new_page()
+    other = patient(
+        browser.new_context(base_url=shown.url, viewport={"width": 1280, "height": 900})
+    ).new_page()
     try:
         again = open_plot(other, shown.url)
         for scheme in ("dark", "light"):
@@ -365,7 +367,7 @@ def test_a_layout_is_stored_for_other_browsers(mct, shown, browser):
     mct.get_by_label("Title", exact=True).fill("Shift of Monday")
     mct.get_by_label("Save", exact=True).click()
     expect(mct.get_by_role("region", name="Shift of Monday Object View")).to_be_visible(timeout=WAIT_MS)
-    other = browser.new_context(base_url=shown.url).new_page()
+    other = patient(browser.new_context(base_url=shown.url)).new_page()
     try:
         other.goto("/mct#/browse/linna.stored:layouts")
         expect(other.get_by_text("Shift of Monday").first).to_be_visible(timeout=30_000)

@@ -15,7 +15,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue
 from tests.ground_service.conftest import write_manifest
-from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S
+from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered
 from tests.ground_service.web.test_sign_in import sign_in
 
@@ -48,10 +48,9 @@ def review(browser, searched):
     contexts, errors = [], []
 
     def open_page(role):
-        context = browser.new_context(base_url=searched[0], viewport={"width": 1280, "height": 900})
+        context = patient(browser.new_context(base_url=searched[0], viewport={"width": 1280, "height": 900}))
         contexts.append(context)
         page = context.new_page()
-        page.set_default_timeout(PATIENCE_S * 1e3)
         page.add_init_script(COUNT_REQUESTS)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto("/landmarks")

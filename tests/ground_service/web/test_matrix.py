@@ -32,7 +32,7 @@ from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import SPACECRAFT, START
 from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
-from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, Service, wait_until
+from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient, wait_until
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
 
@@ -271,7 +271,6 @@ def record(rows: list[str], path: str, state: str, found: Faults) -> None:
 def new_page(context: BrowserContext) -> Page:
     """Return a page that counts its requests."""
     page = context.new_page()
-    page.set_default_timeout(PATIENCE_S * 1e3)
     page.add_init_script(COUNT_REQUESTS)
     return page
 
@@ -279,7 +278,7 @@ def new_page(context: BrowserContext) -> Page:
 @pytest.fixture(scope="module")
 def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
     """The browser of somebody who is signed in."""
-    context = browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844})
+    context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
     page = context.new_page()
     page.goto("/licences")
     page.get_by_label("Token").fill(worked.token)
@@ -293,7 +292,9 @@ def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
 @pytest.fixture(scope="module")
 def newcomer(browser: Browser, empty_service: Service) -> Iterator[BrowserContext]:
     """The browser of somebody at a service without data."""
-    context = browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844})
+    context = patient(
+        browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844})
+    )
     yield context
     context.close()
 
@@ -333,7 +334,7 @@ def test_a_page_without_data_has_no_fault(
 
 @LOOKS
 def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[str], looks: Looks) -> None:
-    context = browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844})
+    context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
     page = new_page(context)
     page.goto("/")
     expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()

@@ -17,7 +17,7 @@ from ground_service.planning.service import add_window
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc
-from tests.ground_service.web.conftest import COUNT_REQUESTS, PATIENCE_S, Pictures, wait_until
+from tests.ground_service.web.conftest import COUNT_REQUESTS, Pictures, patient, wait_until
 from tests.ground_service.web.test_in_browser import answered, camera_fault, receive, settled
 from tmtc.downlink import encode_cadus
 
@@ -188,12 +188,11 @@ def signed_in(browser, guarded):
     contexts = []
 
     def open_page(role):
-        context = browser.new_context(base_url=guarded[0])
+        context = patient(browser.new_context(base_url=guarded[0]))
         contexts.append(context)
         headers = {"Content-Type": "application/json"}
         context.request.post("/api/v1/session", data={"token": guarded[1][role]}, headers=headers)
         page = context.new_page()
-        page.set_default_timeout(PATIENCE_S * 1e3)
         page.add_init_script(COUNT_REQUESTS)
         return page
 
@@ -323,7 +322,6 @@ def planner(browser, tmp_path, console, serve, day_of_orbits):
             add_window(ground, WindowEntry(name, start, start + 1200 * 10**9, 15.0, 76), actor="ann")
     running = serve(home, home / "serve.log", console.port)
     page = browser.new_page(base_url=running.url, viewport={"width": 1280, "height": 900})
-    page.set_default_timeout(PATIENCE_S * 1e3)
     page.add_init_script(COUNT_REQUESTS)
     page.goto("/planner")
     expect(page.locator("#timeline .curve")).to_have_count(3)
@@ -380,9 +378,11 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     page.locator("#selected").get_by_role("button", name="Change").click()
     wait_until(lambda: times(page, 1) == (62.0, 75.0), "not changed by the form")
     answered(page)
-    # In one step: an update of the page replaces the bar.
+    # In one step, and again while there is none: an update of the page replaces the bar.
     page.evaluate("document.querySelector('#timeline [data-window=\"1\"]').scrollIntoView()")
-    box = bar.locator("rect").bounding_box()
+    boxes = [None]
+    wait_until(lambda: boxes.append(bar.locator("rect").bounding_box()) or boxes[-1] is not None, "no bar")
+    box = boxes[-1]
     page.mouse.move(box["x"] + 3, box["y"] + 5)  # the start
     page.mouse.down()
     page.mouse.move(box["x"] + 3 - box["width"] / 2, box["y"] + 5, steps=4)

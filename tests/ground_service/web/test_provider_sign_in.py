@@ -6,6 +6,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.ground_service.access.openid import CLIENT, SECRET, running_provider
+from tests.ground_service.web.conftest import patient
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(
     """The session cookie is strict: a redirect from the provider to the page would come without it."""
     url = signed_in_elsewhere
     assert "localhost" in url and "127.0.0.1" in provider.issuer
-    context = browser.new_context(base_url=url)
+    context = patient(browser.new_context(base_url=url))
     page = context.new_page()
     page.goto("/users?offset=0#tokens")
     expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()

@@ -31,7 +31,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, Pictures, end_socket, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, Pictures, end_socket, patient, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
@@ -230,9 +230,8 @@ def dismiss_notices(page: Page) -> None:
 @pytest.fixture
 def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
     """The operator's browser; the test fails if a script fails or the console shows an error."""
-    context = browser.new_context(base_url=shift.url, viewport={"width": 1280, "height": 800})
+    context = patient(browser.new_context(base_url=shift.url, viewport={"width": 1280, "height": 800}))
     page = context.new_page()
-    page.set_default_timeout(PATIENCE_S * 1e3)
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     yield page

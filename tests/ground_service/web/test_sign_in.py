@@ -5,6 +5,7 @@ from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
+from tests.ground_service.web.conftest import patient
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,7 @@ def guarded(tmp_path_factory, console, serve):
 @pytest.fixture
 def stranger(browser, guarded):
     """A page of somebody who has not signed in."""
-    context = browser.new_context(base_url=guarded[0])
+    context = patient(browser.new_context(base_url=guarded[0]))
     opened = context.new_page()
     yield opened
     context.close()
