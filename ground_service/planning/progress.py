@@ -105,12 +105,15 @@ def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
         and not store.has_reports_between(connection, vehicle, stop + AWAITED_TICKS, stop + HEARD_TICKS)
         and _is_interrupted(connection, vehicle, start, stop)
     )
+    commands = views_of_window(connection, window.id, utc_now_ns())
+    failed = (f"{view.record.name} {view.remark}" for view in commands if view.state == "failed")
     return WindowFacts(
         decision=window.decision,
         replaced=store.is_replaced(connection, window),
         predecessor_failed=predecessor is not None
         and store.get_window(connection, predecessor).state == "failed",
-        command_states=tuple(view.state for view in views_of_window(connection, window.id, utc_now_ns())),
+        command_states=tuple(view.state for view in commands),
+        failure=next(failed, ""),
         frames=frames,
         started=STARTED in events,
         stopped=STOPPED in events,

@@ -34,7 +34,9 @@ class WindowFacts:
     replaced
         Whether a later window that has not failed covers part of its time: data of that time belong to the later one.
     command_states
-        States of the telecommands that carry it up and of those they carry, with the failure where one failed.
+        States of the telecommands that carry it up and of those they carry.
+    failure
+        Name of the first of them that failed, with the reason.
     frames
         Frames of it that came down.
     started, stopped
@@ -55,6 +57,7 @@ class WindowFacts:
     predecessor_failed: bool = False
     replaced: bool = False
     command_states: tuple[str, ...] = ()
+    failure: str = ""
     frames: int = 0
     started: bool = False
     stopped: bool = False
@@ -80,7 +83,7 @@ def state_of(facts: WindowFacts) -> tuple[str, str | None]:
     if begun:
         return "executing", None
     if "failed" in facts.command_states:
-        return "failed", "a telecommand of it failed"
+        return "failed", f"a telecommand of it failed: {facts.failure or 'no reason is known'}"
     if facts.predecessor_failed:
         return "failed", "its predecessor failed"
     sent = bool(facts.command_states) and not {"queued", "released", "carried"} & set(facts.command_states)

@@ -23,6 +23,9 @@ from studies.mission_run.dynamics import DAY_NS, FlightDynamics, write_flight
 WINDOWS_A_DAY = 12
 """A window in almost every revolution, so that a visitor sees one soon."""
 
+HORIZON_DAYS = 0.3
+"""The on-board schedule holds the telecommands of nine windows."""
+
 WINDOW_S = 480.0
 LOOK_S = 1.0
 
@@ -73,7 +76,8 @@ def living_demo(
         client.add_catalogue(folder / "craters.csv")
         client.add_mission(mission)
         client.add_ephemeris(folder / "reference.oem")
-        client.add_request(json.loads((folder / "request.json").read_text()))
+        request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
+        client.add_request({**request, "horizon_days": HORIZON_DAYS})
         say(f"{address}/ shows the shift at {rate:g} times real time; Ctrl-C ends")
         dynamics, day, now = None, 0, ClockFile(clock)
         while not stopping.wait(LOOK_S):

@@ -258,3 +258,8 @@ def test_the_state_follows_from_the_facts(facts: WindowFacts, expected: str) -> 
     state, reason = state_of(facts)
     assert state == expected
     assert (reason is not None) == (state == "failed" and facts.decision == "approved")
+
+
+def test_a_window_that_failed_names_the_telecommand_and_its_failure() -> None:
+    facts = WindowFacts("approved", command_states=("failed",), failure="insert_activity not accepted: busy")
+    assert state_of(facts)[1] == "a telecommand of it failed: insert_activity not accepted: busy"
