@@ -170,7 +170,7 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
                 overlay.stop()
                 assert answer(k).status_code == overlay.meanwhile
                 overlay.start()
-            wait_for(lambda k=k: accepted(k), f"piece {k}")
+            wait_for(lambda k=k: accepted(k), f"piece {k}", 120.0)
         for job in jobs:
             wait_for(lambda job=job: proxy.get(f"/api/v1/jobs/{job}").json()["state"] == "done", job, 120.0)
     assert not [name for name, part in service.parts.items() if part.has_ended]
