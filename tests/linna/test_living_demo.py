@@ -1,24 +1,55 @@
-"""`linna demo --live`: the parts start, telecommands of a window are sent, and all end with the command."""
+"""`linna demo --live`: the parts start, documents are posted, and all end with the command or with a part."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 from threading import Event
+from unittest.mock import MagicMock
 
 import pytest
 
 from ground_service.client import Client
+from ground_service.errors import GroundError
 from linna.data import data_folder
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import load_scenario
 from studies.harness.parts import Part, bare_environment, free_port, listens
-from studies.mission_run.living import living_demo
+from studies.mission_run import living
 from tests.serving import wait_for
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(300)
+def test_a_part_that_ends_is_named_after_the_documents_were_posted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, client, said = tmp_path / "demo", MagicMock(), list[str]()
+    client.__enter__.return_value = client
+
+    def written(*_: object) -> str:
+        (folder / "request.json").write_text('{"windows": 12, "horizon_days": 1.0}')
+        return ""
+
+    def parts(folder: Path, *_: object) -> dict[str, Part]:
+        program = [sys.executable, "-c", "import time; time.sleep(0.5)"]
+        return {"spacecraft": Part(program, folder / "spacecraft.log", lambda: True)}
+
+    monkeypatch.setattr(living, "write_flight", written)
+    monkeypatch.setattr(living, "_parts", parts)
+    monkeypatch.setattr(living, "Client", lambda _: client)
+    monkeypatch.setattr(living, "LOOK_S", 0.01)
+    demo = (load_scenario("live-demo"), data_folder(), folder, 60.0, 8042, said.append, Event())
+    with pytest.raises(GroundError, match="spacecraft: expected it to run, found its end; see "):
+        living.living_demo(*demo)
+    posted = [name for name, _, _ in client.method_calls]
+    assert posted == ["add_catalogue", "add_mission", "add_ephemeris", "add_request"]
+    client.add_request.assert_called_once_with({"windows": 12, "horizon_days": living.HORIZON_DAYS})
+    assert said[-1] == "http://127.0.0.1:8042/ shows the shift at 60 times real time; Ctrl-C ends"
+    with pytest.raises(ScenarioError, match="expected a new folder for a living demo, found one with files"):
+        living.living_demo(*demo)
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(600)
 def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path: Path) -> None:
     port, log = free_port(), tmp_path / "log"
     words = ["demo", "--live", "--out", tmp_path / "demo", "--port", port, "--rate", 240]
@@ -38,9 +69,7 @@ def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path: Path) -> N
                 & {one.state for one in client.list_windows()}
             ),
             "telecommands of a window sent",
-            200.0,
+            300.0,
         )
         demo.finish()
         assert not listens(port)
-    with pytest.raises(ScenarioError, match="expected a new folder for a living demo, found one with files"):
-        living_demo(load_scenario("live-demo"), data_folder(), tmp_path / "demo", 1.0, port, print, Event())
