@@ -18,13 +18,13 @@ from ground_service.clock import mission_now_ns, set_mission_clock
 from ground_service.ground import open_ground
 from ground_service.http.times import UtcTime
 from ground_service.planning.request_model import PlannedCandidate, RequestPlan
+from lunar.boxes import Box, inside_box
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.mission import live_mission_text
-from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.session.regions import observed_boxes
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world import open_world

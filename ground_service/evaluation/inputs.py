@@ -18,6 +18,7 @@ from ground_service.evaluation.detection.fixes import IdentificationSamples
 from ground_service.evaluation.detection.landmarks import MappedCraters, mapped_craters
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.instruments import instrument_reports
+from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
 from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits, StartOrbit
@@ -27,7 +28,7 @@ from ground_service.missions.ephemerides.attitudes import AttitudeTable, load_at
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
 from ground_service.missions.ephemerides.store import covering_ephemerides, get_ephemeris
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
-from ground_service.missions.model import Camera, Mission
+from ground_service.missions.model import Camera, Evidence, Mission
 from ground_service.missions.service import mission_of_pass
 from ground_service.missions.timekeeping.core import largest_step_s
 from ground_service.missions.timekeeping.model import Correlation
@@ -45,6 +46,8 @@ from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import Vehicle, get_vehicle
+from lunar.boxes import share_outside
+from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from lunar.frames import Orientation
@@ -110,6 +113,9 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
         viewing = viewing_of(mission.camera, attitude_table(ground.files, record), span)
         vehicle = get_vehicle(connection, record.vehicle_id)
         ephemeris = reference_of(connection, record)
+        reference = None if ephemeris is None else load_ephemeris(ground.files.path(ephemeris.sha256))
+        detections = detection_samples(connection, span)
+        imaged = reference_states(reference, declared.orientation, detections.utc_ns[detections.usable])
         return PassInputs(
             pass_id=str(pass_id),
             title=record.name,
@@ -118,9 +124,9 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             packets=packet_accounting(ground.files, connection, record, span),
             viewing=viewing,
             orientation=declared.orientation,
-            reference=None if ephemeris is None else load_ephemeris(ground.files.path(ephemeris.sha256)),
+            reference=reference,
             catalogue=_catalogue(ground, record),
-            detections=detection_samples(connection, span),
+            detections=detections,
             navigation=navigation_samples(connection, span),
             outcomes=outcome_samples(connection, span),
             start_state=start_state_of(manifest),
@@ -156,12 +162,25 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
                 correlations_in_force(connection, span.vehicle),
             ),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
-            evidence_level=mission.evidence.text,
+            evidence_level=evidence_of_frames(mission.evidence, viewing.camera, imaged).text,
             configuration=_configuration(manifest, record),
             scenario_text=str(manifest.get("scenario_toml", "")),
             generated_for="",
             created_utc=created_utc,
         )
+
+
+def evidence_of_frames(stated: Evidence, camera: PinholeCamera, frames: ReferenceStates) -> Evidence:
+    """Return the evidence of a pass: the share of its frames over unseen terrain follows from their ground track.
+
+    Without a reference of any frame the share is unknown. A description without the ground used in training states
+    the share itself.
+    """
+    ground = stated.trained_regions
+    if ground is None:
+        return stated
+    share = share_outside(ground, camera, frames.latitude_rad, frames.longitude_rad, frames.altitude_m)
+    return stated.model_copy(update={"unseen_share": share})
 
 
 def navigation_samples(connection: Connection, span: PassSpan) -> tuple[NavigationSamples, ...]:

@@ -20,6 +20,7 @@ from ground_service.http.times import UtcTime
 from ground_service.missions.rules import Automation
 from ground_service.missions.section import Array, Section
 from ground_service.toml import faults, read_table
+from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError
 from lunar.timescales import parse_utc
 from tmtc.dictionary import DICTIONARY
@@ -281,15 +282,43 @@ LEVEL_WORDS: dict[Level, str] = {
 }
 
 
+BoxLimits = Annotated[tuple[float, float, float, float], Array]
+
+
+class TrainedGround(Section):
+    """Ground used in training: in `boxes`, and further than `buffer_km` from those of `avoid`.
+
+    Boxes are west, east, south and north in degrees.
+    """
+
+    boxes: Annotated[tuple[BoxLimits, ...], Array]
+    avoid: Annotated[tuple[BoxLimits, ...], Array] = ()
+    buffer_km: NotNegative = 0.0
+
+
 class Evidence(Section):
     """Simulated or real world of the flight, from which the evidence level follows.
 
-    `unseen_share` is the share of frames over real terrain that was not used in training.
+    `unseen_share` is the share of frames over real terrain that was not used in training. With `trained_on` it is that
+    of each pass, by the ground track of its frames.
     """
 
     world: World | None = None
     seed: int | None = None
     unseen_share: Share | None = None
+    trained_on: Annotated[tuple[TrainedGround, ...], Array] | None = None
+
+    @property
+    def trained_regions(self) -> tuple[Region, ...] | None:
+        """Return the ground used in training; None if it is not stated."""
+        if self.trained_on is None:
+            return None
+        return tuple(
+            Region(
+                tuple(Box(*one) for one in part.boxes), tuple(Box(*one) for one in part.avoid), part.buffer_km
+            )
+            for part in self.trained_on
+        )
 
     @property
     def level(self) -> Level | None:

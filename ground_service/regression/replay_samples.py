@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.detection.viewing import Viewing
-from ground_service.evaluation.inputs import orientation_of
+from ground_service.evaluation.inputs import evidence_of_frames, orientation_of
+from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.missions.ephemerides.attitudes import (
     ATTITUDE_FILES,
     attitude_file,
@@ -90,6 +91,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
     text = (folder / "payload/dictionary.json").read_text(encoding="utf-8")
     utc_ns = _frame_times(folder, [row["frame"] for row in rows], ticks)
     camera = camera_of(mission.camera)
+    orientation, reference = orientation_of(mission, data), load_ephemeris(folder / "reference.oem")
     return PassContext(
         name=archive.name,
         manifest=archive.manifest,
@@ -97,12 +99,14 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
         frame_utc_ns=utc_ns,
         frame_names=tuple(row["image"] or "" for row in rows),
         dictionary=parse_dictionary(text, str(folder / "payload/dictionary.json")),
-        reference=load_ephemeris(folder / "reference.oem"),
+        reference=reference,
         catalogue=load_catalogue(folder / "catalogue.csv"),
         camera=camera,
-        orientation=orientation_of(mission, data),
+        orientation=orientation,
         viewing=_viewing(folder, mission.camera, camera, ticks, utc_ns),
-        evidence=mission.evidence,
+        evidence=evidence_of_frames(
+            mission.evidence, camera, reference_states(reference, orientation, utc_ns)
+        ),
         mission=mission.revision,
         step_ticks=np.array([row["ticks"] for row in frame_inputs(folder, steps=True)], dtype=np.int64),
     )

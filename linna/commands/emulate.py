@@ -56,6 +56,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "what the images of --images are (default: not stated)",
         "",
     )
+    option(parser, "--check", bool, "fly nothing: print what would be flown; exit status 2 with a fault")
     _add_live(parser)
     option(parser, "--campaign FILE", str, "fly the fault campaign of a file, or a shipped one by name")
     finish(parser, run)
@@ -141,6 +142,8 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(chosen).with_choices(
         modes=arguments.mode, seed=arguments.seed, anchoring_catalogue=arguments.anchoring_catalogue
     )
+    if arguments.check:
+        return _check(arguments, scenario)
     if arguments.campaign:
         return _campaign(arguments, scenario)
     if arguments.live:
@@ -160,6 +163,35 @@ def run(arguments: argparse.Namespace) -> int:
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
     return emit(arguments, summary, text=describe(summary, arguments.out))
+
+
+def _check(arguments: argparse.Namespace, scenario: Scenario) -> int:
+    from ground_service.missions.model import parse_mission
+    from linna.data import data_folder
+    from lunar.timescales import format_utc
+    from payload_emulator.session.mission import mission_text
+    from payload_emulator.session.world import build_world
+
+    data = data_folder()
+    world = build_world(scenario, data)
+    mission = parse_mission(mission_text(world, data), scenario.name)
+    times = world.frame_utc_ns
+    figures = {
+        "scenario": scenario.name,
+        "frames": len(times),
+        "start_utc": format_utc(int(times[0]), 0),
+        "stop_utc": format_utc(int(times[-1]), 0),
+        "estimators": list(scenario.navigation.estimators),
+        "stations": list(scenario.link.stations),
+        "unknown": list(mission.unknown),
+        "data": list(world.data_names),
+    }
+    return emit(
+        arguments,
+        figures,
+        text=f"{scenario.name}: {len(times)} frames, {figures['start_utc']} to {figures['stop_utc']}, estimators "
+        f"{', '.join(scenario.navigation.estimators)}\ndata: {'; '.join(world.data_names)}",
+    )
 
 
 def _campaign(arguments: argparse.Namespace, scenario: Scenario) -> int:

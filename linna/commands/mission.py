@@ -30,6 +30,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     writing.set_defaults(handler=write)
     checking = actions.add_parser("check", help="check a mission description; print one line for each fault")
     option(checking, "file FILE", Path)
+    option(
+        checking,
+        "--flight",
+        bool,
+        "dry run: plan request.json over reference.oem beside the file, and release the telecommands",
+    )
     checking.set_defaults(handler=check)
     adding = actions.add_parser("add", help="add a mission description as a revision")
     option(adding, "file FILE", Path)
@@ -127,7 +133,26 @@ def check(arguments: argparse.Namespace) -> int:
         emit(arguments, figures, text="\n".join(faults))
         return 2
     figures = {**_figures(mission), "faults": []}
-    return emit(arguments, figures, text=_described(figures))
+    lines = [_described(figures)]
+    if arguments.flight:
+        from ground_service.planning.dry_run import fly
+        from linna.data import data_folder
+
+        flown = fly(arguments.file, data_folder())
+        figures |= {
+            "faults": list(flown.faults),
+            "windows": [
+                {"start": str(one.start), "stop": str(one.stop), "telecommands": len(one.telecommands)}
+                for one in flown.windows
+            ],
+        }
+        lines += [
+            f"window {one['start']} to {one['stop']}: {one['telecommands']} telecommands"
+            for one in figures["windows"]
+        ]
+        lines += flown.faults
+    emit(arguments, figures, text="\n".join(lines))
+    return 2 if figures["faults"] else 0
 
 
 def add(arguments: argparse.Namespace) -> int:

@@ -10,12 +10,13 @@ import functools
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import astuple, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.arrays import FloatArray, IntArray
+from lunar.boxes import Region, share_outside
 from lunar.constants import MOON_RADIUS_M
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
@@ -24,7 +25,7 @@ from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.loading import detector_parameters, filter_field, network_octets
-from payload_emulator.session.recipe import Source, inside_box, load_recipe
+from payload_emulator.session.recipe import load_recipe
 from payload_emulator.session.recording import StepInput
 from payload_emulator.session.scenario import (
     SHIPPED,
@@ -82,7 +83,7 @@ _ALTITUDE_MARGIN = 1.3
 
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
 
-Value = bool | int | float | str | Sequence[float] | Sequence[str] | None
+Value = bool | int | float | str | Sequence["Value"] | Mapping[str, "Value"] | None
 
 
 def scenario_mission_text(scenario: Scenario, data: DataFolder) -> str:
@@ -343,42 +344,19 @@ def save_attitudes(
 
 
 def unseen_share(world: World) -> float | None:
-    """Return the share of frames none of whose ground was used in training; None without real terrain.
-
-    The ground of a frame is sampled at the centre, edges and corners of its footprint.
-    """
+    """Return the share of frames none of whose ground was used in training; None without real terrain."""
     if not world.terrain.is_real:
         return None
-    latitude, longitude, altitude = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
-    camera = world.scenario.camera
-    half_u = np.tan(np.radians(camera.fov_deg) / 2.0) * altitude / MOON_RADIUS_M
-    half_v = half_u * camera.height_px / camera.width_px
-    seen = np.zeros(latitude.size, dtype=np.bool_)
-    for right in (-1.0, 0.0, 1.0):
-        for up in (-1.0, 0.0, 1.0):
-            there = np.clip(latitude + up * half_v, -np.pi / 2.0, np.pi / 2.0)
-            east = longitude + right * half_u / np.maximum(np.cos(there), 1e-3)
-            seen |= seen_in_training(np.degrees(there), np.degrees(east))
-    return float(np.count_nonzero(~seen) / seen.size) if seen.size else None
-
-
-def seen_in_training(latitude_deg: FloatArray, longitude_deg: FloatArray) -> BoolArray:
-    """Return whether real ground (n,) lies is in the training or validation data of the shipped detector."""
-    seen = np.zeros(np.shape(latitude_deg), dtype=np.bool_)
-    for source in _seen_sources():
-        inside = np.zeros_like(seen)
-        for box in source.boxes:
-            inside |= inside_box(box, latitude_deg, longitude_deg)
-        for box in source.avoid:
-            inside &= ~inside_box(box, latitude_deg, longitude_deg, source.buffer_km)
-        seen |= inside
-    return seen
+    positions = world.truth.positions_mcmf(world.frame_utc_ns)
+    return share_outside(trained_ground(), world.camera, *spherical_from_mcmf(positions))
 
 
 @functools.lru_cache(maxsize=1)
-def _seen_sources() -> tuple[Source, ...]:
+def trained_ground() -> tuple[Region, ...]:
+    """Return the real ground in the training and validation data of the shipped detector."""
     sources = load_recipe(DETECTOR_RECIPE).sources
-    return tuple(one for one in sources if one.terrain == "real" and one.split in SEEN_SPLITS)
+    used = [one for one in sources if one.terrain == "real" and one.split in SEEN_SPLITS]
+    return tuple(Region(one.boxes, one.avoid, one.buffer_km) for one in used)
 
 
 def level_of(world: str, unseen: float | None) -> str:
@@ -412,8 +390,15 @@ def _evidence(world: World) -> dict[str, Value]:
     if world.terrain.is_real:
         if world.terrain.name.startswith("own "):
             return {"world": None}
-        share = unseen_share(world)
-        return {"world": "real-terrain", "seed": world.scenario.seed, "unseen_share": share}
+        ground: list[Mapping[str, Value]] = [
+            {
+                "boxes": [astuple(box) for box in one.boxes],
+                "avoid": [astuple(box) for box in one.avoid],
+                "buffer_km": one.buffer_km,
+            }
+            for one in trained_ground()
+        ]
+        return {"world": "real-terrain", "seed": world.scenario.seed, "trained_on": ground}
     return {"world": "procedural", "seed": world.scenario.seed}
 
 
@@ -459,4 +444,6 @@ def _toml(value: Value) -> str:
         return f'"{escaped}"'
     if isinstance(value, int | float):
         return repr(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     return "[" + ", ".join(_toml(item) for item in value or ()) + "]"

@@ -17,10 +17,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from lunar.arrays import BoolArray, FloatArray
-from lunar.constants import MOON_RADIUS_M
+from lunar.boxes import Box
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.scenario import shipped_file
 from payload_emulator.session.typed_toml import Record, TableFault, read_table
@@ -30,42 +27,6 @@ PAPER_SPLIT = "80/15/5"
 """Split of a source along an ephemeris: the last 5 % of its frames in time are the test arc, the rest is shuffled."""
 
 PAPER_SHARES = (0.80, 0.15, 0.05)
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """West, east, south, north in degrees; east may exceed 360."""
-
-    west_deg: float
-    east_deg: float
-    south_deg: float
-    north_deg: float
-
-    def widened(self, margin_deg: float) -> Box:
-        """Return the box with a margin on all sides."""
-        width = min(self.east_deg - self.west_deg + 2.0 * margin_deg, 360.0)
-        west_deg = self.west_deg - margin_deg
-        return Box(
-            west_deg,
-            west_deg + width,
-            max(self.south_deg - margin_deg, -90.0),
-            min(self.north_deg + margin_deg, 90.0),
-        )
-
-
-def inside_box(
-    box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray, buffer_km: float = 0.0
-) -> BoolArray:
-    """Return which places lie in a box or within `buffer_km` of it."""
-    margin = math.degrees(buffer_km * 1000.0 / MOON_RADIUS_M)
-    widen = margin / np.cos(np.radians(np.minimum(np.abs(latitude_deg) + margin, 85.0)))
-    middle = 0.5 * (box.west_deg + box.east_deg)
-    offset = np.mod(longitude_deg - middle + 180.0, 360.0) - 180.0
-    across = np.abs(offset) <= 0.5 * (box.east_deg - box.west_deg) + widen
-    inside: BoolArray = (
-        across & (latitude_deg >= box.south_deg - margin) & (latitude_deg <= box.north_deg + margin)
-    )
-    return inside
 
 
 EVERYWHERE = (Box(0.0, 360.0, -60.0, 60.0),)

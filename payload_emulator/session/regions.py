@@ -10,8 +10,8 @@ from itertools import groupby
 import numpy as np
 
 from lunar.arrays import BoolArray
+from lunar.boxes import Box, inside_box
 from lunar.catalogue import CraterCatalogue
-from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.session.world import World, rims_of
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 

@@ -99,6 +99,44 @@ def test_errors_are_a_json_object_with_json(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().out == ""
 
 
+SCENARIO = """name = "small"
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 60.0
+[terrain]
+source = "procedural"
+"""
+
+
+def test_a_scenario_is_checked_without_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(SCENARIO)
+    assert cli.run(["emulate", str(path), "--check", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["frames"], found["start_utc"]) == (5, "2029-08-07T01:40:00Z")
+    assert found["stop_utc"] == "2029-08-07T01:41:00Z" and "procedural" in found["data"][0]
+    assert [one.name for one in tmp_path.iterdir()] == ["small.toml"]
+    path.write_text(SCENARIO.replace("duration_s = 60.0", "duration_s = -1.0"))
+    assert cli.run(["emulate", str(path), "--check"]) == 2
+    assert "duration_s" in capsys.readouterr().err
+
+
+def test_a_mission_description_is_checked_by_a_dry_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mission.toml"
+    path.write_text('name = "m"\n[spacecraft]\nid = 76\n')
+    assert cli.run(["mission", "check", str(path)]) == 0
+    capsys.readouterr()
+    assert cli.run(["mission", "check", str(path), "--flight", "--json"]) == 2
+    [fault] = json.loads(capsys.readouterr().out)["faults"]
+    assert fault.endswith("reference.oem: expected a file beside the mission description, found none")
+
+
 def completions(line: str, tmp_path: Path) -> set[str]:
     found = tmp_path / "completions"
     environment = os.environ | {

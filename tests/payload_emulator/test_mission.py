@@ -3,19 +3,22 @@
 import hashlib
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from ground_service.missions.model import parse_mission
+from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.session.mission import mission_text, seen_in_training, unseen_share
+from payload_emulator.session.mission import mission_text, trained_ground, unseen_share
 from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
+from payload_emulator.sim.terrain.tiles import TiledTerrain
 
 SCENARIO = """
 name = "small"
@@ -109,7 +112,20 @@ def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> N
 def test_ground_is_seen_where_the_recipe_of_the_shipped_detector_looked(
     latitude_deg: float, longitude_deg: float, seen: bool
 ) -> None:
-    assert seen_in_training(np.array([latitude_deg]), np.array([longitude_deg])).tolist() == [seen]
+    place = np.array([latitude_deg]), np.array([longitude_deg])
+    assert any(region.contains(*place).all() for region in trained_ground()) is seen
+
+
+class RealTerrain:
+    """A terrain that claims to be real."""
+
+    is_real, name = True, "LROC WAC GLD100"
+
+    def __init__(self, terrain: TiledTerrain) -> None:
+        self._terrain = terrain
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._terrain, name)
 
 
 def flown_over(longitudes_deg: list[float], is_real: bool = True) -> SimpleNamespace:
@@ -119,7 +135,7 @@ def flown_over(longitudes_deg: list[float], is_real: bool = True) -> SimpleNames
         terrain=SimpleNamespace(is_real=is_real),
         truth=SimpleNamespace(positions_mcmf=lambda _: position),
         frame_utc_ns=np.arange(len(longitudes_deg)),
-        scenario=parse_scenario(SCENARIO),
+        camera=PinholeCamera(),
     )
 
 
@@ -135,6 +151,13 @@ def flown_over(longitudes_deg: list[float], is_real: bool = True) -> SimpleNames
 )
 def test_the_unseen_share_counts_frames_whose_whole_footprint_is_unseen(longitudes_deg, share) -> None:
     assert unseen_share(flown_over(longitudes_deg)) == share
+
+
+def test_the_ground_of_training_is_stated_over_real_terrain(world) -> None:
+    real = replace(world, terrain=cast(Any, RealTerrain(world.terrain)))
+    evidence = parse_mission(mission_text(real, DataFolder())).evidence
+    assert evidence.trained_regions == trained_ground()
+    assert (evidence.unseen_share, evidence.level) == (None, None)  # each pass has its own
 
 
 def test_there_is_no_unseen_share_away_from_real_terrain() -> None:

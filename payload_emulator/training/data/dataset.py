@@ -29,12 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray, OctetArray
+from lunar.boxes import Box, inside_box
 from lunar.camera import PinholeCamera, intersect_sphere
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.vision.preprocess import gray_levels
-from payload_emulator.session.recipe import Box, inside_box
 from payload_emulator.training.data.targets import Tier
 from payload_emulator.training.data.truth import FrameTruth
 

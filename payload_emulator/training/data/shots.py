@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from lunar.arrays import FloatArray
+from lunar.boxes import Box, inside_box
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Box, Source, inside_box
+from payload_emulator.session.recipe import Source
 
 _ATTEMPTS = 4000
 _LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame

@@ -17,11 +17,23 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, instance_of, read_manifest
 from ground_service.passes.service import completeness, define_pass
+from lunar.constants import MOON_RADIUS_M
+from lunar.ephemeris import ephemeris_from_states
+from lunar.frames import IauOrientation
+from lunar.ground_track import ground_track
 from lunar.lens import BrownCamera
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement
-from tests.ground_service.conftest import CADENCE_S, NS, SPACECRAFT, START, encode_downlink, write_manifest
+from tests.ground_service.conftest import (
+    CADENCE_S,
+    NS,
+    SPACECRAFT,
+    START,
+    circular_states,
+    encode_downlink,
+    write_manifest,
+)
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
@@ -123,6 +135,29 @@ def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
     assert {one["key"]: one["status"] for one in summary_of(report)["requirements"]} == {
         key: one.status for key, one in table.items()
     }
+
+
+@pytest.mark.parametrize(
+    ("seen_frames", "level"),
+    [
+        (0, "3 (real terrain never"),
+        (8, "3s (real terrain seen in training; 33 %"),
+        (FRAMES, "3s (real terrain seen"),
+    ],
+)
+def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
+    make_pass: Callable[..., Any], ground: Ground, seen_frames: int, level: str
+) -> None:
+    """The pass flies to the north: the ground of training ends between two southern edges of its footprints."""
+    times = START + np.arange(-1, FRAMES + 1) * CADENCE_S * NS
+    track = ground_track(ephemeris_from_states(times, *circular_states(times)), IauOrientation())
+    south_rad = track.latitude_rad - math.tan(math.radians(60.0)) * track.altitude_m / MOON_RADIUS_M
+    end_deg = math.degrees(south_rad[seen_frames : seen_frames + 2].mean())
+    trained_on = f"unseen_share = 0.25\ntrained_on = [{{ boxes = [[-180, 180, -90, {end_deg}]] }}]"
+    made = make_pass(frames=FRAMES, seed=41, mission=MISSION.replace("unseen_share = 0.25", trained_on))
+    report = evaluated(ground, made.folder)
+    assert report.evidence_level.startswith(level)
+    assert report.evidence_level.endswith("unseen terrain)") is (seen_frames == 8)
 
 
 def test_half_a_downlink(make_pass: Callable[..., Any], ground: Ground) -> None:

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lunar.boxes import Box, inside_box
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Box, Source, inside_box, load_recipe, procedural_recipe
+from payload_emulator.session.recipe import Source, load_recipe, procedural_recipe
 from payload_emulator.training.data.build import plan_shards
 from payload_emulator.training.data.shots import allowed
 

@@ -1,0 +1,93 @@
+"""Dry run of a mission description: what contradicts the flight is found before it, one line each."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ground_service.planning.dry_run import DryRun, fly
+from lunar.datafolder import DataFolder
+from tests.ground_service.conftest import START, save_circle
+from tests.ground_service.planning.test_standing import AUTOMATIC, LINKS, MISSION
+
+UPLOADS = '[uploads]\ntables = ["orientation"]\n'
+CRITICAL = ("perform_function/set_mode", "uplink_first", "uplink_middle", "uplink_last")
+ONE_PERSON = f"one_person_for = {json.dumps(CRITICAL)}\n"
+REQUEST = {"name": "low Sun", "spacecraft_id": 76, "windows": 2, "period_days": 7.0, "horizon_days": 1.0}
+
+
+@pytest.fixture(scope="module")
+def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_circle(tmp_path_factory.mktemp("oem") / "reference.oem", START, 30.0)
+
+
+@pytest.fixture
+def flown(tmp_path: Path, oem: Path):
+    """A function that writes the files and makes the dry run."""
+
+    def run(extra: str = AUTOMATIC + LINKS, **request: object) -> DryRun:
+        (tmp_path / "mission.toml").write_text(MISSION.format(extra=extra))
+        (tmp_path / "reference.oem").write_bytes(oem.read_bytes())
+        (tmp_path / "request.json").write_text(json.dumps(REQUEST | request))
+        return fly(tmp_path / "mission.toml", DataFolder())
+
+    return run
+
+
+def test_a_description_that_flies_has_windows_with_telecommands(flown) -> None:
+    found = flown()
+    assert found.faults == () and len(found.windows) == 2
+    # One enables the schedule; start and stop are each inserted into it by another.
+    assert [len(one.telecommands) for one in found.windows] == [5, 5]
+
+
+@pytest.mark.parametrize(
+    ("extra", "request_changes", "fault"),
+    [
+        (
+            AUTOMATIC + UPLOADS + LINKS,
+            {},
+            "mission.toml, approval.windows: expected approval.one_person_for with the telecommands of a window that "
+            "is approved automatically, found a second person needed for " + ", ".join(CRITICAL),
+        ),
+        (
+            AUTOMATIC + LINKS + "[observation]\nlatitude_limit_deg = 20.0\n",
+            {"regions": [{"latitude_deg": {"min": 40.0, "max": 80.0}}]},
+            "request.json: expected windows that can be planned, found no window: excluded by latitude limit of the "
+            "mission description 20 deg, regions",
+        ),
+        (
+            AUTOMATIC + LINKS,
+            {"sun_elevation_deg": {"min": 89.9, "max": 90.0}},
+            "request.json: expected windows that can be planned, found no window: excluded by Sun elevation",
+        ),
+        (
+            AUTOMATIC + LINKS + "[resources]\nstorage_mib = 0.01\n",
+            {},
+            "request.json: expected windows that can be planned, found 58200 octets would be stored on board, expected "
+            "at most 10486",
+        ),
+        (
+            AUTOMATIC,
+            {},
+            "mission.toml, links: expected contacts of a link with an uplink, found no link with an uplink",
+        ),
+        (
+            AUTOMATIC + LINKS.replace('station = "here"\n', "").replace('station = "there"\n', ""),
+            {},
+            "found a: the mission description states no place of the station; b: the mission description states no "
+            "place of the station",
+        ),
+        (AUTOMATIC + LINKS, {"spacecraft_id": 5000}, "request.json, spacecraft_id: expected less than"),
+    ],
+)
+def test_each_contradiction_is_one_line(flown, extra: str, request_changes: dict, fault: str) -> None:
+    found = flown(extra, **request_changes)
+    assert len(found.faults) == 1, found.faults
+    assert fault in found.faults[0]
+
+
+def test_windows_that_persons_approve_are_approved_and_released_by_two(flown) -> None:
+    found = flown(UPLOADS + LINKS)
+    assert found.faults == ()
+    assert [one.decided_by for one in found.windows] == ["dry run, second person"] * 2
