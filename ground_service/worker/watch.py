@@ -36,7 +36,7 @@ class Watch:
         A process that has just begun knows no ages: it raises nothing, and ends only what no longer holds.
         """
         now = time.monotonic()
-        unknown = {"mission_time_stopped"} if self._clock == 0 else set()
+        unknown = {"mission_time_stopped", "spacecraft_gone"} if self._clock == 0 else set()
         with self.ground.database.reading() as connection:
             spacecraft = set(missions_in_force(connection))
         self._since = {one: self._since.get(one, now) for one in self._conditions(spacecraft)}
@@ -49,12 +49,19 @@ class Watch:
         now, before = mission_now_ns(), self._clock
         self._clock = now
         links = list_links(self.ground)
+        with self.ground.database.reading() as connection:
+            waiting = records_where(connection, WINDOWS.c.state.in_(("uplinked", "executing")))
+        awaited = {one.spacecraft_id for one in waiting}
         for number in spacecraft:
             mine = [one for one in links if one.spacecraft_id == number]
+            is_silent = bool(mine) and not any(one.state in ("connected", "contact") for one in mine)
+            is_operated = any(one.owner for one in mine)
             if mine and now == before:
                 yield number, "mission_time_stopped"
-            if mine and not any(one.state in ("connected", "contact") for one in mine):
-                yield number, "no_link"
+            if is_silent:
+                yield number, "no_link" if is_operated else "link_process_gone"
+            if is_silent and is_operated and now == before and number in awaited:
+                yield number, "spacecraft_gone"
         with self.ground.database.reading() as connection:
             refused = records_where(connection, WINDOWS.c.state == "approved", WINDOWS.c.reason.is_not(None))
             yield from ((one.spacecraft_id, "window_not_released") for one in refused)
