@@ -11,6 +11,13 @@ function daysValid() {
   return text ? Number(text) : null;
 }
 
+const missionsText = (row) => row.missions?.join(", ") ?? "all";
+
+function missionsGiven() {
+  const names = byId("missions").value.split(",").map((name) => name.trim()).filter(Boolean);
+  return names.length ? names : null;
+}
+
 function showToken(made) {
   show(
     "given",
@@ -95,6 +102,7 @@ async function load() {
       [
         ["Name", (row) => row.name],
         ["Role", (row) => (row.provider ? row.role : roleChoice(row))],
+        ["Missions", missionsText],
         ["From", (row) => (row.provider ? element("span", { class: "breakable" }, row.provider) : "this service")],
         ["State", (row) => stateMark(row.state)],
         ["Since", (row) => timeText(row.created)],
@@ -112,6 +120,7 @@ async function load() {
         ["No", (row) => String(row.id), "num"],
         ["User", (row) => row.user],
         ["Kind", kindOf],
+        ["Missions", missionsText],
         ["Start", (row) => element("code", {}, `${row.hint}…`)],
         ["State", (row) => stateMark(row.state)],
         ["Created", (row) => timeText(row.created)],
@@ -128,9 +137,9 @@ async function load() {
 byId("add").addEventListener(
   "submit",
   acting(async () => {
-    const given = { name: byId("name").value.trim(), role: byId("role").value, days_valid: daysValid() };
+    const given = { name: byId("name").value.trim(), role: byId("role").value, missions: missionsGiven(), days_valid: daysValid() };
     showToken(await send("POST", "users", given));
-    byId("name").value = "";
+    byId("name").value = byId("missions").value = "";
     await load();
   }),
 );

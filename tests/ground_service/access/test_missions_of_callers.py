@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from fastapi.routing import APIRoute
-from sqlalchemy import BigInteger, Column, Float, Integer, LargeBinary, SmallInteger, Table
+from sqlalchemy import BigInteger, Column, Float, Integer, LargeBinary, SmallInteger, Table, func, select
 from starlette.datastructures import QueryParams
 
 from ground_service.access.scopes import DECIDED, ROWS, Scope, check_scope, scope_of
@@ -25,6 +25,8 @@ from ground_service.store.models import METADATA
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import START, save_circle
 from tests.serving import TestClient
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
 
 V1 = "/api/v1"
 OURS, THEIRS = 78, 76
@@ -192,6 +194,19 @@ def test_a_spacecraft_that_is_not_stated_is_not_one_of_the_caller(fleet: Fleet) 
     assert fleet.client.post(f"{V1}/windows/search", json=search, headers=fleet.headers).status_code == 403
     assert fleet.client.get(f"{V1}/parameters", headers=fleet.headers).status_code == 403
     assert fleet.client.get(f"{V1}/parameters?spacecraft_id={OURS}", headers=fleet.headers).status_code != 403
+
+
+def test_frames_of_other_spacecraft_in_an_upload_are_not_stored(fleet: Fleet) -> None:
+    values = {"event_id": 20, "frame_number": 1, "value_1": 0.0, "value_2": 0.0}
+    packets = [DICTIONARY.pack("event_low", values, ticks=k << 16, sequence_count=k) for k in range(200)]
+    octets = b"".join(encode_cadus(packets, spacecraft_id=one) for one in (THEIRS, OURS, THEIRS))
+    place = f"{V1}/telemetry?spacecraft_id={OURS}"
+    answer = fleet.client.post(place, content=octets, headers=fleet.headers)
+    assert answer.status_code == 202, answer.text
+    count = select(func.count()).select_from(METADATA.tables["packets"])
+    with fleet.client.app.state.ground.database.reading() as connection:
+        stored = {one: connection.scalar(count.filter_by(vehicle_id=one)) for one in (1, 2)}
+    assert stored == {1: 0, 2: 200}
 
 
 def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet: Fleet, tmp_path: Any) -> None:

@@ -39,6 +39,7 @@ def admin(browser, managed):
 def test_a_user_is_added_and_the_token_shown_once(admin, managed):
     admin.get_by_label("Name").fill("ola")
     admin.locator("#role").select_option("operator")
+    admin.get_by_label("Missions", exact=True).fill("selenita, other")
     admin.get_by_label("Days valid").fill("7")
     admin.get_by_role("button", name="Add user").click()
     shown = admin.locator("#given code")
@@ -50,6 +51,12 @@ def test_a_user_is_added_and_the_token_shown_once(admin, managed):
         assert (
             found.expires is not None and 6.9 < (found.expires.utc_ns - found.created.utc_ns) / 86_400e9 < 7.1
         )
+        assert {one.name: one.missions for one in list_users(ground)} == {
+            "ann": None, "vic": None, "ola": ["selenita", "other"],
+        }  # fmt: skip
+    cells = admin.locator("#users tbody tr").filter(has_text="ola").locator("td")
+    expect(cells.nth(2)).to_have_text("selenita, other")
+    expect(admin.locator("#users tbody tr").filter(has_text="vic").locator("td").nth(2)).to_have_text("all")
     admin.get_by_role("button", name="Hide").click()
     expect(shown).to_be_hidden()
     admin.reload()
