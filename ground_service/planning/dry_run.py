@@ -51,7 +51,7 @@ def fly(mission: Path, data: DataFolder) -> DryRun:
             windows = ground.read(store.list_windows, WindowFilter()).items
         except (GroundError, LunarError) as error:
             return DryRun(faults=(str(error),))
-    return DryRun(tuple(windows), tuple(faults))
+    return DryRun(tuple(sorted(windows, key=lambda one: one.start.utc_ns)), tuple(faults))
 
 
 def _posted(ground: Ground, mission: Path) -> tuple[int, int]:

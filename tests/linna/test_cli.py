@@ -117,8 +117,8 @@ def test_a_scenario_is_checked_without_a_flight(tmp_path: Path, capsys: pytest.C
     path.write_text(SCENARIO)
     assert cli.run(["emulate", str(path), "--check", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["frames"], found["start_utc"]) == (5, "2029-08-07T01:40:00Z")
-    assert found["stop_utc"] == "2029-08-07T01:41:00Z" and "procedural" in found["data"][0]
+    assert (found["frames"], found["start_utc"]) == (4, "2029-08-07T01:40:00Z")
+    assert found["stop_utc"] == "2029-08-07T01:40:45Z" and "procedural" in found["data"][0]
     assert [one.name for one in tmp_path.iterdir()] == ["small.toml"]
     path.write_text(SCENARIO.replace("duration_s = 60.0", "duration_s = -1.0"))
     assert cli.run(["emulate", str(path), "--check"]) == 2
