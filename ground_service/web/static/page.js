@@ -137,6 +137,7 @@ export const isoText = (unix) => `${new Date(1000 * unix).toISOString().slice(0,
 export function lengthText(totalSeconds) {
   const whole = Math.round(totalSeconds);
   const [hours, minutes, rest] = [Math.floor(whole / 3600), Math.floor((whole % 3600) / 60), whole % 60];
+  if (hours >= 48) return `${Math.floor(hours / 24)} d ${hours % 24} h`;
   return hours ? `${hours} h ${minutes} min` : minutes ? `${minutes} min ${rest} s` : `${rest} s`;
 }
 

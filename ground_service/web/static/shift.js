@@ -38,8 +38,8 @@ function contactFigure(craft, data) {
 }
 
 function ageFigure(newest) {
-  const ages = newest.map((one) => one.age_s).filter((one) => one !== null);
-  return ages.length ? number("Age of data", lengthText(Math.min(...ages)), "newest telemetry") : number("Age of data", "none", "no telemetry received");
+  const [last] = [...newest].sort((one, other) => one.age_s - other.age_s);
+  return last ? number("Age of data", lengthText(last.age_s), `newest telemetry of ${timeText(last.time)}`) : number("Age of data", "none", "no telemetry received");
 }
 
 async function release(window) {

@@ -136,15 +136,16 @@ def test_the_grid_of_a_chart_follows_a_change_of_the_colours(page):
     page.emulate_media(color_scheme="light")
 
 
-def test_small_figures_have_a_power_of_ten_and_zero_has_none(page):
+def test_small_figures_have_a_power_of_ten_and_zero_has_none_and_long_times_have_days(page):
     page.goto("/licences")
     found = page.evaluate(
         """async () => {
-            const { figure } = await import("/static/page.js");
-            return [0, 4.51e-11, -2e-5, 0.00012, 0.5].map((value) => figure(value));
+            const { figure, lengthText } = await import("/static/page.js");
+            const lengths = [59, 3600 * 47 + 60, 3600 * 49];
+            return [[0, 4.51e-11, -2e-5, 0.00012, 0.5].map((value) => figure(value)), lengths.map(lengthText)];
         }"""
     )
-    assert found == ["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5"]
+    assert found == [["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5"], ["59 s", "47 h 1 min", "2 d 1 h"]]
 
 
 def test_passes_are_searched_and_show_their_verdict(page):
