@@ -551,6 +551,8 @@ class SpacecraftResources(Section):
     ----------
     observe_hours_per_day
         Largest duration of observation windows that begin within 24 hours.
+    windows_on_board
+        Largest number of windows whose telecommands wait on board; later ones are planned when one has flown.
     """
 
     storage_mib: Positive | None = None
@@ -561,6 +563,7 @@ class SpacecraftResources(Section):
     observing_w: NotNegative | None = None
     minimum_battery: Share | None = None
     observe_hours_per_day: Annotated[float, Field(gt=0.0, le=24.0)] | None = None
+    windows_on_board: Annotated[int, Field(ge=1)] | None = None
 
 
 class PacketTime(Section):

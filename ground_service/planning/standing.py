@@ -392,6 +392,11 @@ def _chosen(
         if one.stop.utc_ns > grid.start_utc_ns and one.start.utc_ns < end
     ]
     chosen, reasons = choose(grid, options, committed, quota)
+    most = situation.mission.resources.windows_on_board
+    if most is not None:
+        left = max(most - sum(one.stop.utc_ns > now for one in situation.others), 0)
+        chosen, late = chosen[:left], chosen[left:]
+        reasons |= dict.fromkeys(late, f"the telecommands of {most} windows wait on board")
     return chosen, rejected | reasons
 
 

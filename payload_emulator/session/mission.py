@@ -68,8 +68,14 @@ evaluate = true
 [approval]
 windows = "automatic"
 one_person_for = ["uplink_first", "uplink_middle", "uplink_last", "perform_function/set_mode"]
+
+[resources]
+windows_on_board = 8
 """
-"""Automation and approval of a simulated spacecraft: windows that the ground plans are flown without a person."""
+"""Automation and approval of a simulated spacecraft: windows that the ground plans are flown without a person.
+
+The schedule holds 64 telecommands, seven of each window.
+"""
 
 CLOCK_STEP_S = 0.1
 """Limit of a step of the on-board clock where stations measure it: 170 m along the track."""

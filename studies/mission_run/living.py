@@ -23,9 +23,6 @@ from studies.mission_run.dynamics import DAY_NS, FlightDynamics, write_flight
 WINDOWS_A_DAY = 12
 """A window in almost every revolution, so that a visitor sees one soon."""
 
-HORIZON_DAYS = 0.3
-"""The on-board schedule holds the telecommands of nine windows."""
-
 WINDOW_S = 480.0
 LOOK_S = 1.0
 
@@ -76,8 +73,7 @@ def living_demo(
         client.add_catalogue(folder / "craters.csv")
         client.add_mission(mission)
         client.add_ephemeris(folder / "reference.oem")
-        request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
-        client.add_request({**request, "horizon_days": HORIZON_DAYS})
+        client.add_request(json.loads((folder / "request.json").read_text(encoding="utf-8")))
         say(f"{address}/ shows the shift at {rate:g} times real time; Ctrl-C ends")
         dynamics, day, now = None, 0, ClockFile(clock)
         while not stopping.wait(LOOK_S):

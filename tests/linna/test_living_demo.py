@@ -26,7 +26,7 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
     client.__enter__.return_value = client
 
     def written(*_: object) -> str:
-        (folder / "request.json").write_text('{"windows": 12, "horizon_days": 1.0}')
+        (folder / "request.json").write_text('{"windows": 12}')
         return ""
 
     def parts(folder: Path, *_: object) -> dict[str, Part]:
@@ -42,7 +42,7 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
         living.living_demo(*demo)
     posted = [name for name, _, _ in client.method_calls]
     assert posted == ["add_catalogue", "add_mission", "add_ephemeris", "add_request"]
-    client.add_request.assert_called_once_with({"windows": 12, "horizon_days": living.HORIZON_DAYS})
+    client.add_request.assert_called_once_with({"windows": 12})
     assert said[-1] == "http://127.0.0.1:8042/ shows the shift at 60 times real time; Ctrl-C ends"
     with pytest.raises(ScenarioError, match="expected a new folder for a living demo, found one with files"):
         living.living_demo(*demo)

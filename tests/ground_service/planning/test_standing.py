@@ -107,6 +107,16 @@ def request(ground: Ground, **changes: object) -> int:
     return standing.add_request(ground, StandingRequestIn.model_validate(values), actor="ann").id
 
 
+def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, oem: Path, now: Clock) -> None:
+    prepare(ground, oem, AUTOMATIC + LINKS + "\n[resources]\nwindows_on_board = 1\n")
+    key = request(ground)
+    assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
+    left = [one.reason for one in ground.read(get_plan, key).candidates if one.outcome == "rejected"]
+    assert "the telecommands of 1 windows wait on board" in left
+    now.utc_ns = ground.read(list_windows, WindowFilter()).items[0].stop.utc_ns + HOUR
+    assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
+
+
 def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: Path, now: Clock) -> None:
     prepare(either, oem)
     key = request(either)
