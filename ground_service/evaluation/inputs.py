@@ -134,7 +134,8 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             identifications=identification_samples(connection, span),
             landmarks=landmark_reports(connection, span),
             instruments=reported_instruments(connection, span),
-            sun_known=manifest.get("light", "real") == "real",
+            sun_known=manifest.get("light", "real") == "real"
+            and mission.observation.needs_daylight is not False,
             burns=burns_of(manifest),
             gravity=declared.gravity,
             onboard_gravity=declared.onboard_gravity,

@@ -132,6 +132,17 @@ def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to
     assert table["completeness.packets"] in ("met", "unknown") and table["detector.recall"] == "not judged"
 
 
+@pytest.mark.parametrize("stated", [b"", b"[observation]\nneeds_daylight = false\n"])
+def test_the_sun_of_images_is_unknown_where_a_simulated_world_draws_its_light(
+    synthetic_pass: Any, ground: Ground, stated: bytes
+) -> None:
+    add_mission(ground, MISSION_76 + stated)
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    start, stop = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
+    pass_id = define_pass(ground, name="live", start_utc_ns=start, stop_utc_ns=stop, spacecraft_id=76)
+    assert load_pass_inputs(ground, pass_id).sun_known == (stated == b"")
+
+
 MISSION_76 = b"""name = "live"
 [spacecraft]
 id = 76

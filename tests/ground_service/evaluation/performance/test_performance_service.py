@@ -129,7 +129,7 @@ def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: Synth
     made = make_report(either, pass_id)
     conditions = made.summary["conditions"]
     assert conditions["altitude_km"] == pytest.approx(ALTITUDE_M / 1e3, abs=0.1)
-    assert -90.0 <= conditions["sun_elevation_deg"] <= 90.0
+    assert conditions["sun_elevation_deg"] is None  # the light of the images is not that of the ephemeris
     [one] = performance(either, SPACECRAFT).passes
     assert (one.pass_id, one.report_id) == (pass_id, made.report_id)
     assert one.altitude_km == conditions["altitude_km"]
