@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 import threading
 import zlib
@@ -14,9 +15,13 @@ import cv2
 import numpy as np
 import pytest
 
+from ground_service.evaluation.core import summary_of
+from ground_service.evaluation.service import evaluate
+from ground_service.ground import Ground
+from ground_service.passes.archive_import import import_archive
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.emulator import emulate, file_entries
 from payload_emulator.session.live import LiveSession
 from payload_emulator.session.recording import frame_path
 from payload_emulator.session.replay import FlightBuild, replay_archive
@@ -25,7 +30,7 @@ from payload_emulator.session.starting import launch, load_scenario_payload
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import build_world, clock_ticks, open_world
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import decode
+from tmtc.downlink import decode, encode_cadus
 from tmtc.link import LinkSettings
 
 NO_DATA = DataFolder(None)
@@ -119,20 +124,53 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(archive: Path, tmp_path: Path) -> None:
-    packets = packets_of((archive / "downlink.cadu").read_bytes())
-    assert len(of_kind("detections", packets)) == FRAMES
+@pytest.fixture(scope="module")
+def ways(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
+    """Return the packets of each way."""
     world = build_world(parse_scenario(SCENARIO), NO_DATA)
     loaded, _, _ = load_scenario_payload(world, NO_DATA)
     session = LiveSession(world, loaded, has_operator=True, ends_with_scenario=True, paused=True)
-    assert flown(session) == packets
-    replay_archive(archive, FlightBuild(), tmp_path / "replay")
-    again = packets_of((tmp_path / "replay" / "downlink.cadu").read_bytes())
+    replayed = tmp_path_factory.mktemp("replay")
+    replay_archive(archive, FlightBuild(), replayed)
+    return {
+        "archive": packets_of((archive / "downlink.cadu").read_bytes()),
+        "live": flown(session),
+        "replay": packets_of((replayed / "downlink.cadu").read_bytes()),
+    }
+
+
+def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways: dict[str, list[bytes]]) -> None:
+    packets, again = ways["archive"], ways["replay"]
+    assert len(of_kind("detections", packets)) == FRAMES
+    assert ways["live"] == packets
     assert len(again) == len(packets)
     # A replay has no board: times of its processor, readings and memory are unknown.
     other = [DICTIONARY.unpack(one)[0] for one, two in zip(packets, again, strict=True) if one != two]
     assert set(other) == {"housekeeping", "performance"}
     assert len(other) < len(packets) / 4
+
+
+def test_every_way_has_the_same_figures_in_its_report(
+    archive: Path, ways: dict[str, list[bytes]], either: Ground, tmp_path: Path
+) -> None:
+    figures = {}
+    for name, packets in ways.items():
+        folder = tmp_path / name
+        shutil.copytree(archive, folder)
+        (folder / "downlink.cadu").write_bytes(encode_cadus(packets, spacecraft_id=76))
+        manifest = json.loads((folder / "manifest.json").read_text())
+        manifest |= {"pass_name": name, "files": file_entries(folder)}
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+        figures[name] = summary_of(evaluate(either, import_archive(either, folder)))
+    assert len({one.pop("pass_id") for one in figures.values()}) == len(ways)
+    assert figures["archive"]["detector"]["recall"] > 0.3 and figures["archive"]["navigation"]
+    assert figures["live"] == figures["archive"]
+    # A replay has no board.
+    board = [one["key"] for one in figures["replay"]["requirements"] if one["key"].startswith("resources.")]
+    for one in figures.values():
+        one["requirements"] = [row for row in one["requirements"] if row["key"] not in board]
+        del one["verdict"]
+    assert figures["replay"] == figures["archive"]
 
 
 def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveSession, list[bytes]]:
