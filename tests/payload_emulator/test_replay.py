@@ -79,14 +79,6 @@ def test_the_same_build_gives_the_same_octets(archive: Path, tmp_path: Path) -> 
     assert (tmp_path / "one/downlink.cadu").read_bytes() == (tmp_path / "two/downlink.cadu").read_bytes()
 
 
-def test_the_flown_build_says_of_every_frame_what_it_said_in_flight(archive: Path, tmp_path: Path) -> None:
-    """Housekeeping differs: the processor time of the flown board is not the payload's to repeat."""
-    replay_archive(archive, FlightBuild(), tmp_path / "out")
-    flown, again = ((folder / "downlink.cadu").read_bytes() for folder in (archive, tmp_path / "out"))
-    for name in ("detections", "navigation_state", "frame_outcome"):
-        assert packets_of(name, again) == packets_of(name, flown), name
-
-
 def test_the_service_renders_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:
     """Of the files that a scenario can name, the renderer opens only those that the service refuses."""
     shutil.rmtree(copy / "frames")

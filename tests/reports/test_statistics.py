@@ -13,6 +13,7 @@ from reports.statistics import (
     cumulative,
     inside,
     north_east_error_m,
+    per_degree,
     quantiles,
     reference_at,
     round_edges,
@@ -169,3 +170,11 @@ def test_a_zoom_shows_the_reset_nearest_the_middle_and_what_led_to_it() -> None:
     late = day.stop_utc_ns - 60_000_000_000
     zoom = zoom_span(day, (), resets=[late])
     assert zoom is not None and zoom.start_utc_ns < late < zoom.stop_utc_ns == day.stop_utc_ns
+
+
+def test_a_mean_per_degree_is_the_ratio_of_sums_and_not_the_mean_of_ratios() -> None:
+    values, degrees = np.array([6.0, 8.0, np.nan, 5.0]), np.array([2, 16, 2, 0])
+    count, mean, within = per_degree(values, degrees)
+    assert (count, mean) == (2, pytest.approx(14.0 / 18.0))  # the mean of 6 / 2 and 8 / 16 is 1.75
+    assert within == 1.0  # of 2 degrees 0.05 to 7.4, of 16 degrees 6.9 to 28.8
+    assert per_degree(values[2:], degrees[2:])[0] == 0
