@@ -395,10 +395,9 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     ]
     equator = observed_boxes(flat_terrain(listed, []), 13.0)
     assert equator == [Box(0.0, 15.0, -13.0, 13.0), Box(15.0, 30.0, 32.0, 58.0)]
-    # Ground with height rasters comes first, also further away from the equator.
-    assert observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0)[0] == Box(
-        0.0, 15.0, 2.0, 28.0
-    )
+    # Ground with height rasters alone, also further away from the equator: coarse ones show few craters.
+    covered = observed_boxes(flat_terrain(listed, [(0.0, 0.0), (15.0, 0.0)]), 13.0)
+    assert covered == [Box(0.0, 15.0, 2.0, 28.0)]
     # Part of the height is not enough.
     assert observed_boxes(flat_terrain(listed, [(0.0, 0.0)]), 13.0) == equator
     everywhere = SimpleNamespace(is_real=False)

@@ -35,16 +35,17 @@ def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box
     """Return the boxes of the windows, each twice `latitude_limit_deg` high.
 
     A terrain without data is the same everywhere: its windows are at the equator. On real terrain, each 15 deg of
-    longitude have one box: where height rasters cover all of it if there is such a place, else where the crater
-    catalogue does; of several the nearest to the equator. Longitudes without a catalogued place have none.
+    longitude have one box where fine height rasters and the crater catalogue cover all of it, the nearest to the
+    equator; longitudes without such a place have none. Coarse rasters show few of the craters, so where no fine ones
+    cover any box, the catalogue decides alone.
     """
     if not terrain.is_real:
         return [Box(-180.0, 180.0, -latitude_limit_deg, latitude_limit_deg)]
     rows = max(math.ceil(2.0 * latitude_limit_deg / CELL_DEG), 1)
-    catalogued, covered = _catalogued(terrain), _covered(terrain)
-    columns = [
-        _band(catalogued[:, k], covered[:, k], rows, latitude_limit_deg) for k in range(360 // CELL_DEG)
-    ]
+    catalogued = _catalogued(terrain)
+    columns = _bands(catalogued & _covered(terrain), rows, latitude_limit_deg)
+    if not any(columns):
+        columns = _bands(catalogued, rows, latitude_limit_deg)
     boxes = []
     for band, group in groupby(enumerate(columns), key=lambda one: one[1]):
         numbers = [number for number, _ in group]
@@ -57,20 +58,16 @@ def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box
     return boxes
 
 
-def _band(
-    catalogued: BoolArray, covered: BoolArray, rows: int, limit_deg: float
-) -> tuple[float, float] | None:
-    """Return south and north of the best box of one column of cells; None without a catalogued one."""
+def _bands(described: BoolArray, rows: int, limit_deg: float) -> list[tuple[float, float] | None]:
+    """Return south and north of the best box of each column of cells; None without a described one."""
 
-    def found() -> Iterator[tuple[bool, float, float]]:
-        for first in range(len(catalogued) - rows + 1):
-            part = slice(first, first + rows)
-            if catalogued[part].all():
-                centre = -LATITUDE_LIMIT_DEG + CELL_DEG * (first + rows / 2.0)
-                yield not covered[part].all(), abs(centre), centre
+    def centres(column: BoolArray) -> Iterator[float]:
+        for first in range(len(column) - rows + 1):
+            if column[first : first + rows].all():
+                yield -LATITUDE_LIMIT_DEG + CELL_DEG * (first + rows / 2.0)
 
-    best = min(found(), default=None)
-    return None if best is None else (best[2] - limit_deg, best[2] + limit_deg)
+    best = (min(centres(column), key=lambda one: (abs(one), one), default=None) for column in described.T)
+    return [None if one is None else (one - limit_deg, one + limit_deg) for one in best]
 
 
 def _cells() -> tuple[int, int]:
