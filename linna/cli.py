@@ -116,7 +116,6 @@ def _run(arguments: Sequence[str]) -> int:
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     except BadUsage as fault:
-        sys.stderr.write(fault.usage)
         return _refused(str(fault), arguments, fault.command)
     handler = getattr(namespace, "handler", None)
     if handler is None:

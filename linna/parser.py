@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from typing import Any, NoReturn
 
@@ -12,12 +13,11 @@ REQUIRED = "(required)"
 
 
 class BadUsage(Exception):
-    """Arguments that the parser refuses, with the usage line of the command."""
+    """Arguments that the parser of a command refuses."""
 
-    def __init__(self, command: str, message: str, usage: str) -> None:
+    def __init__(self, command: str, message: str) -> None:
         super().__init__(message)
         self.command = command
-        self.usage = usage
 
 
 class LinnaFormatter(argparse.HelpFormatter):
@@ -64,7 +64,7 @@ class LinnaParser(argparse.ArgumentParser):
         return f"{super().format_help()}\nexample: {example(self.prog)}\n"
 
     def error(self, message: str) -> NoReturn:
-        raise BadUsage(self.prog, message, self.format_usage())
+        raise BadUsage(self.prog, message)
 
 
 class _Subcommands(argparse._SubParsersAction):  # type: ignore[type-arg]  # generic in the stubs only
@@ -108,6 +108,33 @@ def option(
     if default not in (None, "", [], False) and default == default and "default" not in help:
         help = f"{help} (default: {f'{default:g}' if isinstance(default, float) else default})".strip()
     return parser.add_argument(*flags, help=help, default=default, **words)
+
+
+def number(
+    kind: type[int] | type[float] = float,
+    *,
+    least: float = -math.inf,
+    above: float = -math.inf,
+    most: float = math.inf,
+    below: float = math.inf,
+) -> Callable[[str], Any]:
+    """Return the type of an option: a finite number within limits."""
+    limits = {"from": least, "above": above, "up to": most, "below": below}
+    told = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if math.isfinite(limit))
+
+    def parse(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not (least <= value <= most and above < value < below):
+            raise argparse.ArgumentTypeError(f"expected a number {told}, found {text!r}")
+        return value
+
+    return parse
+
+
+ABOVE_ZERO = number(above=0)
 
 
 def all_commands(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:

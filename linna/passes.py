@@ -11,6 +11,7 @@ import json
 import os
 import tempfile
 import zipfile
+from argparse import Namespace
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -50,19 +51,10 @@ def open_archive(source: str | Path | None, token: str | None = None) -> Archive
 
 def _home(path: Path | None) -> Archive:
     from ground_service.client.local import local_client
-    from ground_service.ground import open_ground
-    from ground_service.settings import load_settings
-    from ground_service.store.objects import objects_of
-    from linna.data import data_folder
+    from linna.commands._ground import open_ground_only
 
-    settings = load_settings(home=path)
-    ground = open_ground(
-        settings.home,
-        data_folder(),
-        database_url=settings.resolved_database_url(),
-        objects=objects_of(settings),
-    )
-    return Archive(local_client(ground, "notebook"), str(settings.home))
+    ground = open_ground_only(Namespace(home=path))
+    return Archive(local_client(ground, "notebook"), str(ground.home))
 
 
 def _imported(archive: Path) -> Archive:

@@ -112,7 +112,6 @@ def _lroc(folder: str, stem: str, ending: str, octets: int, place: str) -> tuple
     known = {
         "WAC_EMP_643NM_E300N0450_064P": "37e0144f3fa52cf91f9cb0aa605d9200",
         "WAC_EMP_643NM_E300S0450_064P": "53eb43347e3a96bc8fdb17c1f3207546",
-        "WAC_EMP_643NM_E300N0450_304P": "97af2366068cffb38415b3658993b4f1",
     }
     files = []
     for half in "NS":
@@ -271,22 +270,6 @@ PRODUCTS: tuple[Product, ...] = (
         "Boyd et al. 2012; NASA, Arizona State University",
         _lroc("MDR/WAC_EMP", "WAC_EMP_643NM", "064P", 88_496_640, "albedo"),
         patterns=("albedo/moon_albedo*.jpg",),
-    ),
-    Product(
-        "wac-mosaic-304",
-        "the same at 304 px/deg (100 m), what the paper used",
-        _LROC_LICENCE,
-        "Boyd et al. 2012; NASA, Arizona State University",
-        _lroc("MDR/WAC_EMP", "WAC_EMP_643NM", "304P", 1_996_295_040, "albedo"),
-        note="finer than the renderer's albedo grid: 64 px/deg gives the same pictures",
-    ),
-    Product(
-        "photometry",
-        "disk-resolved photometric model of SELENE SP",
-        "MIT",
-        "Kouyama et al. 2016",
-        note="address unknown",
-        patterns=("photometry/*",),
     ),
 )
 

@@ -296,14 +296,17 @@ def _script_revision(path: Path) -> tuple[str, str | None]:
     return ast.literal_eval(stated["revision"]), ast.literal_eval(stated["down_revision"])
 
 
-def upgrade_database(database: Database) -> None:
-    """Upgrade the schema to the newest revision in one transaction; wait for a concurrent upgrade."""
-    _migrate(database, "upgrade", "head")
-
-
-def empty_database(database: Database) -> None:
-    """Drop every table; the files of the archive are kept."""
-    _migrate(database, "downgrade", "base")
+def upgrade_database(database: Database, revision: str = "head") -> None:
+    """Upgrade the schema to a revision in one transaction; wait for a concurrent upgrade."""
+    for left in reversed(range(LOCK_TRIES)):
+        try:
+            _upgrade_once(database, revision)
+            return
+        except DatabaseBusy as error:
+            if left == 0:
+                raise
+            log.info("the migration is tried again: %s", error)
+            time.sleep(LOCK_PAUSE_S)
 
 
 def migrations_folder() -> Path:
@@ -355,19 +358,7 @@ def _refused(message: str) -> InvalidInput:
     return InvalidInput("request", "", "text and numbers that the database can hold", message[:200])
 
 
-def _migrate(database: Database, direction: str, revision: str) -> None:
-    for left in reversed(range(LOCK_TRIES)):
-        try:
-            _migrate_once(database, direction, revision)
-            return
-        except DatabaseBusy as error:
-            if left == 0:
-                raise
-            log.info("the migration is tried again: %s", error)
-            time.sleep(LOCK_PAUSE_S)
-
-
-def _migrate_once(database: Database, direction: str, revision: str) -> None:
+def _upgrade_once(database: Database, revision: str) -> None:
     from alembic import command
 
     config = migration_config()
@@ -376,7 +367,7 @@ def _migrate_once(database: Database, direction: str, revision: str) -> None:
             connection.execute(text("SELECT pg_advisory_xact_lock(7601)"))
             connection.execute(text(f"SET LOCAL lock_timeout = {LOCK_WAIT_MS}"))
         config.attributes["connection"] = connection
-        getattr(command, direction)(config, revision)
+        command.upgrade(config, revision)
 
 
 def _make_folder(path: Path) -> None:

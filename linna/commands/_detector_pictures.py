@@ -9,17 +9,18 @@ from typing import Any
 
 from linna.commands._detector_common import add_model, model_octets
 from linna.output import finish
-from linna.parser import option
+from linna.parser import ABOVE_ZERO, number, option
+
+FIELD_OF_VIEW = number(above=0, below=180)
 
 
 def configure(verbs: Any) -> None:
     """Add the verb `detect`."""
-
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF, JPEG or NPY")
     option(detect, "images IMAGE", Path, nargs="+")
     add_model(detect)
-    option(detect, "--altitude-km", float, "above the ground; gives size classes", None)
-    option(detect, "--fov-deg", float, "", 120.0)
+    option(detect, "--altitude-km", ABOVE_ZERO, "above the ground; gives size classes", None)
+    option(detect, "--fov-deg", FIELD_OF_VIEW, "", 120.0)
     option(detect, "--threshold", float, "", None)
     option(detect, "--picture F.png", Path, "the image with the rims of its craters; of one image")
     _add_search(detect)
@@ -31,9 +32,11 @@ def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
     option(tested, "--coco DIR", Path, "a set of images with crater boxes or polygons in COCO files")
     of_set = evaluate.add_argument_group("with --coco")
     _add_search(of_set)
-    option(of_set, "--pixel-m", float, "ground covered by a pixel; gives classes in km", default=math.nan)
-    option(of_set, "--altitude-km", float, "above the ground, with --fov-deg, instead", default=math.nan)
-    option(of_set, "--fov-deg", float, "", 120.0)
+    option(
+        of_set, "--pixel-m", ABOVE_ZERO, "ground covered by a pixel; gives classes in km", default=math.nan
+    )
+    option(of_set, "--altitude-km", ABOVE_ZERO, "above the ground, with --fov-deg, instead", default=math.nan)
+    option(of_set, "--fov-deg", FIELD_OF_VIEW, "", 120.0)
     option(of_set, "--range-px LOW HIGH", float, "diameters that are scored (default: 8 150)", (8.0, 150.0))
     option(
         of_set,
@@ -59,11 +62,6 @@ def evaluate_set(arguments: argparse.Namespace) -> int:
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
             raise UsageError(f"{option}: expected together with --dataset, found with --coco")
-    for name in ("pixel_m", "altitude_km"):
-        if getattr(arguments, name) <= 0.0:
-            option = f"--{name.replace('_', '-')}"
-            raise UsageError(f"{option}: expected a number above zero, found {getattr(arguments, name):g}")
-    _check_fov(arguments.fov_deg)
     low, high = arguments.range_px
     if not 0.0 <= low < high:
         raise UsageError(f"--range-px: expected two diameters in rising order, found {low:g} {high:g}")
@@ -119,13 +117,6 @@ def _add_search(parser: Any) -> None:
     )
 
 
-def _check_fov(fov_deg: float) -> None:
-    from linna.errors import UsageError
-
-    if not 0.0 < fov_deg < 180.0:
-        raise UsageError(f"--fov-deg: expected an angle between 0 and 180, found {fov_deg:g}")
-
-
 def _detect(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from linna.output import emit, log
@@ -134,11 +125,6 @@ def _detect(arguments: argparse.Namespace) -> int:
     from payload_emulator.session.picture_files import read_picture
     from payload_emulator.training.evaluate.sheets import draw_detections, format_detections, save_png
 
-    if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
-        raise UsageError(
-            f"--altitude-km: expected a positive number of kilometres, found {arguments.altitude_km:g}"
-        )
-    _check_fov(arguments.fov_deg)
     if arguments.picture and len(arguments.images) > 1:
         raise UsageError(f"--picture: expected one image, found {len(arguments.images)}")
     detector = OnnxDetector(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.output import emit, finish, save
-from linna.parser import option
+from linna.parser import ABOVE_ZERO, option
 
 if TYPE_CHECKING:
     from lunar.ephemeris import Ephemeris
@@ -20,7 +20,7 @@ def configure_compare(commands: Any) -> None:
     compare = commands.add_parser("compare", help="difference of two ephemerides on common epochs")
     option(compare, "a A", Path, "ephemeris file; its orbit gives the axes")
     option(compare, "b B", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
-    option(compare, "--step S", float, "seconds between epochs (default: the states of A)")
+    option(compare, "--step S", ABOVE_ZERO, "seconds between epochs (default: the states of A)")
     finish(compare, run_compare)
 
 
@@ -45,7 +45,7 @@ def configure_convert(commands: Any) -> None:
     )
     option(convert, "--out FILE", Path, "ending in .oem, .xml, .bsp, .e, .csv or .tum", required=True)
     option(convert, "--spice-id N", int, "SPICE number of the spacecraft in an SPK, such as -85")
-    option(convert, "--step S", float, "seconds between states (default: the states of the file)")
+    option(convert, "--step S", ABOVE_ZERO, "seconds between states (default: the states of the file)")
     finish(convert, run_convert)
 
 
@@ -172,14 +172,9 @@ def _spice_id(arguments: argparse.Namespace) -> int:
 
 
 def _epochs(step_s: float | None, ephemeris: Any) -> Any:
-    from linna.errors import UsageError
     from lunar.ground_track import even_epochs
 
-    if step_s is None:
-        return None
-    if not step_s > 0.0:
-        raise UsageError(f"--step: expected seconds above 0, found {step_s:g}")
-    return even_epochs(ephemeris, step_s)
+    return None if step_s is None else even_epochs(ephemeris, step_s)
 
 
 def _read_epochs(name: str) -> list[int]:

@@ -82,7 +82,7 @@ class Command:
     preset: Mapping[str, Any] = field(default_factory=dict)
     limit: int | None = LIMIT
 
-    def configure(self, parser: LinnaParser) -> None:
+    def configure(self, parser: argparse.ArgumentParser) -> None:
         """Add the options and the handler."""
         work = self._work()
         signature = inspect.signature(work)
@@ -171,7 +171,9 @@ def add_commands(parser: argparse.ArgumentParser, commands: Commands) -> None:
         actions.add_parser(name, help=one.help).fill(one.configure)
 
 
-def _add(parser: LinnaParser, name: str, kind: Any, default: Any, option: Option, positional: bool) -> None:
+def _add(
+    parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, option: Option, positional: bool
+) -> None:
     """Add an argument of a type: choices of a literal, repeated values of a sequence, a switch for a truth value."""
     required = default is inspect.Parameter.empty
     inner = [one for one in get_args(kind) if one is not types.NoneType]

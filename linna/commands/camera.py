@@ -7,7 +7,7 @@ from pathlib import Path
 
 from linna.commands._choices import CATALOGUE_HELP, open_catalogue
 from linna.output import emit, finish, log
-from linna.parser import option
+from linna.parser import ABOVE_ZERO, number, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -18,10 +18,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(study, "--ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)", required=True)
     option(study, "--catalogue F", str, CATALOGUE_HELP)
     option(study, "--seed", int, "seed of a synthetic catalogue", 1)
-    option(study, "--step S", float, "seconds between positions (default: every state of the file)")
-    option(study, "--fov-step DEG", float, "default: 10 degrees", 10.0)
-    option(study, "--needed N", int, "craters needed", 3)
-    option(study, "--threshold P", float, "probability to exceed", 0.9)
+    option(study, "--step S", ABOVE_ZERO, "seconds between positions (default: every state of the file)")
+    option(study, "--fov-step DEG", number(above=0, most=150), "default: 10 degrees", 10.0)
+    option(study, "--needed N", number(int, least=1, most=50), "craters needed", 3)
+    option(study, "--threshold P", number(least=0, below=1), "probability to exceed", 0.9)
     finish(study, run_fov_study)
 
 
@@ -29,21 +29,12 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from linna.data import data_folder
-    from linna.errors import UsageError
     from lunar.datafolder import default_orientation
     from lunar.fov_study import PAPER_COUNTS, study_field_of_view
     from lunar.frames import mcmf_from_spherical
     from lunar.ground_track import even_epochs, ground_track
     from lunar.messages.ephemeris_files import load_ephemeris
 
-    if not 0.0 < arguments.fov_step <= 150.0:
-        raise UsageError(f"--fov-step: expected a step of 0 to 150 degrees, found {arguments.fov_step:g}")
-    if not 0.0 <= arguments.threshold < 1.0:
-        raise UsageError(f"--threshold: expected a probability of 0 to 1, found {arguments.threshold:g}")
-    if not 1 <= arguments.needed <= 50:
-        raise UsageError(f"--needed: expected 1 to 50 craters, found {arguments.needed}")
-    if arguments.step is not None and not arguments.step > 0.0:
-        raise UsageError(f"--step: expected seconds above 0, found {arguments.step:g}")
     ephemeris = load_ephemeris(arguments.ephemeris)
     catalogue = open_catalogue(arguments.catalogue, arguments.seed)
     orientation = default_orientation(data_folder())

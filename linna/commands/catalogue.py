@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.commands._choices import CATALOGUE_HELP, open_catalogue, parse_region
-from linna.commands._ground import add_operator_options, ground_client
+from linna.commands._table import Command, Option
 from linna.output import emit, finish
-from linna.parser import option
+from linna.parser import number, option
 
 if TYPE_CHECKING:
     from lunar.arrays import FloatArray
@@ -34,20 +34,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     adding = commands.add_parser(
         "add", help="have the ground service hold a catalogue, which a mission description names by its hash"
     )
-    option(adding, "file FILE", Path, "CSV, plain or gzip")
-    add_operator_options(adding)
-    finish(adding, run_add)
+    Command(
+        "add_catalogue",
+        "",
+        lambda held: f"{held.name}: {held.sha256}",
+        options={"file": Option("CSV, plain or gzip", "FILE")},
+    ).configure(adding)
     from linna.commands._catalogue_landmarks import configure as configure_landmarks
 
     configure_landmarks(
         commands.add_parser("landmarks", help="compare the map made by the payload with a catalogue")
     )
-
-
-def run_add(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        held = service.add_catalogue(arguments.file)
-    return emit(arguments, held.model_dump(mode="json"), text=f"{held.name}: {held.sha256}")
 
 
 def _configure_curate(curate: argparse.ArgumentParser) -> None:
@@ -67,8 +64,8 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
         required=True,
     )
     option(curate, "--region W,E,S,N", str, "degrees, longitude east", "0,360,-80,80")
-    option(curate, "--min-diameter KM", float, "default: 3 km", 3.0)
-    option(curate, "--max-diameter KM", float, "default: 30 km", 30.0)
+    option(curate, "--min-diameter KM", number(least=0.5), "default: 3 km", 3.0)
+    option(curate, "--max-diameter KM", number(most=200), "default: 30 km", 30.0)
     option(curate, "--depth-ratio R", float, "least depth over diameter", 0.03)
     finish(curate, run_curate)
 
@@ -106,10 +103,9 @@ def run_curate(arguments: argparse.Namespace) -> int:
     from tmtc.tables import pack_catalogue_table, table_hash
 
     region = parse_region(arguments.region)
-    if not 0.5 <= arguments.min_diameter < arguments.max_diameter <= 200.0:
+    if arguments.min_diameter >= arguments.max_diameter:
         raise UsageError(
-            f"--min-diameter, --max-diameter: expected 0.5 to 200 km in this order, "
-            f"found {arguments.min_diameter:g} and {arguments.max_diameter:g}"
+            f"--min-diameter: expected below {arguments.max_diameter:g} km, found {arguments.min_diameter:g}"
         )
     paths = arguments.terrain
     if paths is None:

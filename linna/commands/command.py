@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,51 +51,23 @@ def _configure_uplink(parser: LinnaParser) -> None:
     option(parser, "--spacecraft-id N", int, required=True)
     option(parser, "--instance", str, "instance of the spacecraft", "flight")
     option(parser, "--format", ("cltu", "packets"), "", "cltu")
-    option(parser, "--out FILE", Path, "file for the octets")
-    option(parser, "--tcp HOST:PORT", str, "TCP address to send the octets to")
+    option(parser, "--out FILE", Path, "file for the octets", required=True)
     add_operator_options(parser)
     finish(parser, _uplink)
 
 
 def _uplink(arguments: argparse.Namespace) -> int:
-    if arguments.out is None and arguments.tcp is None:
-        raise UsageError("uplink: expected --out FILE or --tcp HOST:PORT, found neither")
-    with contextlib.ExitStack() as opened:
-        # Connection and file come first: telecommands count as sent from the moment they are taken.
-        link = opened.enter_context(_connection(arguments.tcp)) if arguments.tcp else None
-        file = None
-        if arguments.out is not None:
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            file = opened.enter_context(arguments.out.open("wb"))
-        service = opened.enter_context(ground_client(arguments))
+    out: Path = arguments.out
+    out.parent.mkdir(parents=True, exist_ok=True)
+    # The file comes first: telecommands count as sent from the moment they are taken.
+    with out.open("wb") as file, ground_client(arguments) as service:
         taken = service.take_uplink(
             arguments.spacecraft_id, instance=arguments.instance, format=arguments.format
         )
-        if file is not None:
-            file.write(taken.octets)
-        if link is not None:
-            link.sendall(taken.octets)
-    where = str(arguments.out or arguments.tcp)
-    figures = {"file": where, "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
-    return emit(
-        arguments,
-        figures,
-        text=f"{where}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets",
-    )
-
-
-def _connection(address: str) -> Any:
-    import socket
-
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise UsageError(f"--tcp: expected HOST:PORT, found {address!r}")
-    try:
-        return socket.create_connection((host.strip("[]"), int(port)), timeout=10.0)
-    except OSError as error:
-        raise UsageError(
-            f"--tcp {address}: expected a TCP server that accepts telecommands, found {error}"
-        ) from None
+        file.write(taken.octets)
+    figures = {"file": str(out), "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
+    text = f"{out}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets"
+    return emit(arguments, figures, text=text)
 
 
 def _figures(telecommand: Telecommand) -> dict[str, Any]:
@@ -183,7 +154,7 @@ COMMANDS: Commands = {
         "no notes, no holds",
     ),
     "uplink": Hand(
-        "take the released telecommands and write or send them; they count as sent from then on",
+        "take the released telecommands and write them to a file; they count as sent from then on",
         _configure_uplink,
     ),
     "receiver": Command(

@@ -30,10 +30,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(granting, "--print", bool, "print the SQL statements and do not run them")
     granting.set_defaults(handler=run_grant)
-    downgrade = actions.add_parser("downgrade", help="delete every table and row of the database")
-    option(downgrade, "revision", str, "base, the only revision to downgrade to")
-    option(downgrade, "--yes", bool, "confirm that everything is deleted")
-    downgrade.set_defaults(handler=run_downgrade)
     status = actions.add_parser("status", help="show the schema revision of the database")
     status.set_defaults(handler=run_status)
     saving = actions.add_parser("backup", help="write the whole service into a new folder, while it runs")
@@ -54,16 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     tidying.set_defaults(handler=run_tidy)
     decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")
     decoding.set_defaults(handler=run_redecode)
-    for action in (
-        upgrade,
-        granting,
-        downgrade,
-        status,
-        saving,
-        restoring,
-        tidying,
-        decoding,
-    ):
+    for action in (upgrade, granting, status, saving, restoring, tidying, decoding):
         add_service_options(action)
         add_json_flag(action)
 
@@ -121,28 +108,6 @@ def _service_role(settings: Settings) -> str | None:
     if settings.migration_database_url is None or service.username == owner.username:
         return None
     return service.username
-
-
-def run_downgrade(arguments: argparse.Namespace) -> int:
-    from ground_service.store.database import empty_database, open_database, schema_revisions
-    from linna.errors import UsageError
-
-    if arguments.revision != "base":
-        raise UsageError(
-            f"revision: expected base, because a downgrade to another revision loses rows, found {arguments.revision}"
-        )
-    database = open_database(settings_of(arguments).resolved_migration_url())
-    if not arguments.yes:
-        raise UsageError(
-            f"expected --yes, because base deletes every row of {database.label}, found no --yes"
-        )
-    try:
-        found = schema_revisions(database)[0]
-        if found is not None:
-            empty_database(database)
-        return _show(arguments, *schema_revisions(database)[:2], database.label)
-    finally:
-        database.engine.dispose()
 
 
 def run_status(arguments: argparse.Namespace) -> int:

@@ -38,7 +38,6 @@ def _add_train(verbs: Any) -> None:
     option(train, "--seed", int, "", 1)
     option(train, "--crop PX", int, "", 384)
     option(train, "--batch", int, "", 8)
-    option(train, "--patience", int, "stop after this many validations without gain (0: never)", 0)
     option(train, "--learning-rate", float, "", 2.5e-3)
     option(train, "--landmarks F.csv", Path, "uncatalogued landmarks as further labels", None)
     option(train, "--start-from FILE", Path, "first weights: a checkpoint or an ONNX network", None)
@@ -66,7 +65,6 @@ def _add_export(verbs: Any) -> None:
     option(export, "--out M.onnx", Path, required=True)
     option(export, "--dataset DIR", Path, "whose validation split fixes the thresholds", [], nargs="*")
     option(export, "--revision", str, "source revision for the model's metadata", "")
-    option(export, "--note", str, "a remark on the training for the model's metadata", "")
     option(export, "--paper-classes", bool, "keep the heatmaps of the paper's three classes")
     option(
         export,
@@ -148,7 +146,6 @@ def _train(arguments: argparse.Namespace) -> int:
         batch=arguments.batch,
         crop_px=arguments.crop,
         learning_rate=arguments.learning_rate,
-        patience=arguments.patience,
         seed=arguments.seed,
         replicas=arguments.replicas,
         enlarge=arguments.enlarge,
@@ -184,7 +181,6 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.out,
         datasets,
         arguments.revision,
-        {"training_note": arguments.note} if arguments.note else None,
         paper_classes=arguments.paper_classes,
         classes_only=arguments.classes_only,
         enlarge=arguments.enlarge,

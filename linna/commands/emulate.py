@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.output import emit, finish, log, progress
-from linna.parser import option
+from linna.parser import ABOVE_ZERO, number, option
 
 if TYPE_CHECKING:
     from payload_emulator.session.scenario import Scenario
@@ -58,7 +58,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--check", bool, "fly nothing: print what would be flown; exit status 2 with a fault")
     _add_live(parser)
-    option(parser, "--campaign FILE", str, "fly the fault campaign of a file, or a shipped one by name")
     finish(parser, run)
 
 
@@ -69,13 +68,13 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
     add("--no-operator", action="store_true", help="the ground commands, from the epoch of the scenario on")
     add(
         "--rate",
-        type=float,
+        type=number(least=0),
         default=1.0,
         help="simulated seconds a second, 0: as fast as possible (default: 1)",
     )
     add("--paused", action="store_true", help="wait for run or step on the console")
     add("--stop-at-end", action="store_true", help="end with the windows of the scenario")
-    add("--days", type=float, metavar="D", help="end after so many days (default: never)")
+    add("--days", type=ABOVE_ZERO, metavar="D", help="end after so many days (default: never)")
     add("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     add("--port", type=int, default=10015, help="telemetry of the first station (default: %(default)s)")
     add(
@@ -136,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("emulate: expected a scenario or --images DIR, found none")
     if arguments.evidence and arguments.images is None:
         raise UsageError("--evidence: expected together with --images DIR, found alone")
-    if arguments.images is not None and (arguments.live or arguments.campaign):
+    if arguments.images is not None and arguments.live:
         raise UsageError("--images: expected together with --out DIR alone")
     chosen = arguments.images / SCENARIO if arguments.scenario is None else arguments.scenario
     scenario = load_scenario(chosen).with_choices(
@@ -144,12 +143,10 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.check:
         return _check(arguments, scenario)
-    if arguments.campaign:
-        return _campaign(arguments, scenario)
     if arguments.live:
         return _live(arguments, scenario)
     if arguments.out is None:
-        raise UsageError("emulate: expected --out DIR, --live or --campaign FILE, found none")
+        raise UsageError("emulate: expected --out DIR or --live, found neither")
     kept = {"none": 0, "some": 8, "all": None}[arguments.frames]
     external = (
         None if arguments.images is None else load_external(arguments.images, scenario, arguments.evidence)
@@ -194,60 +191,17 @@ def _check(arguments: argparse.Namespace, scenario: Scenario) -> int:
     )
 
 
-def _campaign(arguments: argparse.Namespace, scenario: Scenario) -> int:
-    from dataclasses import asdict
-
-    from linna.data import data_folder
-    from payload_emulator.session.campaign import load_campaign, run_campaign, table
-
-    campaign = load_campaign(arguments.campaign)
-    results = run_campaign(
-        scenario,
-        campaign,
-        data_folder(),
-        progress=lambda runs, total: progress(runs, total, "campaign", "run"),
-    )
-    rows = table(results)
-    missed = sum(row["runs"] - row["detected"] for row in rows)
-    lost = sum(row["lost"] for row in rows)
-    figures = {
-        "campaign": campaign.name,
-        "scenario": scenario.name,
-        "runs": len(results),
-        "undetected": missed,
-        "lost": lost,
-        "table": rows,
-        "results": [asdict(result) for result in results],
-    }
-    width = max(len(row["case"]) for row in rows)
-    lines = [f"{'case':<{width}}  runs  detected  recovered  contained  lost  latest  frames"]
-    lines += [
-        f"{row['case']:<{width}}  {row['runs']:>4}  {row['detected']:>8}  {row['recovered']:>9}  "
-        f"{row['contained']:>9}  {row['lost']:>4}  {row['latency_max_s']:>4.0f} s  "
-        f"{row['frames_processed']}/{row['frames_expected']}"
-        for row in rows
-    ]
-    lines.append(f"{len(results)} runs, {missed} undetected, {lost} lost")
-    emit(arguments, figures, text="\n".join(lines))
-    return 1 if missed or lost else 0
-
-
 def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     import signal
     from dataclasses import asdict
 
     from linna.data import data_folder
-    from linna.errors import UsageError
     from lunar.timescales import format_utc
     from payload_emulator.session.live import LiveSession, station_names
     from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
     from payload_emulator.session.starting import launch, load_scenario_payload
     from payload_emulator.session.world import build_world
 
-    if not arguments.rate >= 0.0 or (arguments.days is not None and not arguments.days > 0.0):
-        raise UsageError(
-            f"--rate, --days: expected numbers above 0, found {arguments.rate}, {arguments.days}"
-        )
     data, operated = data_folder(), not arguments.no_operator
     if operated:
         world = build_world(scenario, data)
@@ -282,8 +236,8 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
             world, data, arguments.host, used, operations, arguments.keep_unacknowledged, arguments.craters
         ),
     )
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: session.stopping.set())
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, lambda *_: session.stopping.set())
     log(", ".join(f"{name} on {arguments.host}:{port}" for name, port in session.ports.items()))
     session.run()
     account = asdict(session.account)

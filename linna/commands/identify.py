@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.output import emit, finish, log, progress
-from linna.parser import option
+from linna.parser import number, option
 
 if TYPE_CHECKING:
     from lunar.arrays import IntArray
@@ -34,8 +34,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         required=True,
     )
     option(lost, "--frames", int, "", 300)
-    option(lost, "--attitude-deg", float, "error of nadir and heading, 1 sigma per axis", 0.5)
-    option(lost, "--min-diameter-km", float, "smallest craters of the map", 3.0)
+    option(
+        lost, "--attitude-deg", number(above=0, most=2), "error of nadir and heading, 1 sigma per axis", 0.5
+    )
+    option(lost, "--min-diameter-km", number(least=1, most=20), "smallest craters of the map", 3.0)
     option(lost, "--detections F.npz", Path, "keep the detections here, or take those kept here")
     option(
         lost,
@@ -56,7 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
     from studies import lost_in_space as study
     from studies.lost_frames import FRAMES_COMBINED
 
-    _check(arguments, FRAMES_COMBINED)
+    if arguments.frames < FRAMES_COMBINED:
+        raise UsageError(f"--frames: expected at least {FRAMES_COMBINED}, found {arguments.frames}")
     scenario = study.pointed(load_scenario(arguments.scenario), arguments.attitude_deg)
     world = build_world(scenario, data_folder())
     numbers = study.frames_in_sets(world, math.ceil(arguments.frames / FRAMES_COMBINED))
@@ -163,17 +166,6 @@ def _statistics(single: Sequence[LostRow], wrong_m: float) -> dict[str, float | 
         "catalogued_per_frame": float(np.mean([row.catalogued for row in single])),
         "detections_per_frame": float(np.mean([row.detections for row in single])),
     }
-
-
-def _check(arguments: argparse.Namespace, least_frames: int) -> None:
-    from linna.errors import UsageError
-
-    if arguments.frames < least_frames:
-        raise UsageError(f"--frames: expected at least {least_frames}, found {arguments.frames}")
-    if not 1.0 <= arguments.min_diameter_km <= 20.0:
-        raise UsageError(f"--min-diameter-km: expected 1 to 20, found {arguments.min_diameter_km:g}")
-    if not 0.0 < arguments.attitude_deg <= 2.0:
-        raise UsageError(f"--attitude-deg: expected above 0 and up to 2, found {arguments.attitude_deg:g}")
 
 
 def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Share]]) -> list[str]:

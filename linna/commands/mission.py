@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from linna.commands._ground import add_operator_options, ground_client
-from linna.output import add_json_flag, emit
-from linna.parser import option
+from linna.commands._table import Command, Commands, Hand, add_commands, as_json
+from linna.output import emit, finish
+from linna.parser import ABOVE_ZERO, LinnaParser, number, option
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    writing = actions.add_parser("write", help="write the mission description of a scenario")
+def _configure_write(writing: LinnaParser) -> None:
     option(writing, "scenario SCENARIO", str, "scenario file or name", nargs="?")
     option(writing, "--xtce FILE", Path, "instead of a scenario: packets of another mission")
     option(writing, "--spacecraft-id N", int, "spacecraft of these packets", 0)
@@ -27,8 +25,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(writing, "--windows N", int, "windows a day of the request", 2)
     option(writing, "--window-min M", float, "duration of its windows", 12.0)
-    writing.set_defaults(handler=write)
-    checking = actions.add_parser("check", help="check a mission description; print one line for each fault")
+    finish(writing, write)
+
+
+def _configure_check(checking: LinnaParser) -> None:
     option(checking, "file FILE", Path)
     option(
         checking,
@@ -36,26 +36,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
         bool,
         "dry run: plan request.json over reference.oem beside the file, and release the telecommands",
     )
-    checking.set_defaults(handler=check)
-    adding = actions.add_parser("add", help="add a mission description as a revision")
-    option(adding, "file FILE", Path)
-    adding.set_defaults(handler=add)
-    listing = actions.add_parser("list", help="list the revisions, newest first")
-    option(listing, "--limit", int, "largest number of revisions", 50)
-    listing.set_defaults(handler=list_missions)
-    showing = actions.add_parser("show", help="show a revision")
-    option(showing, "revision REVISION", str, "the hash or its first eight digits")
-    showing.set_defaults(handler=show)
-    running = actions.add_parser("run", help="run payload, stations, ground service and automation for days")
+    finish(checking, check)
+
+
+def _configure_run(running: LinnaParser) -> None:
     option(running, "scenario SCENARIO", str, "scenario file or name; several are a fleet", nargs="+")
-    option(running, "--days D", float, "simulated days", required=True)
+    option(running, "--days D", ABOVE_ZERO, "simulated days", required=True)
     option(running, "--speed X|max", str, "simulated seconds per second", "max")
-    option(running, "--observe-hours-a-day H", float, "observation a day", 0.4)
-    option(running, "--window-min M", float, "window (default: 12 min)", 12.0)
+    option(running, "--observe-hours-a-day H", ABOVE_ZERO, "observation a day", 0.4)
+    option(running, "--window-min M", number(least=1), "window (default: 12 min)", 12.0)
     option(
         running,
         "--real-time-factor F",
-        float,
+        number(least=0),
         "simulated seconds per second that do not wait for the ground, instead of --speed",
         0.0,
     )
@@ -77,25 +70,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
         running, "--broker URL", str, "broker of the distributed form (default: a Redis server of the run)"
     )
     option(
-        running, "--kill SEED", int, "kill processes of the distributed form at random points of this seed"
+        running,
+        "--kill SEED",
+        number(int, least=0),
+        "kill processes of the distributed form at random points of this seed",
     )
-    option(running, "--kills N", int, "number of kills (default: 4 a day)")
-    running.set_defaults(handler=run_mission)
-    comparing = actions.add_parser(
-        "compare",
-        help="compare the closing figures of two mission runs",
-        description="Compare all closing figures of two mission runs except those of processes and the wall clock. "
-        "Exit status 0: identical; 1: not.",
+    option(running, "--kills N", number(int, least=0), "number of kills (default: 4 a day)")
+    finish(running, run_mission)
+
+
+def _configure_compare(comparing: LinnaParser) -> None:
+    comparing.description = (
+        "Compare all closing figures of two mission runs except those of processes and the wall clock. "
+        "Exit status 0: identical; 1: not."
     )
     for name in ("first", "second"):
-        comparing.add_argument(
-            name, type=Path, metavar=name.upper(), help="folder of a run, or its report.json"
-        )
-    comparing.set_defaults(handler=compare)
-    for action in (adding, listing, showing):
-        add_operator_options(action)
-    for action in (writing, checking, adding, listing, showing, running, comparing):
-        add_json_flag(action)
+        option(comparing, f"{name} {name.upper()}", Path, "folder of a run, or its report.json")
+    finish(comparing, compare)
 
 
 def write(arguments: argparse.Namespace) -> int:
@@ -155,29 +146,6 @@ def check(arguments: argparse.Namespace) -> int:
     return 2 if figures["faults"] else 0
 
 
-def add(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        figures = service.add_mission(arguments.file).model_dump(mode="json")
-    return emit(arguments, figures, text=_described(figures))
-
-
-def list_missions(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        page = service.list_missions().page(arguments.limit)
-    lines = [
-        f"{one.revision[:16]}  {str(one.entered)[:19]}Z  {one.mission}  ({len(one.unknown)} not stated)"
-        for one in page.items
-    ]
-    figures = {"missions": [one.model_dump(mode="json") for one in page.items], "total": page.total}
-    return emit(arguments, figures, text="\n".join(lines) or "no mission descriptions")
-
-
-def show(arguments: argparse.Namespace) -> int:
-    with ground_client(arguments) as service:
-        figures = service.get_mission(arguments.revision).model_dump(mode="json")
-    return emit(arguments, figures, text=f"{_described(figures)}\n\n{figures['text'].rstrip()}")
-
-
 def _figures(mission: Any) -> dict[str, Any]:
     return {"mission": mission.name, "revision": mission.revision, "unknown": list(mission.unknown)}
 
@@ -205,10 +173,6 @@ def run_mission(arguments: argparse.Namespace) -> int:
         rate = -1.0
     if rate < 0.0 or (rate == 0.0 and arguments.speed != "max"):
         raise UsageError(f"--speed: expected a number above 0 or max, found {arguments.speed!r}")
-    if not (arguments.days > 0.0 and arguments.observe_hours_a_day > 0.0 and arguments.window_min >= 1.0):
-        raise UsageError(
-            "--days, --observe-hours-a-day, --window-min: expected numbers above 0 and windows of a minute or more"
-        )
     if not arguments.distributed and (arguments.kill, arguments.kills, arguments.database, arguments.broker) != (
         None, None, None, None,
     ):  # fmt: skip
@@ -220,11 +184,9 @@ def run_mission(arguments: argparse.Namespace) -> int:
         kills = max(round(4 * arguments.days), 1) if arguments.kills is None else arguments.kills
     elif arguments.kills is not None:
         raise UsageError("--kills: expected --kill SEED with it, found none")
-    if kills < 0 or (arguments.kill or 0) < 0:
-        raise UsageError("--kill, --kills: expected numbers from 0")
     factor = arguments.real_time_factor
-    if not factor >= 0.0 or (factor and (rate or kills)):
-        raise UsageError("--real-time-factor: expected a number above 0 without --speed and --kill")
+    if factor and (rate or kills):
+        raise UsageError("--real-time-factor: expected neither --speed nor --kill with it, found one")
     disturbances = UNDISTURBED
     if arguments.disturbances is not None:
         disturbances = load_disturbances(arguments.disturbances)
@@ -283,3 +245,33 @@ def compare(arguments: argparse.Namespace) -> int:
     figures = comparison(arguments.first, arguments.second)
     emit(arguments, figures, text=described(figures))
     return 1 if figures["differences"] else 0
+
+
+COMMANDS: Commands = {
+    "write": Hand("write the mission description of a scenario", _configure_write),
+    "check": Hand("check a mission description; print one line for each fault", _configure_check),
+    "add": Command(
+        "add_mission", "add a mission description as a revision", lambda made: _described(as_json(made))
+    ),
+    "list": Command(
+        "list_missions",
+        "list the revisions, newest first",
+        lambda one: (
+            f"{one.revision[:16]}  {str(one.entered)[:19]}Z  {one.mission}  ({len(one.unknown)} not stated)"
+        ),
+        "missions",
+        "no mission descriptions",
+    ),
+    "show": Command(
+        "get_mission",
+        "show a revision",
+        lambda found: f"{_described(as_json(found))}\n\n{found.text.rstrip()}",
+        options={"revision": "the hash or its first eight digits"},
+    ),
+    "run": Hand("run payload, stations, ground service and automation for days", _configure_run),
+    "compare": Hand("compare the closing figures of two mission runs", _configure_compare),
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    add_commands(parser, COMMANDS)

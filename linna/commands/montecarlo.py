@@ -7,13 +7,13 @@ from dataclasses import asdict
 from typing import Any
 
 from linna.output import emit, finish
-from linna.parser import option
+from linna.parser import ABOVE_ZERO, number, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    option(parser, "--runs N", int, "runs", 50)
+    option(parser, "--runs N", number(int, least=1), "runs", 50)
     option(parser, "--seed", int, "seed of the first run", 1)
-    option(parser, "--hours H", float, "length of a run", 3.0)
+    option(parser, "--hours H", number(above=0.1), "length of a run", 3.0)
     option(
         parser,
         "--track",
@@ -21,11 +21,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits",
         "test",
     )
-    option(parser, "--noise-factor F", float, "factor on the filter's process noise", 1.0)
+    option(parser, "--noise-factor F", ABOVE_ZERO, "factor on the filter's process noise", 1.0)
     option(
         parser,
         "--attitude-noise-deg A",
-        float,
+        number(least=0, most=10),
         "true noise of the attitude per axis in each frame (default: as declared on board)",
     )
     option(parser, "--workers N", int, "processes (default: one per core)")
@@ -38,20 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
     from math import radians
 
     from linna.data import data_folder
-    from linna.errors import UsageError
     from studies.montecarlo import consistency, fly_many, verdict
     from studies.montecarlo_world import standard_case
 
-    if arguments.runs < 1 or not arguments.hours > 0.1 or not arguments.noise_factor > 0.0:
-        raise UsageError(
-            "expected --runs of 1 or more, --hours over 0.1 and a positive --noise-factor, found "
-            f"{arguments.runs}, {arguments.hours:g} and {arguments.noise_factor:g}"
-        )
     case = standard_case(data_folder(), arguments.track, arguments.hours, arguments.noise_factor)
     noise_deg = arguments.attitude_noise_deg
     if noise_deg is not None:
-        if not 0.0 <= noise_deg <= 10.0:
-            raise UsageError(f"expected --attitude-noise-deg of 0 to 10, found {noise_deg:g}")
         case = replace(case, attitude_noise_rad=radians(noise_deg))
     seeds = list(range(arguments.seed, arguments.seed + arguments.runs))
     result = consistency(fly_many(case, seeds, arguments.workers), settle_frames=60)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from linna.commands._choices import parse_region
 from linna.output import emit, finish, log, progress
-from linna.parser import option
+from linna.parser import number, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -19,9 +19,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "and judge them by the truth. With --out, an interrupted survey resumes with the next seed.",
     )
     option(survey, "--region W,E,S,N", str, "degrees, such as 285,300,-60,60", required=True)
-    option(survey, "--seeds N", int, "sessions", 3)
+    option(survey, "--seeds N", number(int, least=1), "sessions", 3)
     option(survey, "--seed S", int, "first seed (default: the scenario's)")
-    option(survey, "--windows N", int, "windows of a session", 6)
+    option(survey, "--windows N", number(int, least=1), "windows of a session", 6)
     option(survey, "--direction", ("ascending", "descending", "any"), "", "ascending")
     option(
         survey,
@@ -36,13 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run_survey(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
-    from linna.errors import UsageError
     from payload_emulator.session.scenario import load_scenario
     from studies.survey import format_survey, summary, survey_scenario, survey_session
 
-    for name in ("seeds", "windows"):
-        if getattr(arguments, name) < 1:
-            raise UsageError(f"--{name}: expected 1 or more, found {getattr(arguments, name)}")
     region, base = parse_region(arguments.region), load_scenario(arguments.scenario)
     first = base.seed if arguments.seed is None else arguments.seed
     if arguments.out is not None:

@@ -11,15 +11,15 @@ from typing import Any
 
 from linna.commands._orbit_ephemeris import configure_compare, configure_convert, configure_interpolate
 from linna.output import emit, finish, log, save
-from linna.parser import option
+from linna.parser import ABOVE_ZERO, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
     option(propagate, "scenario", str, "scenario file, or the name of a shipped one")
-    option(propagate, "--days D", _positive, "span in days", 30.0)
-    option(propagate, "--step S", _positive, "seconds between states", 30.0)
+    option(propagate, "--days D", ABOVE_ZERO, "span in days", 30.0)
+    option(propagate, "--step S", ABOVE_ZERO, "seconds between states", 30.0)
     option(propagate, "--out F.oem", Path, "ephemeris to write", required=True)
     option(propagate, "--gravity FILE", str, "coefficient file, or 'builtin'")
     option(propagate, "--degree N", int, "degree of the gravity field")
@@ -58,13 +58,6 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     figures["data"] = list(data.names()) or ["built-in gravity and IAU orientation only"]
     figures["out"] = str(out)
     return emit(arguments, figures, _text(figures))
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (value > 0.0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"expected a number over 0, found {text!r}")
-    return value
 
 
 def _with_choices(scenario: Any, arguments: argparse.Namespace) -> Any:
@@ -155,20 +148,17 @@ def configure_visibility(commands: Any) -> None:
         [],
         action="append",
     )
-    option(visibility, "--step S", float, "seconds between looks", 60.0)
+    option(visibility, "--step S", ABOVE_ZERO, "seconds between looks", 60.0)
     finish(visibility, run_visibility)
 
 
 def run_visibility(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
-    from linna.errors import UsageError
     from lunar.contacts import visibility_spans
     from lunar.datafolder import default_orientation
     from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
-    if not arguments.step > 0.0:
-        raise UsageError(f"--step: expected seconds above 0, found {arguments.step:g}")
     stations = tuple(_station(text) for text in arguments.station)
     orientation = default_orientation(data_folder())
     ephemeris = load_ephemeris(arguments.ephemeris)
@@ -197,10 +187,10 @@ def run_visibility(arguments: argparse.Namespace) -> int:
         "data": [f"lunar orientation {orientation.name}"],
     }
     kinds = {
-        "eclipses": listed(found.eclipse),
-        "nights below": listed(found.night),
-        "occultations": listed(found.occultation),
-        **{f"contacts {name}": listed(spans) for name, spans in found.contacts.items()},
+        "eclipses": figures["eclipses"],
+        "nights below": figures["nights"],
+        "occultations": figures["occultations"],
+        **{f"contacts {name}": spans for name, spans in figures["contacts"].items()},
     }
     whole_s = (found.stop_utc_ns - found.start_utc_ns) / 1e9
     lines = [f"{figures['start']} to {figures['stop']}, orientation {orientation.name}"]
@@ -215,8 +205,6 @@ def run_visibility(arguments: argparse.Namespace) -> int:
 
 
 def _station(text: str) -> Any:
-    import math
-
     from linna.errors import UsageError
     from lunar.visibility import GroundStation
 

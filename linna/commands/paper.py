@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.output import as_json, emit, finish, log, progress
-from linna.parser import option
+from linna.parser import number, option
 
 if TYPE_CHECKING:
     from reports.paper_values import PaperReport
@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--out DIR", Path, "folder of the document and its steps", required=True)
     option(parser, "--quick", bool, "3 hours and few images instead of 24 hours")
-    option(parser, "--hours H", float, "length of the session (default: 24; quick: 3)")
+    option(parser, "--hours H", number(least=0.5, most=240), "length of the session (default: 24; quick: 3)")
     option(
         parser,
         "--model M.onnx",
@@ -39,8 +39,6 @@ def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
 
-    if arguments.hours is not None and not 0.5 <= arguments.hours <= 240.0:
-        raise UsageError(f"--hours: expected 0.5 to 240, found {arguments.hours:g}")
     if arguments.model is not None and not arguments.model.is_file():
         raise UsageError(f"--model: expected a file, found none at {arguments.model}")
     if arguments.model is None and importlib.util.find_spec("torch") is not None:

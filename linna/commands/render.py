@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from linna.output import emit, finish, log, progress
-from linna.parser import option
+from linna.parser import number, option
 
 RENDERERS = ("fast", "raymarch", "cycles")
 LAWS = ("lunar-lambert", "lambert", "hapke", "matt")
 TERRAINS = ("auto", "raster", "procedural")
-SHEET_VIEWS = 6
 SHEET_COLUMNS = 3
 
 
@@ -27,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out F.png", Path, "RGB picture to write", required=True)
     option(parser, "--renderer", RENDERERS, "", "fast")
     option(parser, "--sheet", bool, "a contact sheet of several frames")
-    option(parser, "--views N", int, f"frames of a sheet (default: {SHEET_VIEWS})", default=SHEET_VIEWS)
+    option(parser, "--views N", number(int, least=1, most=60), "frames of a sheet", 6)
     option(parser, "--draw-labels", bool, "draw the labels: cyan, lime, yellow by class (paper, Fig. 5)")
     option(parser, "--terrain", TERRAINS, "instead of the scenario's")
     option(parser, "--photometry", LAWS, "instead of the scenario's; matt is the paper's Principled BSDF")
@@ -41,8 +40,6 @@ def run_render(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--out: expected a .png file, found {arguments.out.name}")
     if not arguments.out.parent.is_dir():
         raise UsageError(f"--out: expected an existing folder, found {arguments.out.parent}")
-    if not 1 <= arguments.views <= 60:
-        raise UsageError(f"--views: expected 1 to 60 frames, found {arguments.views}")
     if arguments.sheet:
         return _run_sheet(arguments)
     if len(arguments.epoch) != 1:

@@ -36,6 +36,7 @@ from payload_emulator.session.scenario import (
 )
 from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL
 from payload_emulator.session.station_ports import RECORD_HEADER
+from payload_emulator.session.typed_toml import toml_text
 from payload_emulator.session.world import World, build_world, open_world
 from payload_emulator.sim.board.contact_plan import parse_outage
 from payload_emulator.sim.board.link import STATIONS, LinkSection
@@ -441,15 +442,10 @@ def _requirements(scenario: Scenario) -> dict[str, Value]:
 
 
 def _toml(value: Value) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if isinstance(value, str) and "\n" in value and "'''" not in value:
         return f"'''\n{value}'''"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-        return f'"{escaped}"'
-    if isinstance(value, int | float):
-        return repr(value)
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
-    return "[" + ", ".join(_toml(item) for item in value or ()) + "]"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return toml_text(value)

@@ -31,7 +31,7 @@ from payload_emulator.errors import RecordError
 
 VERSION = 5
 _HEADER = re.compile(rb"LINNA spacecraft state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
-_EXPECTED = "the state of a spacecraft process (linna emulate --continuous --state)"
+_EXPECTED = "the state of a spacecraft process (linna emulate --live --state)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")
 _PLAIN = (type(None), bool, int, float, str)
 _SEQUENCES: dict[str, type] = {

@@ -128,8 +128,8 @@ def test_a_labelled_set_of_anyone_is_evaluated(tmp_path, write_image, capsys):
     [
         (["--report", "r.html"], "--report: expected together with --dataset"),
         (["--paper-classes"], "--paper-classes: expected together with --dataset"),
-        (["--pixel-m", "0"], "--pixel-m: expected a number above zero, found 0"),
-        (["--fov-deg", "0"], "--fov-deg: expected an angle between 0 and 180"),
+        (["--pixel-m", "0"], "--pixel-m: expected a number above 0, found '0'"),
+        (["--fov-deg", "0"], "--fov-deg: expected a number above 0 and below 180"),
         (["--range-px", "9", "8"], "--range-px: expected two diameters in rising order, found 9 8"),
         ([], "expected a COCO file"),
     ],
@@ -148,8 +148,8 @@ def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--altitude-km", "-3"], "--altitude-km: expected a positive number of kilometres, found -3"),
-        (["--fov-deg", "180"], "--fov-deg: expected an angle between 0 and 180, found 180"),
+        (["--altitude-km", "-3"], "--altitude-km: expected a number above 0, found '-3'"),
+        (["--fov-deg", "180"], "--fov-deg: expected a number above 0 and below 180, found '180'"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused(write_image, capsys, extra, words):

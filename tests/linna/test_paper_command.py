@@ -105,5 +105,7 @@ def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path: Path) 
 
 def test_hours_out_of_range_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["paper", "--out", str(tmp_path / "p"), "--hours", "0"]) == 2
-    assert capsys.readouterr().err == "linna: error: --hours: expected 0.5 to 240, found 0\n"
+    assert capsys.readouterr().err == (
+        "linna paper: error: argument --hours: expected a number from 0.5 and up to 240, found '0'\n"
+    )
     assert not (tmp_path / "p").exists()

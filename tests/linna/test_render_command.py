@@ -110,7 +110,10 @@ def test_cycles_without_blender_is_one_line(scenario, tmp_path, capsys, monkeypa
         (("--out", "x.png"), "expected one for one frame, found 0"),
         (("--epoch", "yesterday", "--out", "x.png"), "yesterday"),
         (("--epoch", "2029-08-06T00:00:00Z", "--out", "x.png"), "at or after the scenario's 2029-08-07"),
-        (("--epoch", EPOCHS[0], "--out", "x.png", "--views", "0"), "expected 1 to 60 frames, found 0"),
+        (
+            ("--epoch", EPOCHS[0], "--out", "x.png", "--views", "0"),
+            "--views: expected a number from 1 and up to 60, found '0'",
+        ),
         (("--epoch", EPOCHS[0], "--out", "x.png", "--terrain", "raster"), "height rasters"),
     ],
 )

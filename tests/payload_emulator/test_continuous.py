@@ -410,8 +410,8 @@ def test_the_mission_description_names_stations_and_links() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--live", "--rate", "-1"], "expected numbers above 0"),
-        (["--live", "--days", "-1"], "expected numbers above 0"),
+        (["--live", "--rate", "-1"], "--rate: expected a number from 0, found '-1'"),
+        (["--live", "--days", "-1"], "--days: expected a number above 0, found '-1'"),
     ],
 )
 def test_impossible_options_are_refused_in_one_line(

@@ -1,4 +1,4 @@
-"""The payload as a process: commanded and watched over TCP; and the campaign that breaks it."""
+"""The payload as a process: commanded and watched over TCP; and a fault."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +21,20 @@ from lunar.camera import project_mcmf
 from lunar.datafolder import DataFolder, find_data
 from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
-from payload_emulator.errors import LinkError, ScenarioError
+from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.camera import Exposure, expose
-from payload_emulator.session.campaign import Case, fly_case, load_campaign, table
 from payload_emulator.session.live import LiveSession
 from payload_emulator.session.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
 from payload_emulator.session.loading import LoadedPayload
-from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.schedule import Operator
+from payload_emulator.session.scenario import FaultsSection, parse_scenario
+from payload_emulator.session.schedule import Operator, fly_scenario
 from payload_emulator.session.spacecraft import Moment, Turn, new_spacecraft
 from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.station_ports import RECORD_HEADER, TelecommandBuffer
 from payload_emulator.session.viewing import turn_message
 from payload_emulator.session.world import World, build_world
+from payload_emulator.sim.board.faults import FAULT_KINDS
 from payload_emulator.sim.board.link import Receiver
 from tests.scenarios import live_scenario
 from tmtc.dictionary import DICTIONARY
@@ -395,57 +396,24 @@ def test_a_flood_of_octets_is_not_kept() -> None:
     assert buffer.dropped > 1 << 20
 
 
-# Campaigns
-
-
-def test_faults_are_flown_judged_and_counted(flown: tuple[World, LoadedPayload]) -> None:
+def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown: tuple[World, LoadedPayload]) -> None:
     world, loaded = flown
-    cases = [
-        Case("none"),
-        Case("hang", ("processor_hang at 60",), ("watchdog_reset",)),
-        Case("never told", ("camera_dark at 60 for 30",), ("watchdog_reset",)),
-    ]
-    results = [fly_case(world, loaded, case, seed) for case in cases for seed in (1, 2)]
-    rows = table(results)
-    assert [(row["detected"], row["recovered"], row["lost"]) for row in rows] == [
-        (2, 2, 0),
-        (2, 2, 0),
-        (0, 2, 0),
-    ]
-    assert results[2].resets == 1 and 0.0 < results[2].latency_s <= 60.0
-    assert rows[0]["frames_processed"] == rows[0]["frames_expected"] == 32
-    # The same seed gives the same flight.
-    assert fly_case(world, loaded, cases[1], 1) == results[2]
+    scenario = replace(world.scenario, faults=FaultsSection(("processor_hang at 60",)))
+    flights = []
+    for _ in range(2):
+        spacecraft = new_spacecraft(replace(world, scenario=scenario), loaded)
+        packets = [packet for turn in fly_scenario(spacecraft.world, spacecraft) for packet in turn.packets]
+        flights.append(packets)
+        assert len(spacecraft.resets) == 1 and spacecraft.payload.mode is PayloadMode.standby
+    unpacked = list(map(DICTIONARY.unpack, flights[0]))
+    labels = DICTIONARY.labels("event_info", "event_id")
+    events = [labels[values["event_id"]] for name, values in unpacked if name.startswith("event_")]
+    frames = [values["frame_number"] for name, values in unpacked if name == "detections"]
+    # 16 images are due, of which two pass while the processor hangs and starts again.
+    assert "watchdog_reset" in events and frames == list(range(14))
+    assert flights[1] == flights[0]  # the same seed gives the same flight
 
 
-def test_the_shipped_campaign_names_every_kind_of_fault() -> None:
-    from payload_emulator.sim.board.faults import FAULT_KINDS
-
-    campaign = load_campaign("faults")
+def test_every_kind_of_fault_is_documented() -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "payload.md").read_text()
     assert all(f"`{kind}`" in page for kind in FAULT_KINDS)
-    assert {text.split()[0] for case in campaign.case for text in case.faults} == set(FAULT_KINDS)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name = 'c'\n[[case]]\nfaults = ['meteor at 3']", "expected one of camera_dark"),
-        ("[[case]]\nevents = ['boom']", "case 1: events must be names of the dictionary, found 'boom'"),
-        (
-            "[[case]]\nfault = []",
-            r"case\[0\].fault: expected one of name, faults, events, safe, found an unknown key",
-        ),
-        ("seeds = []\n[[case]]\n", "expected seeds from 0"),
-        ("seeds = [1]", "one .* or more, found none"),
-        ("seeds = ['a']\n[[case]]\n", "expected a whole number, found 'a'"),
-        ("[[", "not TOML"),
-    ],
-)
-def test_a_campaign_file_that_says_something_else_is_refused(tmp_path: Path, text: str, message: str) -> None:
-    file = tmp_path / "campaign.toml"
-    file.write_text(text)
-    with pytest.raises(ScenarioError, match=message):
-        load_campaign(file)
-    with pytest.raises(ScenarioError, match="no such campaign file; shipped campaigns: faults"):
-        load_campaign(tmp_path / "none.toml")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import sqlalchemy as sa
 from alembic import op
 
 from ground_service.store.snapshot import create_schema
@@ -21,9 +20,3 @@ depends_on = None
 def upgrade() -> None:
     create_schema(op.get_bind(), Path(__file__).parents[1] / "schema_1.0.json")
     op.execute(f"INSERT INTO audit_head (id, number, sha256) VALUES (1, 0, '{'0' * 64}')")
-
-
-def downgrade() -> None:
-    stored = sa.MetaData()
-    stored.reflect(op.get_bind(), only=lambda name, _: name != "alembic_version")
-    stored.drop_all(op.get_bind())

@@ -26,7 +26,3 @@ def upgrade() -> None:
             op.execute(f'DROP FUNCTION "{function}" CASCADE')
     for table in REMOVED_TABLES:
         op.drop_table(table)
-
-
-def downgrade() -> None:
-    """Leave the removal of all tables to revision 1.0: no other downgrade is possible."""

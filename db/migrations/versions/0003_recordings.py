@@ -128,7 +128,3 @@ def _list_waiting() -> None:
                 row["file_sha256"],
                 octets,
             )
-
-
-def downgrade() -> None:
-    """Leave the removal of all tables to revision 1.0: no other downgrade is possible."""

@@ -17,7 +17,3 @@ depends_on = None
 def upgrade() -> None:
     for table in ("users", "tokens"):
         op.add_column(table, sa.Column("missions", sa.JSON(), nullable=True))
-
-
-def downgrade() -> None:
-    """Leave the removal of all tables to revision 1.0: no other downgrade is possible."""

@@ -29,7 +29,3 @@ def upgrade() -> None:
         ),
         sa.PrimaryKeyConstraint("vehicle_id", name=op.f("pk_handovers")),
     )
-
-
-def downgrade() -> None:
-    """Leave the removal of all tables to revision 1.0: no other downgrade is possible."""

@@ -41,100 +41,38 @@ occasionally without an image. It returns telemetry packets. The last argument i
 | returned | TM/TC | telemetry packets, at most `downlink_octets` in total |
 """
 
-# Fault, events, reaction.
-_FAULTS = (
-    (
-        "dark, saturated or uniform images",
-        "image_dark, image_saturated, image_uniform",
-        "the frame is not used; a lasting streak is reported at its beginning and end (image_streak)",
-    ),
-    (
-        "no image",
-        "camera_fault, camera_recovered",
-        "the camera is switched off and on; after `camera_cycles` the observation ends",
-    ),
-    (
-        "no attitude",
-        "attitude_missing",
-        "only the odometry estimators process the frame",
-    ),
-    (
-        "detector too slow",
-        "detector_timeout",
-        "its detections are not used; `detector_failures` in a row: safe",
-    ),
-    (
-        "detector raises an exception",
-        "detector_error",
-        "the frame is not used; `detector_failures` in a row: safe",
-    ),
-    (
-        "estimate cannot be inverted",
-        "estimator_error",
-        "the estimator restarts from its tables",
-    ),
-    (
-        "filter diverges",
-        "filter_divergence, filter_reset",
-        "the search for craters is widened until it is found again",
-    ),
-    (
-        "attitude noisier than declared",
-        "attitude_degraded, attitude_restored",
-        "the estimated noise is used in place of the declared one until it is restored",
-    ),
-    (
-        "processor hangs",
-        "watchdog_reset",
-        "reset by the watchdog; the observation is resumed; `watchdog_limit` within an hour: safe",
-    ),
-    (
-        "bits of model, parameters or tables change",
-        "model_hash_mismatch, parameters_hash_mismatch, catalogue_hash_mismatch, "
-        "anchor_table_hash_mismatch, table_hash_mismatch",
-        "restored from the backup copy (memory_repaired); if it is also damaged: memory_unrepairable, safe",
-    ),
-    (
-        "bits of the packet store change",
-        "storage_corrupt",
-        "the packet is dropped",
-    ),
-    (
-        "packet store full",
-        "store_overwritten, storage_full",
-        "the oldest of its class is overwritten, or the newest is rejected (`store_overwrite`)",
-    ),
-    (
-        "reset",
-        "boot, state_recovered",
-        "settings, schedule, sequence counts and unsent packets are retained; a requested reset ends in standby",
-    ),
-    (
-        "settings lost",
-        "state_lost",
-        "defaults; safe",
-    ),
-    (
-        "clock jumps",
-        "clock_jump",
-        "housekeeping restarts; skipped activities expire (activity_expired)",
-    ),
-    (
-        "bus voltage low",
-        "power_low",
-        "below `voltage_safe_v`: safe",
-    ),
-    (
-        "board too hot or too cold",
-        "temperature_high, temperature_low",
-        "above `temperature_safe_c`: safe",
-    ),
-    (
-        "much memory in use",
-        "memory_high",
-        "none",
-    ),
-)
+_FAULTS = """\
+## Faults and reactions
+
+| fault | event | reaction |
+|---|---|---|
+| dark, saturated or uniform images | image_dark, image_saturated, image_uniform | the frame is not used; a \
+lasting streak is reported at its beginning and end (image_streak) |
+| no image | camera_fault, camera_recovered | the camera is switched off and on; after `camera_cycles` the \
+observation ends |
+| no attitude | attitude_missing | only the odometry estimators process the frame |
+| detector too slow | detector_timeout | its detections are not used; `detector_failures` in a row: safe |
+| detector raises an exception | detector_error | the frame is not used; `detector_failures` in a row: safe |
+| estimate cannot be inverted | estimator_error | the estimator restarts from its tables |
+| filter diverges | filter_divergence, filter_reset | the search for craters is widened until it is found again |
+| attitude noisier than declared | attitude_degraded, attitude_restored | the estimated noise is used in place of \
+the declared one until it is restored |
+| processor hangs | watchdog_reset | reset by the watchdog; the observation is resumed; `watchdog_limit` within an \
+hour: safe |
+| bits of model, parameters or tables change | model_hash_mismatch, parameters_hash_mismatch, \
+catalogue_hash_mismatch, anchor_table_hash_mismatch, table_hash_mismatch | restored from the backup copy \
+(memory_repaired); if it is also damaged: memory_unrepairable, safe |
+| bits of the packet store change | storage_corrupt | the packet is dropped |
+| packet store full | store_overwritten, storage_full | the oldest of its class is overwritten, or the newest is \
+rejected (`store_overwrite`) |
+| reset | boot, state_recovered | settings, schedule, sequence counts and unsent packets are retained; a requested \
+reset ends in standby |
+| settings lost | state_lost | defaults; safe |
+| clock jumps | clock_jump | housekeeping restarts; skipped activities expire (activity_expired) |
+| bus voltage low | power_low | below `voltage_safe_v`: safe |
+| board too hot or too cold | temperature_high, temperature_low | above `temperature_safe_c`: safe |
+| much memory in use | memory_high | none |
+"""
 
 _PRODUCTS = """\
 ## Large data products
@@ -148,7 +86,7 @@ that used it (u16).
 def format_interfaces() -> str:
     """Return the payload part of the document in Markdown."""
     return "\n".join(
-        [_STEP, *_instruments(), *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, *_faults()]
+        [_STEP, *_instruments(), *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, _FAULTS]
     )
 
 
@@ -227,8 +165,3 @@ def _store() -> list[str]:
         "| class | share of the memory |\n|---|---|",
     ]
     return [*lines, *(f"| {kind.name} | {SHARES[kind]:.0%} |" for kind in StoreClass), ""]
-
-
-def _faults() -> list[str]:
-    lines = ["## Faults and reactions\n", "| fault | event | reaction |\n|---|---|---|"]
-    return [*lines, *(f"| {' | '.join(row)} |" for row in _FAULTS), ""]

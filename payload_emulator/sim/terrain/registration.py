@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -141,18 +141,11 @@ def registered(catalogue: CraterCatalogue, registration: Registration | None) ->
     if registration is None or not len(catalogue):
         return catalogue
     shift, _ = registration.at(catalogue.latitude_rad, catalogue.longitude_rad)
-    return CraterCatalogue(
-        catalogue.ids,
-        catalogue.latitude_rad + shift[:, 1] / MOON_RADIUS_M,
-        np.mod(
-            catalogue.longitude_rad + shift[:, 0] / (MOON_RADIUS_M * np.cos(catalogue.latitude_rad)),
-            2.0 * math.pi,
-        ),
-        catalogue.diameter_m,
-        catalogue.rim_height_m,
-        catalogue.depth_m,
-        catalogue.source,
-        catalogue.complete,
+    east_rad = shift[:, 0] / (MOON_RADIUS_M * np.cos(catalogue.latitude_rad))
+    return replace(
+        catalogue,
+        latitude_rad=catalogue.latitude_rad + shift[:, 1] / MOON_RADIUS_M,
+        longitude_rad=np.mod(catalogue.longitude_rad + east_rad, 2.0 * math.pi),
     )
 
 

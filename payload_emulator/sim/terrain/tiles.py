@@ -11,7 +11,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -314,16 +314,7 @@ class TiledTerrain(ABC):
         """
         self._measure(indices[~self._measured[indices]])
         chosen = self.catalogue.select(indices)
-        return CraterCatalogue(
-            ids=chosen.ids,
-            latitude_rad=chosen.latitude_rad,
-            longitude_rad=chosen.longitude_rad,
-            diameter_m=chosen.diameter_m,
-            rim_height_m=self._rim_m[indices],
-            depth_m=self._depth_m[indices],
-            source=chosen.source,
-            complete=chosen.complete,
-        )
+        return replace(chosen, rim_height_m=self._rim_m[indices], depth_m=self._depth_m[indices])
 
     def rim_tilts_m(self, indices: IntArray) -> FloatArray:
         """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""

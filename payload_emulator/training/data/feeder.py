@@ -175,7 +175,6 @@ class TrainParameters:
     average_decay: float = 0.998
     validate_every_minutes: float = 4.0
     validation_frames: int = 120
-    patience: int = 0
     seed: int = 1
     replicas: int = 0
     paper_classes: bool = True

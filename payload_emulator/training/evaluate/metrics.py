@@ -91,9 +91,7 @@ def score(
         },
         "balanced": _at(pair, thresholds.balanced),
         "navigation": _at(pair, thresholds.navigation),
-        "recall_by_degradation": _recall_by(
-            strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
-        ),
+        "recall_by_degradation": _recall_by(strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold),
         "degradation_state": _state(fair, threshold),
         "by_altitude_km": _by_frame(
             pair, threshold, np.array([s.altitude_km for s in scenes]), _ALTITUDE_EDGES_KM
@@ -146,13 +144,11 @@ def _at(pair: tuple[Tally, Tally], threshold: float) -> dict[str, Any]:
     }
 
 
-def _group(
-    pair: tuple[Tally, Tally],
-    threshold: float,
-    masks: Sequence[tuple[BoolArray, BoolArray]],
-) -> dict[str, Any]:
-    strict, fair = (part.select(*mask) for part, mask in zip(pair, masks, strict=True))
+def _group(pair: tuple[Tally, Tally], threshold: float, chosen: BoolArray) -> dict[str, Any]:
+    """Figures of chosen frames (f,)."""
+    strict, fair = (part.select(*_of_frames(part, chosen)) for part in pair)
     return {
+        "frames": int(chosen.sum()),
         "strict": strict.figures(threshold).to_dict(),
         "ignore_aware": fair.figures(threshold).to_dict(),
     }
@@ -166,37 +162,22 @@ def _of_frames(part: Tally, chosen: BoolArray) -> tuple[BoolArray, BoolArray]:
 def _by_frame(
     pair: tuple[Tally, Tally], threshold: float, values: FloatArray, edges: Sequence[float]
 ) -> list[dict[str, Any]]:
-    rows = []
-    for low, high in itertools.pairwise(edges):
-        chosen = (values >= low) & (values < high)
-        if chosen.any():
-            rows.append(
-                {
-                    "low": low,
-                    "high": high,
-                    "frames": int(chosen.sum()),
-                    **_group(pair, threshold, [_of_frames(part, chosen) for part in pair]),
-                }
-            )
-    return rows
+    return [
+        {"low": low, "high": high, **_group(pair, threshold, chosen)}
+        for low, high in itertools.pairwise(edges)
+        if (chosen := (values >= low) & (values < high)).any()
+    ]
 
 
 def _by_name(pair: tuple[Tally, Tally], threshold: float, names: Sequence[str]) -> list[dict[str, Any]]:
-    rows = []
-    for name in sorted(set(names)):
-        chosen = np.array([other == name for other in names])
-        rows.append(
-            {
-                "name": name,
-                "frames": int(chosen.sum()),
-                **_group(pair, threshold, [_of_frames(part, chosen) for part in pair]),
-            }
-        )
-    return rows
+    return [
+        {"name": name, **_group(pair, threshold, np.array([other == name for other in names]))}
+        for name in sorted(set(names))
+    ]
 
 
 def _recall_by(
-    tallied: Tally, values: FloatArray, edges: Sequence[float], threshold: float, name: str
+    tallied: Tally, values: FloatArray, edges: Sequence[float], threshold: float
 ) -> list[dict[str, Any]]:
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
@@ -206,7 +187,7 @@ def _recall_by(
         count = int(chosen.sum())
         rows.append(
             {
-                "by": name,
+                "by": "depth_ratio",
                 "low": low,
                 "high": high,
                 "expected": count,
@@ -241,16 +222,9 @@ def _calibration(tallied: Tally, threshold: float, chosen: BoolArray | None = No
         hit &= chosen
     sigma = tallied.sigma_px[hit]
     scaled = np.concatenate([tallied.error_u[hit] / sigma, tallied.error_v[hit] / sigma])
-    nan = float("nan")
     if scaled.size == 0:
-        return {
-            "pairs": 0,
-            "mean_sigma_px": nan,
-            "rms": nan,
-            "median_ratio": nan,
-            "inside_one_sigma": nan,
-            "inside_three_sigma": nan,
-        }
+        names = ("mean_sigma_px", "rms", "median_ratio", "inside_one_sigma", "inside_three_sigma")
+        return {"pairs": 0} | dict.fromkeys(names, float("nan"))
     return {
         "pairs": int(hit.sum()),
         "mean_sigma_px": float(sigma.mean()),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -31,6 +32,10 @@ from reports.values import (
     TrainingCurve,
 )
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Value = TypeVar("Value", bound="DataclassInstance")
 _CLASS_LABELS = ("5–10 km", "10–15 km", "15–30 km")
 _WORST_FRAMES = 24
 _GALLERY_FRAMES = 9
@@ -106,9 +111,7 @@ def _score(scored: Scored, figures: dict[str, Any], strict: Tally) -> DetectorSc
     curves = [
         PrecisionRecallCurve(
             label,
-            np.array([point["threshold"] for point in curve]),
-            np.array([point["precision"] for point in curve]),
-            np.array([point["recall"] for point in curve]),
+            *(np.array([point[name] for point in curve]) for name in ("threshold", "precision", "recall")),
         )
         for label, curve in zip(
             (*_CLASS_LABELS, "5–30 km"),
@@ -126,10 +129,7 @@ def _score(scored: Scored, figures: dict[str, Any], strict: Tally) -> DetectorSc
         by_altitude_km=_bins(figures["by_altitude_km"]),
         by_sun_elevation_deg=_bins(figures["by_sun_elevation_deg"]),
         curves=tuple(curves),
-        calibration=tuple(
-            CalibrationBin(row["mean_score"], row["fraction_true"], row["count"])
-            for row in figures["score_calibration"]
-        ),
+        calibration=tuple(_filled(CalibrationBin, row) for row in figures["score_calibration"]),
         residuals=ResidualSeries(
             strict.detection_u[right],
             strict.detection_v[right],
@@ -140,52 +140,37 @@ def _score(scored: Scored, figures: dict[str, Any], strict: Tally) -> DetectorSc
     )
 
 
+def _filled(kind: type[Value], row: Mapping[str, Any], **stated: Any) -> Value:
+    """Return a value of the report with the figures of a row that it names, and the stated ones."""
+    named = {one.name for one in fields(kind)}
+    return kind(**{name: value for name, value in row.items() if name in named} | stated)
+
+
 def _class_score(k: int, label: str, row: dict[str, Any]) -> ClassScore:
-    return ClassScore(
-        k,
-        label,
-        row["expected"],
-        row["detected_true"],
-        row["false_alarms"],
-        row["precision"],
-        row["recall"],
-        row["loc_px"],
-    )
+    return _filled(ClassScore, row, size_class=k, label=label, localisation_px=row["loc_px"])
 
 
 def _bins(rows: Sequence[dict[str, Any]]) -> tuple[BinScore, ...]:
     return tuple(
-        BinScore(
-            row["low"],
-            row["high"],
-            row["strict"]["expected"],
-            row["strict"]["precision"],
-            row["strict"]["recall"],
-            row["strict"]["loc_px"],
-        )
-        for row in rows
+        _filled(BinScore, row | row["strict"], localisation_px=row["strict"]["loc_px"]) for row in rows
     )
 
 
 def _named(rows: Sequence[dict[str, Any]], label: Any) -> tuple[NamedScore, ...]:
     return tuple(
-        NamedScore(
-            label(row),
-            row["strict"]["expected"],
-            row["strict"]["precision"],
-            row["strict"]["recall"],
-            row["strict"]["loc_px"],
-            row["ignore_aware"]["precision"],
-            row["ignore_aware"]["recall"],
+        _filled(
+            NamedScore,
+            row["strict"],
+            label=label(row),
+            localisation_px=row["strict"]["loc_px"],
+            fair_precision=row["ignore_aware"]["precision"],
+            fair_recall=row["ignore_aware"]["recall"],
         )
         for row in rows
     )
 
 
 def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
-    def span(row: dict[str, Any]) -> str:
-        return f"{row['low']:g}–{row['high']:g}"
-
     rule = "Strict scores drawn; the table also gives the ignore-aware scores."
     on_board = {
         "threshold": figures["threshold"],
@@ -209,20 +194,22 @@ def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
             _named(figures["by_terrain"], lambda row: f"{row['name']} ({row['frames']} frames)"),
             f"Lowland: mean ground of the frame below −1 km, mostly mare. {rule}",
         ),
-        ScoreGroup(
-            "By altitude",
-            _named(figures["by_altitude_km"], lambda row: f"{span(row)} km"),
-            f"Altitude. {rule}",
-        ),
-        ScoreGroup(
-            "By Sun elevation",
-            _named(figures["by_sun_elevation_deg"], lambda row: f"{span(row)}°"),
-            f"Elevation of the Sun. {rule}",
-        ),
-        ScoreGroup(
-            "By Sun azimuth",
-            _named(figures["by_sun_octant"], lambda row: f"{span(row)}°"),
-            f"Azimuth of the Sun in the image, clockwise from its top. {rule}",
+        *(
+            ScoreGroup(
+                f"By {name}",
+                _named(figures[key], lambda row, unit=unit: f"{row['low']:g}–{row['high']:g}{unit}"),
+                f"{meaning}. {rule}",
+            )
+            for name, key, unit, meaning in (
+                ("altitude", "by_altitude_km", " km", "Altitude"),
+                ("Sun elevation", "by_sun_elevation_deg", "°", "Elevation of the Sun"),
+                (
+                    "Sun azimuth",
+                    "by_sun_octant",
+                    "°",
+                    "Azimuth of the Sun in the image, clockwise from its top",
+                ),
+            )
         ),
     )
 
@@ -234,41 +221,28 @@ def _bias(figures: dict[str, Any]) -> tuple[BiasBin, ...]:
         for row in figures["bias_px_by_sun_octant"]
         for low, high in (row["sun_azimuth_image_deg"],)
     ]
+    keys = {
+        "right_px": "du_px",
+        "down_px": "dv_px",
+        "sunward_px": "toward_sun_px",
+        "across_px": "across_sun_px",
+    }
     return tuple(
-        BiasBin(
-            label,
-            row["pairs"],
-            _mean_with_interval(row, "du_px"),
-            _mean_with_interval(row, "dv_px"),
-            _mean_with_interval(row, "toward_sun_px"),
-            _mean_with_interval(row, "across_sun_px"),
-            median_length_px=row["median_length_px"],
+        _filled(
+            BiasBin,
+            row,
+            label=label,
+            **{name: (row[key], *row["interval_95"][key]) for name, key in keys.items()},
         )
         for label, row in rows
         if row["pairs"]
     )
-
-
-def _mean_with_interval(row: dict[str, Any], key: str) -> tuple[float, float, float]:
-    low, high = row["interval_95"][key]
-    return row[key], low, high
 
 
 def _sigma(calibration: dict[str, Any]) -> tuple[SigmaBin, ...]:
     rows = [("all", calibration)]
     rows += [(f"{row['low']:g}–{row['high']:g} km up", row) for row in calibration["by_altitude_km"]]
-    return tuple(
-        SigmaBin(
-            label,
-            row["pairs"],
-            row["mean_sigma_px"],
-            row["rms"],
-            row["inside_one_sigma"],
-            row["inside_three_sigma"],
-        )
-        for label, row in rows
-        if row["pairs"]
-    )
+    return tuple(_filled(SigmaBin, row, label=label) for label, row in rows if row["pairs"])
 
 
 def _curves(run: Path) -> tuple[TrainingCurve, ...]:

@@ -54,7 +54,6 @@ def export(
     out: Path,
     datasets: Sequence[Dataset],
     revision: str = "",
-    notes: dict[str, str] | None = None,
     *,
     paper_classes: bool = False,
     classes_only: bool = False,
@@ -92,10 +91,7 @@ def export(
     heats = network.heat_channels if paper_classes else 1
     exported = ExportedCraterNet(network, calibration.geometry_shift, heats, classes_only=classes_only).eval()
     model = keep_blocked(onnx_model(exported))
-    metadata = _metadata(stored, calibration, checkpoint, datasets) | {
-        "git_revision": revision,
-        **(notes or {}),
-    }
+    metadata = _metadata(stored, calibration, checkpoint, datasets) | {"git_revision": revision}
     if classes_only:
         metadata["class_median_diameter_m"] = json.dumps(class_medians_m(datasets))
     octets = _with_metadata(model, metadata)

@@ -19,7 +19,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -164,7 +164,7 @@ def _optimise(
     *,
     report: Callable[[str], None],
 ) -> None:
-    """Take steps until the budget is spent or validations bring no gain; validate and save at intervals."""
+    """Take steps until the budget is spent; validate and save at intervals."""
     parameters = team.parameters
     shown = _Shown()
     began = time.monotonic() - state.seconds
@@ -191,14 +191,9 @@ def _optimise(
                 f"R {figures['recall']:.3f} loc {figures['loc_px']:.2f} px, threshold {figures['threshold']:.2f})"
             )
             if figures["f1"] >= state.best_f1:
-                state.best_f1, state.best_step, state.stale = figures["f1"], state.step, 0
+                state.best_f1, state.best_step = figures["f1"], state.step
                 files.write(files.run / "best.pt", state, figures, {})
-            else:
-                state.stale += 1
             files.save(state, figures)
-            if parameters.patience and state.stale >= parameters.patience:
-                report(f"stopped early: {state.stale} validations without gain")
-                break
         elif now - last_saved > 60.0:
             files.save(state, {})
             last_saved = now
@@ -226,7 +221,7 @@ class _RunFiles:
         with reading(self.checkpoint):
             for name in ("network", "average", "optimiser"):
                 getattr(self, name).load_state_dict(stored[name])
-            return _Progress(**stored["progress"])
+            return _Progress(*(stored["progress"][one.name] for one in fields(_Progress)))
 
     def save(self, state: _Progress, figures: dict[str, float]) -> None:
         """Write the checkpoint, from which a run can be resumed."""
@@ -253,7 +248,6 @@ class _Progress:
     seconds: float = 0.0
     best_f1: float = -1.0
     best_step: int = 0
-    stale: int = 0
 
 
 class _Shown:

@@ -49,7 +49,7 @@ def upgraded(begun: tuple[int, bytes], tmp_path: Path, caplog: pytest.LogCapture
     home = tmp_path / "home"
     home.mkdir()
     database = open_database(f"sqlite:///{home / 'linna.db'}")
-    stores._migrate(database, "upgrade", "1.1")
+    stores.upgrade_database(database, "1.1")
     with database.engine.begin() as connection:
         connection.execute(text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (1, 76, 'flight')"))
         for number, stream in ((1, ""), (2, "s")):

@@ -23,11 +23,9 @@ from ground_service.errors import (
     storage_error,
 )
 from ground_service.store.database import (
-    empty_database,
     open_database,
     prepare_database,
     schema_revisions,
-    upgrade_database,
 )
 from ground_service.store.files import FileArchive
 from ground_service.store.models import METADATA
@@ -62,17 +60,6 @@ def test_a_migrated_database_has_the_schema_of_the_models(
     assert described_schema(migrated) == described_schema(made)
     for database in (migrated, made):
         database.engine.dispose()
-
-
-def test_a_database_that_is_emptied_can_be_filled_again(tmp_path: Path) -> None:
-    database = prepare_database(url(tmp_path))
-    before = described_schema(database)
-    empty_database(database)
-    assert described_schema(database) == {}
-    assert schema_revisions(database)[0] is None
-    upgrade_database(database)
-    assert described_schema(database) == before
-    database.engine.dispose()
 
 
 def test_samples_are_clustered_by_time(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_every_shipped_expansion_follows_the_rule(tmp_path: Path) -> None:
     database = open_database(f"sqlite:///{tmp_path / 'one.db'}")
     states = {}
     for revision in oldest_first:
-        stores._migrate(database, "upgrade", revision)
+        stores.upgrade_database(database, revision)
         states[revision] = reflected(database)
         assert len(revision) <= 32  # width of the column of alembic_version
         found = breaking_changes(states[oldest_program(revision)], states[revision])
@@ -133,7 +133,7 @@ def test_a_program_works_with_an_expanded_schema_and_with_no_other_newer_one(
 
 def of_version_1(database: Database) -> None:
     """Make a database as version 1.0 left it: its schema, a user, and the triggers of row digests."""
-    stores._migrate(database, "upgrade", "1.0")
+    stores.upgrade_database(database, "1.0")
     statements = [
         "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)",
         "INSERT INTO row_digests VALUES ('users', '1', 'x')",

@@ -18,7 +18,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store.audit import read_head
-from ground_service.store.database import _migrate, open_database
+from ground_service.store.database import open_database, upgrade_database
 from ground_service.store.models import METADATA
 from ground_service.store.rows import table_digests
 from ground_service.worker.backup import backup, restore
@@ -156,7 +156,7 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
     saved = tmp_path / "saved"
     saved.mkdir()
     database = open_database(f"sqlite:///{saved / 'linna.db'}")
-    _migrate(database, "upgrade", "1.0")
+    upgrade_database(database, "1.0")
     with database.writing() as connection:
         connection.execute(
             text(

@@ -28,10 +28,8 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.database import (
-    empty_database,
     open_database,
     prepare_database,
-    schema_revisions,
 )
 from ground_service.store.models import METADATA
 from ground_service.store.vehicles import vehicle_id
@@ -81,13 +79,6 @@ def test_a_migrated_database_has_the_schema_of_the_models(
     migrated = described_schema(ground_on_postgres.database)
     assert migrated == described_schema(made)
     made.engine.dispose()
-    database = prepare_database(new_postgres_database(), upgrade=True)
-    empty_database(database)
-    assert described_schema(database) == {}
-    assert schema_revisions(database)[0] is None
-    prepare_database(database.engine.url.render_as_string(), upgrade=True).engine.dispose()
-    assert described_schema(database) == migrated
-    database.engine.dispose()
 
 
 def test_the_archive_is_the_same_as_on_sqlite(

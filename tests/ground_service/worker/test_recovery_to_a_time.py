@@ -18,7 +18,8 @@ from sqlalchemy import text
 from ground_service.access import service as users
 from ground_service.ground import Ground, open_ground
 from ground_service.store import audit
-from ground_service.store.database import empty_database, open_database, prepare_database
+from ground_service.store.database import open_database, prepare_database
+from ground_service.store.models import METADATA
 from tests.ground_service.conftest import free_port
 from tests.serving import wait_for
 
@@ -194,7 +195,7 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
         chosen = next_second(ground)
         users.add_user(ground, "after", "viewer")
         database = open_database(server.url)
-        empty_database(database)
+        METADATA.drop_all(database.engine)
         database.engine.dispose()
         archive_all(ground)
     server.stop()
