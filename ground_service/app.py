@@ -13,6 +13,7 @@ from typing import Any
 from anyio import to_thread
 from fastapi import FastAPI
 from starlette.routing import Route
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from ground_service.access.provider import provider_of
 from ground_service.contacts.links.supervisor import LinkSupervisor
@@ -22,7 +23,6 @@ from ground_service.http.common import API_PREFIX
 from ground_service.http.limits import BodyLimit, HeadersAndTags, LastRequests
 from ground_service.http.model import Problem
 from ground_service.http.origins import LOOPBACK, SameOrigin
-from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.missions.clocks import mission_clock
@@ -171,4 +171,4 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
     app.add_middleware(HeadersAndTags)
     app.add_middleware(LastRequests, state=app.state)
     app.add_middleware(Watch, metrics=app.state.metrics)
-    app.add_middleware(ForwardedHeaders, proxies=TrustedProxies(settings.trusted_proxies))
+    app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=[*settings.trusted_proxies])

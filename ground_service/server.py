@@ -76,8 +76,7 @@ def serve(settings: Settings) -> None:
         # Longer than clients and proxies keep idle connections, so that none is closed under a request of theirs.
         timeout_keep_alive=75,
         server_header=False,
-        # `proxies` handles these headers for configured proxies; uvicorn itself would accept them from any local
-        # process.
+        # The application accepts these headers from configured proxies; the server would from any local process.
         proxy_headers=False,
     )
     host, port = listener.getsockname()[:2]

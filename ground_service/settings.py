@@ -159,8 +159,8 @@ class Settings(BaseSettings):
     )
     trusted_proxies: Words = Field(
         default=(),
-        description="Comma-separated addresses or networks of reverse proxies whose X-Forwarded-For, "
-        "-Proto and -Host headers are accepted; headers of other peers are ignored",
+        description="Comma-separated addresses or networks of reverse proxies whose X-Forwarded-For and "
+        "-Proto headers are accepted; headers of other peers are ignored",
     )
     notify_networks: Words = Field(
         default=(),

@@ -29,7 +29,6 @@ from ground_service.errors import GroundError, NotAuthorised, NotFound
 from ground_service.events import TelemetryReceived, last_number, read_events
 from ground_service.ground import Ground
 from ground_service.http.problems import problem
-from ground_service.http.proxies import address_key
 from ground_service.http.times import time_text
 from ground_service.passes.live import newest_packets
 from ground_service.store.events import LoggedEvent
@@ -165,7 +164,7 @@ class Sockets:
             yield None
             return
         client = socket.client.host if socket.client is not None else ""
-        holder = f"user {caller.name}" if token is not None else f"address {address_key(client)}"
+        holder = f"user {caller.name}" if token is not None else f"address {client}"
         if self._holders[holder] >= self._per_user or len(self._sessions) >= self._total:
             limit = f"{self._per_user} of one user and {self._total} in all"
             refusal = problem(429, "too many sockets", f"WebSockets: expected at most {limit}")
