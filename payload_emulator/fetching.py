@@ -126,21 +126,16 @@ def survey(root: Path, products: Sequence[Product] = PRODUCTS) -> list[dict[str,
     }
     return [
         {
-            "name": product.name,
-            "title": product.title,
-            "basic": product.basic,
+            **{name: getattr(product, name) for name in ("name", "title", "basic", "octets")},
             "files": len(product.files),
             "files_present": sum(file.path in there for file in product.files),
             "files_of_its_own": sum(
                 product.claims(path) and all(path != file.path for file in product.files) for path in there
             ),
-            "octets": product.octets,
             "octets_known": sum(file.octets for file in product.files),
             "checksums": sorted({file.checksum_source for file in product.files if file.checksum_source}),
-            "licence": product.licence,
-            "citation": product.citation,
+            **{name: getattr(product, name) for name in ("licence", "citation", "note")},
             "address": product.files[0].url if product.files else "",
-            "note": product.note,
         }
         for product in products
     ]

@@ -24,7 +24,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -433,13 +433,7 @@ class LiveSession:
             "waiting": self._waiting if self.contact is not None else self.spacecraft.payload.waiting,
             "sent": {name: one.sent for name, one in self.stations.items()},
             "unacknowledged": sum(one.unacknowledged for one in self.stations.values()),
-            "frames": self.account.frames,
-            "images_lost": self.account.images_lost,
-            "packets": self.account.packets,
-            "telecommands": self.account.telecommands,
-            "packets_lost_on_link": self.account.packets_lost_on_link,
-            "telecommand_octets_lost": self.account.telecommand_octets_lost,
-            "resets": self.account.resets,
+            **asdict(self.account),
         }
 
     def _plan_ahead(self) -> None:

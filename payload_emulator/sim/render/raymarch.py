@@ -115,16 +115,8 @@ def cast(
 
 
 def _ground(patch: TerrainPatch) -> Ground:
-    return Ground(
-        patch.heights,
-        patch.albedo,
-        patch.table,
-        patch.first_row,
-        patch.first_column,
-        patch.pixels_per_radian,
-        patch.low_m,
-        patch.high_m,
-    )
+    where = (patch.first_row, patch.first_column, patch.pixels_per_radian)
+    return Ground(patch.heights, patch.albedo, patch.table, *where, patch.low_m, patch.high_m)
 
 
 def rays_window(
