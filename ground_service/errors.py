@@ -5,9 +5,10 @@ GroundError
 ├── StoreError
 │   ├── DatabaseUnavailable      the database cannot be opened or reached
 │   ├── DatabaseBusy             the database cancelled a transaction because of a concurrent one
-│   ├── DatabaseTooNew           written by a newer version of this program
-│   ├── DatabaseTooOld           written before version 1.0; its raw files can be ingested again
-│   ├── DatabaseNotMigrated      older than this program and not migrated automatically
+│   ├── OtherRevision            a schema revision that this program does not use
+│   │   ├── DatabaseTooNew           written by a newer version of this program
+│   │   ├── DatabaseTooOld           written before version 1.0; its raw files can be ingested again
+│   │   └── DatabaseNotMigrated      older than this program and not migrated automatically
 │   ├── StorageFull              no space left for the archive
 │   ├── StorageReadOnly          the archive cannot be written
 │   ├── ObjectsUnavailable       the object store cannot be reached
@@ -73,39 +74,36 @@ class DatabaseBusy(StoreError):
         super().__init__(f"database: nothing was changed, a retry may succeed: {reason}")
 
 
-class DatabaseTooNew(StoreError):
+class OtherRevision(StoreError):
+    """Base of what a database of another schema revision is refused with; `remedy` ends the message."""
+
+    remedy = ""
+
+    def __init__(self, url: str, expected: str, found: str) -> None:
+        super().__init__(f"database {url}: expected schema revision {expected}, found {found}{self.remedy}")
+        self.expected = expected
+        self.found = found
+
+
+class DatabaseTooNew(OtherRevision):
     """The database was written by a newer version of this program."""
 
-    def __init__(self, url: str, expected: str, found: str) -> None:
-        super().__init__(
-            f"database {url}: expected schema revision {expected} or older, found {found} of a newer version; "
-            "update linna or use another database"
-        )
-        self.expected = expected
-        self.found = found
+    remedy = " of a newer version; update linna or use another database"
 
 
-class DatabaseTooOld(StoreError):
+class DatabaseTooOld(OtherRevision):
     """The database was written before version 1.0; it cannot be migrated."""
 
-    def __init__(self, url: str, expected: str, found: str) -> None:
-        super().__init__(
-            f"database {url}: expected schema revision {expected}, found {found} of a version before 1.0; "
-            "ingest the raw files under LINNA_HOME/files into a new database with 'linna ingest'"
-        )
-        self.expected = expected
-        self.found = found
+    remedy = (
+        " of a version before 1.0; ingest the raw files under LINNA_HOME/files into a new database with "
+        "'linna ingest'"
+    )
 
 
-class DatabaseNotMigrated(StoreError):
+class DatabaseNotMigrated(OtherRevision):
     """The database is older than this program; `linna db upgrade` is needed."""
 
-    def __init__(self, url: str, expected: str, found: str) -> None:
-        super().__init__(
-            f"database {url}: expected schema revision {expected}, found {found}; run 'linna db upgrade'"
-        )
-        self.expected = expected
-        self.found = found
+    remedy = "; run 'linna db upgrade'"
 
 
 class StorageFull(StoreError):

@@ -40,38 +40,7 @@ log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 
-STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
-    (NotFound, 404, "not found"),
-    (Conflict, 409, "conflict"),
-    (InvalidInput, 422, "invalid input"),
-    (EvaluationError, 422, "cannot be evaluated"),
-    (BuildNotChecked, 503, "build not checked"),
-    (NotAuthorised, 401, "not authorised"),
-    (SignInRefused, 401, "not authorised"),
-    (ProviderUnavailable, 503, "sign-in provider unavailable"),
-    (StorageFull, 507, "no space left"),
-    (StorageReadOnly, 503, "read-only"),
-    (StoreError, 503, "store unavailable"),
-    (MissingLibrary, 501, "missing library"),
-    (TmtcError, 422, "invalid telemetry"),
-    (MissingLunarLibrary, 501, "missing library"),
-    (LunarError, 422, "invalid input"),
-    (ReportError, 500, "report failed"),
-    (GroundError, 400, "bad request"),
-)
-
 RETRY_AFTER_S = 1
-
-TOLD: tuple[tuple[type[Exception], str], ...] = (
-    (StorageFull, "no space left; the data were not stored"),
-    (StorageReadOnly, "the archive or the database cannot be written"),
-    (FileDamaged, "the content of a stored file has changed"),
-    (ObjectsUnavailable, "the object store cannot be reached; the data were not stored"),
-    (StoreError, "database unavailable"),
-    (BuildNotChecked, "the parameters of the build cannot be checked here, so it was not registered"),
-    (Exception, "internal error; see the log of the service"),
-)
-"""Public text of internal errors, without paths and addresses."""
 
 
 class TooLarge(GroundError):
@@ -92,6 +61,43 @@ class UnsupportedEncoding(GroundError):
 
 class PreconditionFailed(GroundError):
     """What is stored is no longer what the caller saw."""
+
+
+STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
+    (Forbidden, 403, "forbidden"),
+    (TooLarge, 413, "too large"),
+    (BrokenOff, 400, "broken off"),
+    (UnsupportedEncoding, 415, "unsupported encoding"),
+    (PreconditionFailed, 412, "precondition failed"),
+    (NotFound, 404, "not found"),
+    (Conflict, 409, "conflict"),
+    (InvalidInput, 422, "invalid input"),
+    (EvaluationError, 422, "cannot be evaluated"),
+    (BuildNotChecked, 503, "build not checked"),
+    (NotAuthorised, 401, "not authorised"),
+    (SignInRefused, 401, "not authorised"),
+    (ProviderUnavailable, 503, "sign-in provider unavailable"),
+    (StorageFull, 507, "no space left"),
+    (StorageReadOnly, 503, "read-only"),
+    (StoreError, 503, "store unavailable"),
+    (MissingLibrary, 501, "missing library"),
+    (TmtcError, 422, "invalid telemetry"),
+    (MissingLunarLibrary, 501, "missing library"),
+    (LunarError, 422, "invalid input"),
+    (ReportError, 500, "report failed"),
+    (GroundError, 400, "bad request"),
+)
+
+TOLD: tuple[tuple[type[Exception], str], ...] = (
+    (StorageFull, "no space left; the data were not stored"),
+    (StorageReadOnly, "the archive or the database cannot be written"),
+    (FileDamaged, "the content of a stored file has changed"),
+    (ObjectsUnavailable, "the object store cannot be reached; the data were not stored"),
+    (StoreError, "database unavailable"),
+    (BuildNotChecked, "the parameters of the build cannot be checked here, so it was not registered"),
+    (Exception, "internal error; see the log of the service"),
+)
+"""Public text of internal errors, without paths and addresses."""
 
 
 def problem(
@@ -144,18 +150,8 @@ def install(app: FastAPI) -> None:
     """Make the application answer every error with a problem document."""
 
     async def known(request: Request, error: Exception) -> JSONResponse:
-        if isinstance(error, Forbidden):
-            return problem(403, "forbidden", str(error), request)
-        if isinstance(error, TooLarge):
-            return problem(413, "too large", str(error), request)
         if isinstance(error, Busy):
             return busy(str(error), request)
-        if isinstance(error, BrokenOff):
-            return problem(400, "broken off", str(error), request)
-        if isinstance(error, UnsupportedEncoding):
-            return problem(415, "unsupported encoding", str(error), request)
-        if isinstance(error, PreconditionFailed):
-            return problem(412, "precondition failed", str(error), request)
         is_local = getattr(request.app.state, "local_caller", None) is not None
         told = str(error) if is_local else public_text(error)  # the log contains the complete text
         if isinstance(error, PlanConflicts):

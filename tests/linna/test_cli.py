@@ -1,5 +1,6 @@
 """The command line's shell: help, unknown commands, errors as one line."""
 
+import argparse
 import json
 import os
 import shlex
@@ -11,7 +12,7 @@ import pytest
 
 from linna import cli
 from linna.completion import command_parser
-from linna.parser import REQUIRED, all_commands
+from linna.parser import ABOVE_ZERO, REQUIRED, all_commands, number
 from payload_emulator.errors import install_hint
 from payload_emulator.session.recipe import load_recipe, procedural_recipe
 from payload_emulator.session.scenario import load_scenario
@@ -152,9 +153,24 @@ def completions(line: str, tmp_path: Path) -> set[str]:
 
 def test_a_shell_completes_commands_options_and_scenarios(tmp_path: Path) -> None:
     assert {"plan", "pass", "paper"} <= completions("linna p", tmp_path)
-    assert "--campaign" in completions("linna emulate --c", tmp_path)
+    assert "--craters" in completions("linna emulate --c", tmp_path)
     assert {"paper-day", "paper-dataset"} <= completions("linna emulate paper", tmp_path)
     assert "paper-dataset" in completions("linna dataset build paper", tmp_path)
+
+
+def test_a_number_outside_its_limits_is_refused() -> None:
+    kind = number(int, least=1, most=5)
+    assert (kind("1"), kind("5"), ABOVE_ZERO("1e-9")) == (1, 5, 1e-9)
+    for wrong, text in [
+        (kind, "0"),
+        (kind, "6"),
+        (kind, "1.5"),
+        (ABOVE_ZERO, "0"),
+        (ABOVE_ZERO, "nan"),
+        (ABOVE_ZERO, "inf"),
+    ]:
+        with pytest.raises(argparse.ArgumentTypeError, match=f"expected a number .*found '{text}'"):
+            wrong(text)
 
 
 def test_a_warning_tells_which_of_home_and_server_is_used(

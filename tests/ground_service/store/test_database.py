@@ -80,7 +80,9 @@ def test_a_database_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     database.engine.dispose()
-    with pytest.raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \S+ or older, found 9999"):
+    with pytest.raises(
+        DatabaseTooNew, match=r"linna\.db: expected schema revision \S+, found 9999 of a newer"
+    ):
         prepare_database(url(tmp_path))
 
 
