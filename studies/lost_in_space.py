@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ import numpy as np
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, project_mcmf
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.errors import RecordError
 from payload_emulator.flight.navigation.lost_in_space import (
     LostParameters,
     Place,
@@ -177,44 +175,6 @@ def see_frames(
         np.concatenate(owners or [np.empty(0, dtype=np.int64)]).astype(np.int64),
         _joined(found),
     )
-
-
-def save_seen_frames(path: Path, seen: SeenFrames, key: str) -> None:
-    """Save what was found, under a key that says of what."""
-    found = seen.found
-    with path.open("wb") as stream:
-        np.savez_compressed(
-            stream,
-            key=np.array(key),
-            number=seen.number,
-            camera_from_mcmf=seen.camera_from_mcmf,
-            owner=seen.owner,
-            u_px=found.u_px,
-            v_px=found.v_px,
-            diameter_px=found.diameter_px,
-            score=found.score,
-            sigma_px=found.sigma_px,
-        )
-
-
-def load_seen_frames(path: Path, key: str) -> SeenFrames:
-    """Return what was saved.
-
-    Raises
-    ------
-    RecordError
-        The file is of other frames, another scenario or another detector.
-    """
-    try:
-        with np.load(path) as file:
-            if str(file["key"]) != key:
-                raise RecordError(
-                    f"{path}: expected detections of {key}, found those of {file['key']}; remove it or name another"
-                )
-            found = Detections(*(file[name] for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")))
-            return SeenFrames(file["number"], file["camera_from_mcmf"], file["owner"], found)
-    except (OSError, KeyError, ValueError) as error:
-        raise RecordError(f"{path}: expected saved detections, found {error}") from None
 
 
 def search_map(world: World, numbers: IntArray, smallest_m: float) -> tuple[LandmarkMap, LandmarkMap]:

@@ -6,17 +6,13 @@ import argparse
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.output import emit, finish, log, progress
 from linna.parser import number, option
 
 if TYPE_CHECKING:
-    from lunar.arrays import IntArray
-    from payload_emulator.flight.vision.detector import OnnxDetector
-    from payload_emulator.session.world import World
-    from studies.lost_in_space import LostRow, SeenFrames, Share
+    from studies.lost_in_space import LostRow, Share
 
 LEAST_CATALOGUED = 6
 
@@ -38,7 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         lost, "--attitude-deg", number(above=0, most=2), "error of nadir and heading, 1 sigma per axis", 0.5
     )
     option(lost, "--min-diameter-km", number(least=1, most=20), "smallest craters of the map", 3.0)
-    option(lost, "--detections F.npz", Path, "keep the detections here, or take those kept here")
     option(
         lost,
         "--hostile",
@@ -51,7 +46,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
+    from payload_emulator.flight.models import load_shipped_model
     from payload_emulator.flight.navigation.lost_in_space import LostParameters
+    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.session.mission import level_of, level_text, unseen_share
     from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world import build_world
@@ -67,7 +64,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--scenario {arguments.scenario}: expected {FRAMES_COMBINED} frames in a row, found none"
         )
-    detector, seen = _seen(arguments, world, numbers)
+    size = {"width_px": world.camera.width_px, "height_px": world.camera.height_px}
+    detector = OnnxDetector(load_shipped_model(), DetectorParameters(**size))
+    seen = study.see_frames(
+        world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
+    )
     log("map of the search")
     true, board = study.search_map(world, numbers, 1e3 * arguments.min_diameter_km)
     parameters = LostParameters(attitude_sigma_rad=math.radians(arguments.attitude_deg))
@@ -128,29 +129,6 @@ def run(arguments: argparse.Namespace) -> int:
     return emit(arguments, figures, text="\n".join([*table, last, level]))
 
 
-def _seen(arguments: argparse.Namespace, world: World, numbers: IntArray) -> tuple[OnnxDetector, SeenFrames]:
-    """Return the detector that flies and what it finds in frames, kept or found now."""
-    from payload_emulator.flight.models import load_shipped_model
-    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
-    from payload_emulator.session.scenario import format_scenario
-    from studies import lost_in_space as study
-
-    camera = world.camera
-    detector = OnnxDetector(
-        load_shipped_model(), DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
-    )
-    key = _key(format_scenario(world.scenario), numbers.tobytes(), detector.sha256)
-    if arguments.detections is not None and arguments.detections.exists():
-        seen = study.load_seen_frames(arguments.detections, key)
-    else:
-        seen = study.see_frames(
-            world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
-        )
-        if arguments.detections is not None:
-            study.save_seen_frames(arguments.detections, seen, key)
-    return detector, seen
-
-
 def _statistics(single: Sequence[LostRow], wrong_m: float) -> dict[str, float | None]:
     """Return errors of the frames placed within ``wrong_m``, processor times, and counts per frame."""
     import numpy as np
@@ -179,10 +157,3 @@ def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Sha
 
 def _as_json(row: Share) -> dict[str, Any]:
     return asdict(row) | {"correct_share": row.correct_share if row.searches else None}
-
-
-def _key(scenario: str, numbers: bytes, model_sha256: str) -> str:
-    """Return the SHA-256 of everything on which the detections depend."""
-    import hashlib
-
-    return hashlib.sha256(b"|".join([scenario.encode(), numbers, model_sha256.encode()])).hexdigest()

@@ -79,10 +79,11 @@ def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable
     migrate(made)
     whole = schema_revisions(made)
 
-    def upgrade(database: Database) -> None:
+    def upgrade(database: Database, revision: str = "head") -> None:
         with lock:
-            if database.dialect != "sqlite" or schema_revisions(database) != (None, *whole[1:]):
-                return migrate(database)
+            is_new = database.dialect == "sqlite" and schema_revisions(database) == (None, *whole[1:])
+            if revision != "head" or not is_new:
+                return migrate(database, revision)
             with made.engine.connect() as source, database.engine.connect() as target:
                 source.connection.driver_connection.backup(target.connection.driver_connection)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 
 from lunar.camera import PinholeCamera
 from lunar.datafolder import find_data
-from payload_emulator.errors import RecordError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.navigation.lost_in_space import LostParameters, Place
 from payload_emulator.flight.vision.detections import Detections
@@ -38,26 +36,6 @@ def test_sets_hold_consecutive_frames_of_the_cadence_and_do_not_cross_gaps(world
     assert numbers.reshape(-1, 4).tolist() == [[0, 1, 2, 3], [7, 8, 9, 10]]
     assert study.frames_in_sets(replace(world, frame_utc_ns=utc_ns), 1).size == 4
     assert not study.frames_in_sets(replace(world, frame_utc_ns=utc_ns[:3]), 5).size
-
-
-def test_detections_come_back_as_they_were_kept_and_only_for_what_they_are_of(tmp_path: Path) -> None:
-    column = np.arange(5.0)
-    seen = SeenFrames(
-        np.arange(3),
-        np.tile(np.eye(3), (3, 1, 1)),
-        np.array([0, 0, 2, 2, 2]),
-        Detections(column, column + 1.0, column + 2.0, column / 5.0, column + 0.5),
-    )
-    path = tmp_path / "seen.npz"
-    study.save_seen_frames(path, seen, "this scenario")
-    again = study.load_seen_frames(path, "this scenario")
-    assert [len(again.of(row)) for row in range(3)] == [2, 0, 3]
-    assert again.of(2).u_px.tolist() == [2.0, 3.0, 4.0]
-    with pytest.raises(RecordError, match=r"expected detections of another, found those of this scenario"):
-        study.load_seen_frames(path, "another")
-    path.write_text("no such file")
-    with pytest.raises(RecordError, match="expected saved detections"):
-        study.load_seen_frames(path, "this scenario")
 
 
 def test_a_place_two_kilometres_off_is_wrong_and_no_fix_is_neither_right_nor_wrong() -> None:

@@ -138,7 +138,7 @@ def test_forwarded_headers_count_only_from_a_trusted_proxy(
     forwarded = {"X-Forwarded-For": "1.1.1.1, 198.51.100.4", "X-Forwarded-Proto": "https"}
     headers = {"Host": "ground.example", "Origin": "https://ground.example", **forwarded}
     with (
-        caplog.at_level(logging.INFO),
+        caplog.at_level(logging.INFO, "ground_service.worker.metrics"),
         TestClient(create_app(settings), base_url=BASE, client=("10.0.0.5", 1)) as opened,
     ):
         answer = opened.post(f"{V1}/session", json={"token": token}, headers=headers)
