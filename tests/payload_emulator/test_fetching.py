@@ -299,7 +299,7 @@ def test_the_registry_names_files_where_the_data_folder_is_searched(tmp_path):
     assert data.gravity_alternative is not None and data.gravity_alternative.name == "jgl165p1.sha"
     assert data.orientation_bpc is not None and data.orientation_tf is not None
     assert data.catalogue_robbins is not None and "robbins" in data.catalogue_robbins.name
-    assert (len(data.dem_sldem), len(data.dem_tiles), len(data.albedo_tiles)) == (6, 8, 16)
+    assert (len(data.dem_sldem), len(data.dem_tiles), len(data.albedo_tiles)) == (6, 8, 8)
 
 
 def test_the_registry_promises_nothing_it_does_not_know():
