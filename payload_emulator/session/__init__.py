@@ -1,1 +1,1 @@
-"""Execution of a scenario: world, flight, live payload, recording, replay, campaigns."""
+"""Execution of a scenario: world, flight, live payload, recording, replay."""
