@@ -44,6 +44,8 @@ class DataFolder:
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the products present, for the ``data`` field of outputs."""
+        listed = self.catalogue_robbins.name if self.catalogue_robbins is not None else ""
+        listed = listed if listed.startswith("own") else "Robbins 2019"
         present = (
             (self.gravity, f"gravity {_stem(self.gravity)} (GRAIL, NASA GSFC)"),
             (self.gravity_alternative, f"gravity {_stem(self.gravity_alternative)} (Lunar Prospector, JPL)"),
@@ -53,7 +55,7 @@ class DataFolder:
                 self.catalogue_composite,
                 "crater catalogue composite (LU1319381; Robbins 2019; Povilaitis et al. 2018)",
             ),
-            (self.catalogue_robbins, f"crater catalogue {_catalogue_name(self.catalogue_robbins)}"),
+            (self.catalogue_robbins, f"crater catalogue {listed}"),
             (
                 self.dem_tiles or None,
                 self.own_heights or "height model LROC WAC GLD100 (Scholten et al. 2012)",
@@ -130,10 +132,6 @@ def _first(root: Path, *patterns: str) -> Path | None:
         if found:
             return found[0]
     return None
-
-
-def _catalogue_name(path: Path | None) -> str:
-    return path.name if path is not None and path.name.startswith("own") else "Robbins 2019"
 
 
 def _stem(path: Path | None) -> str:

@@ -422,10 +422,6 @@ def _kernel_values(text: str) -> list[str]:
     return text.strip("()").replace(",", " ").split()
 
 
-def _pa_from_me_de421() -> FloatArray:
-    z, y, x = (angle * ARCSECOND_RAD for angle in DE421_PA_FROM_ME_ARCSECONDS)
-    return np.asarray(axis_rotation(3, z) @ axis_rotation(2, y) @ axis_rotation(1, x))
-
-
-PA_FROM_ME_DE421 = _pa_from_me_de421()
+_Z, _Y, _X = (angle * ARCSECOND_RAD for angle in DE421_PA_FROM_ME_ARCSECONDS)
+PA_FROM_ME_DE421 = np.asarray(axis_rotation(3, _Z) @ axis_rotation(2, _Y) @ axis_rotation(1, _X))
 """Principal axes of DE421 from mean-Earth axes, (3, 3)."""

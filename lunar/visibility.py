@@ -15,7 +15,7 @@ Montenbruck and Gill 2000, Satellite Orbits, section 3.4.2: conical shadow, over
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -172,14 +172,8 @@ def find_windows(
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     # Of the two sides of an edge, the one on which the condition holds.
     edges = np.where(before, low, high)
-    return list(_pairs(held, edges, int(epochs[0]), int(epochs[-1])))
-
-
-def _pairs(held: BoolArray, edges: IntArray, start: int, stop: int) -> Iterator[tuple[int, int]]:
-    bounds = [start, *edges.tolist()] if held[0] else edges.tolist()
-    if held[-1]:
-        bounds = [*bounds, stop]
-    return zip(bounds[::2], bounds[1::2], strict=True)
+    bounds = [int(epochs[0])] * bool(held[0]) + edges.tolist() + [int(epochs[-1])] * bool(held[-1])
+    return list(zip(bounds[::2], bounds[1::2], strict=True))
 
 
 def _rotate(matrix: FloatArray, vector: ArrayLike) -> FloatArray:

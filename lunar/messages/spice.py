@@ -199,7 +199,7 @@ def format_sclk(lines: Sequence[ClockLine], spacecraft: int) -> str:
             "",
             "\\begindata",
             "",
-            f"SCLK_KERNEL_ID = ( @{_kernel_date(lines[0].utc_ns)} )",
+            f"SCLK_KERNEL_ID = ( @{np.datetime64(lines[0].utc_ns, 'ns').astype('datetime64[s]')} )",
             f"SCLK_DATA_TYPE_{number} = ( 1 )",
             f"SCLK01_TIME_SYSTEM_{number} = ( 2 )",
             f"SCLK01_N_FIELDS_{number} = ( 2 )",
@@ -216,10 +216,6 @@ def format_sclk(lines: Sequence[ClockLine], spacecraft: int) -> str:
             "",
         ]
     )
-
-
-def _kernel_date(utc_ns: int) -> str:
-    return str(np.datetime64(utc_ns, "ns").astype("datetime64[s]"))
 
 
 def format_fk(spacecraft: int, name: str) -> str:
@@ -257,6 +253,7 @@ def format_ik(camera: PinholeCamera, spacecraft: int, name: str) -> str:
     rays = camera.rays(camera.corners_px())
     corners = ["    " + " ".join(f"{value:.15f}" for value in ray) for ray in rays.tolist()]
     focal = camera.focal_px
+    lens = (getattr(camera, name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
     lines = [
         "KPL/IK",
         "",
@@ -276,16 +273,12 @@ def format_ik(camera: PinholeCamera, spacecraft: int, name: str) -> str:
         f"INS{number}_FOCAL_LENGTH_PX = ( {focal:.12f} )",
         f"INS{number}_CCD_CENTER = ( {camera.centre_px[0]:.6f} {camera.centre_px[1]:.6f} )",
         f"INS{number}_FOV_DEGREES = ( {math.degrees(camera.fov_rad):.12f} )",
-        f"INS{number}_DISTORTION = ( {' '.join(f'{value:.15e}' for value in _distortion(camera))} )",
+        f"INS{number}_DISTORTION = ( {' '.join(f'{float(value):.15e}' for value in lens)} )",
         "",
         "\\begintext",
         "",
     ]
     return "\n".join(lines)
-
-
-def _distortion(camera: PinholeCamera) -> list[float]:
-    return [float(getattr(camera, name, 0.0)) for name in ("k1", "k2", "k3", "p1", "p2")]
 
 
 def _spice_name(name: str) -> str:
