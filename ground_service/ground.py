@@ -51,7 +51,7 @@ class Ground:
     database: Database
     files: FileArchive
     home: Path
-    data: DataFolder
+    stated_data: DataFolder
     runner: Path | None = None
     objects: ObjectStore | None = None
     networks: tuple[IPv4Network | IPv6Network, ...] = ()
@@ -102,6 +102,12 @@ class Ground:
             with _changed:
                 _running.discard(mine)
                 _changed.notify_all()
+
+    @property
+    def data(self) -> DataFolder:
+        """Public data products that are available now: those that are mounted later are noticed."""
+        root = self.stated_data.root
+        return self.stated_data if root is None or not root.is_dir() else find_data(root)
 
     @property
     def orientation(self) -> Orientation:

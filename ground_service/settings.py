@@ -180,6 +180,13 @@ class Settings(BaseSettings):
         ge=0,
         description="Size of the kept regression archives in MiB, pinned ones included; 0: any",
     )
+    placebo_passes: int = Field(
+        default=3,
+        ge=0,
+        le=100,
+        description="Kept archives over which the installed flight code is compared with itself every night, with "
+        "other noise in the images; 0: none",
+    )
     runner_exchange: Path | None = Field(
         default=None,
         description="Folder shared with a runner (`linna runner`) that runs payload builds; "
@@ -253,6 +260,7 @@ class Settings(BaseSettings):
             "archive_days": self.archive_days,
             "archive_limit_mib": self.archive_limit_mib,
             "audit_heads": self.audit_heads,
+            "placebo_passes": self.placebo_passes,
         }
 
     def resolved_database_url(self) -> str:

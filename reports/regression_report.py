@@ -120,7 +120,7 @@ def _changed(report: RegressionReport) -> list[Block]:
         for one in report.changed_tracks
     )
     sides = tuple(side for one in report.changed_tracks for side in (one.baseline, one.candidate))
-    lead = "Left the baseline, right the candidate, around the same crater, in the order of the list."
+    lead = "Left the baseline, right the candidate, around one crater, in the order of the list; contrast stretched."
     return [
         *blocks,
         Table(

@@ -40,8 +40,8 @@ CONTENT = {"add_ephemeris", "withdraw_ephemeris", "add_mission"}
 SERVICE = {
     "upload_archive", "repeat_job", "withdraw_catalogue", "add_build",
     "add_current_build", "list_kept_archives", "keep_archive", "render_kept_archive", "change_kept_archive",
-    "delete_kept_archives", "start_regression", "start_analysis", "list_regressions", "get_regression",
-    "get_regression_report", "regression_page", "list_users", "add_user", "get_user", "change_user",
+    "delete_kept_archives", "start_regression", "start_analysis", "list_regressions", "list_calibrations",
+    "get_regression", "get_regression_report", "regression_page", "list_users", "add_user", "get_user", "change_user",
     "add_token", "list_tokens", "revoke_token", "list_audit", "get_audit_head",
 }  # fmt: skip
 """Operations that concern the whole service, or passes of any mission."""

@@ -296,6 +296,10 @@ class Operations(Connection):
     def find_landmarks(self, pass_id: int) -> landmarks.LandmarkUpdate:
         """Search a pass for landmarks and enter them; what the pass said before is replaced."""
 
+    @operation("GET /passes/{pass_id}/anchoring-table")
+    def get_onboard_table(self, pass_id: int, out: Path) -> None:
+        """Return the anchoring table that was on board at the end of a pass."""
+
     # exports
 
     @operation("POST /exports", body=("pass_id", "format", "states"))
@@ -685,6 +689,10 @@ class Operations(Connection):
     @operation("GET /regressions", reads="regression.store.list_regressions")
     def list_regressions(self) -> Listing[regression.RegressionSummary]:
         """List the verdicts, newest first."""
+
+    @operation("GET /calibrations")
+    def list_calibrations(self) -> list[regression.Calibration]:
+        """Return the noise of each metric in placebos, and whether its gate is calibrated."""
 
     @operation("GET /regressions/{regression_id}")
     def get_regression(self, regression_id: str) -> regression.Regression:

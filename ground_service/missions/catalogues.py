@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +85,18 @@ def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
             "a crater catalogue that is available (linna data fetch, or linna catalogue add FILE and catalogue.sha256)",
             stated.source,
         )
+    return found
+
+
+def listed_craters(ground: Ground, mission: Mission) -> list[CraterCatalogue]:
+    """Return the available crater lists: that of a mission, and over the real Moon the largest public one."""
+    found = []
+    with suppress(InvalidInput):
+        found.append(catalogue_of(ground, mission))
+    data = ground.data
+    path = data.catalogue_lu or data.catalogue_composite or data.catalogue_robbins
+    if path is not None and mission.evidence.world not in ("unit-geometry", "procedural"):
+        found.append(read_catalogue(path))
     return found
 
 

@@ -6,21 +6,25 @@ unpacked, and no file is used whose hash is not the one in the manifest.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import shutil
 import struct
 import tempfile
 import zipfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound, StoreError, storage_error
+from ground_service.evaluation.inputs import read_image
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.passes.archive_import import checked_files, read_manifest
@@ -55,6 +59,9 @@ _WORKING = ".working-"
 INPUTS = "payload/inputs.jsonl"
 DETECTIONS = "payload/detections.jsonl"
 """Received detections by frame, from which an archive without frames is replayed."""
+
+NOISE_DN = 1.0
+"""Standard deviation of the noise of a placebo."""
 
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 _PNG_HEADER = struct.Struct(">8s4x4sII")
@@ -199,10 +206,11 @@ def pack_archive(folder: Path, target: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def write_flight_view(archive: Path, folder: Path) -> None:
+def write_flight_view(archive: Path, folder: Path, *, noise: int = 0) -> None:
     """Copy what the payload was given into a folder: manifest without truth, inputs, tables, parameters, images.
 
-    An archive without all its frames is replayed from its received detections, without images.
+    An archive without all its frames is replayed from its received detections, without images. `noise` is the seed of
+    noise that is added to the images; 0: none.
     """
     manifest, _ = read_manifest(archive)
     folder.mkdir(parents=True)
@@ -215,6 +223,24 @@ def write_flight_view(archive: Path, folder: Path) -> None:
             shutil.copyfile(archive / name, folder / name)
     seen = {key: manifest[key] for key in _FLIGHT_KEYS if key in manifest}
     (folder / MANIFEST).write_text(json.dumps({**seen, "coding": coding_of(manifest)}, indent=1) + "\n")
+    if noise and not partial:
+        _add_noise(folder, noise)
+
+
+def _add_noise(folder: Path, seed: int) -> None:
+    """Add noise to the images of a flight view, and give its inputs their hashes."""
+    from PIL import Image
+
+    rng, rows = np.random.default_rng(seed), frame_inputs(folder, steps=True)
+    for row in rows:
+        if row["image"]:
+            place = folder / row["image"]
+            image = read_image(place.read_bytes(), place.name)
+            noisy = np.rint(image + NOISE_DN * rng.standard_normal(image.shape))
+            image = np.clip(noisy, 0, 255).astype(np.uint8)
+            Image.fromarray(image).save(place, compress_level=1)
+            row["pixels_sha256"] = hashlib.sha256(image.tobytes()).hexdigest()
+    (folder / INPUTS).write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
 
 
 def coding_of(manifest: dict[str, Any]) -> str:
@@ -302,9 +328,14 @@ def kept_archive(ground: Ground, digest: str) -> KeptArchive:
 
 
 def check_out(ground: Ground, digest: str, folder: Path, *, images: bool = True) -> PassArchive:
-    """Write a kept archive into a folder, checked again; without its images what the ground reads of a pass."""
+    """Write a kept archive into a folder, checked again, and note its use.
+
+    Without its images: what the ground reads of a pass, which is no use.
+    """
     with ground.database.writing() as connection:
-        record = store.use_archive(connection, digest, utc_now_ns())
+        if images:
+            store.use_archive(connection, digest, utc_now_ns())
+        record = store.get_archive(connection, digest)
     files = store_of(ground)
     archive = archive_of(ground, record, folder)
     try:
@@ -351,7 +382,12 @@ def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
 
 
 def let_go(
-    ground: Ground, *, unused_for_ns: int | None, limit_octets: int | None = None, actor: str = "service"
+    ground: Ground,
+    *,
+    unused_for_ns: int | None,
+    limit_octets: int | None = None,
+    actor: str = "service",
+    condition: Callable[[str], str] = str,
 ) -> list[str]:
     """Remove archives that are not pinned; return their identities. Each removal is recorded in the audit log.
 
@@ -362,14 +398,21 @@ def let_go(
     unused_for_ns
         Remove those that were not used for so long; None: none for their age.
     limit_octets
-        Remove those that were not used for the longest time until the others have this size; None: any size.
+        Remove those of the condition that most have, the longest unused first, until the others have this size; None:
+        any size.
+    condition
+        Returns the condition of a kept archive with frames.
     """
+    conditions = {}
+    if limit_octets is not None and sum(one.octets for one in kept_archives(ground)) > limit_octets:
+        whole = [one.digest for one in kept_archives(ground) if one.state == COMPLETE]
+        conditions = {digest: condition(digest) for digest in whole}
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
         now = utc_now_ns()
         removed = [] if unused_for_ns is None else store.remove_unused(connection, now - unused_for_ns)
         if limit_octets is not None:
-            removed += store.remove_above(connection, limit_octets)
+            removed += store.remove_above(connection, limit_octets, conditions)
         for record in removed:
             detail = {"pass": record.pass_id, "octets": record.octets, "kept_since": str(record.kept_since)}
             audit(connection, actor, "remove regression archive", record.digest, detail)
@@ -378,12 +421,7 @@ def let_go(
 
 
 def _remove_files(ground: Ground, removed: Sequence[ArchiveRecord]) -> None:
-    """Remove the files of archives that were removed, after the commit, unless a kept archive has them.
-
-    Nothing is removed while the manifest of a kept archive cannot be read, because its files are not known.
-    """
-    if not removed:
-        return
+    """Remove the files of archives that were removed, after the commit."""
     files = store_of(ground)
     unused: set[str] = set()
     for record in removed:
@@ -391,11 +429,22 @@ def _remove_files(ground: Ground, removed: Sequence[ArchiveRecord]) -> None:
             unused |= _held(files, record)
         except (NotFound, StoreError) as error:
             _log.warning("files of removed archive %s are not removed: %s", record.digest, error)
+    remove_unheld(ground, unused)
+
+
+def remove_unheld(ground: Ground, unused: set[str]) -> None:
+    """Remove files by their hashes, unless a kept archive has them.
+
+    Nothing is removed while the manifest of a kept archive cannot be read, because its files are not known.
+    """
+    if not unused:
+        return
+    files = store_of(ground)
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
         try:
             for record in store.list_archives(connection):
-                unused -= _held(files, record)
+                unused = unused - _held(files, record)
         except (NotFound, StoreError) as error:
             _log.warning("no files of archives are removed: kept archive %s: %s", record.digest, error)
             return

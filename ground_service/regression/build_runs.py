@@ -98,7 +98,7 @@ def run_build(
     work = out / ".run"
     work.mkdir(parents=True)
     try:
-        write_flight_view(archive, work / "archive")
+        write_flight_view(archive, work / "archive", noise=build.noise)
         build.stage(work / "build")
         written = work / "out"
         written.mkdir()

@@ -134,6 +134,8 @@ class Build:
         Camera for which the build is made; None if it is not specific to a camera.
     digest
         Identity of the build.
+    noise
+        Seed of noise in the images that it is given in a placebo; 0: none.
     """
 
     name: str
@@ -148,6 +150,7 @@ class Build:
     provenance: tuple[tuple[str, str], ...] = ()
     flight_code: str = ""
     parameters: str = ""
+    noise: int = 0
 
     @property
     def title(self) -> str:

@@ -10,6 +10,7 @@ from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ground_service.evaluation.core import gallery_frame
 from ground_service.evaluation.detection.recall import expected_craters, match_detections
@@ -52,6 +53,9 @@ CHANGED_TRACKS = 10
 CROP_PX = 160
 """Tracks shown side by side, and the side of their images."""
 
+DARKEST_BRIGHTEST = (1.0, 99.5)
+"""Percentiles of a shown image that become black and white."""
+
 SCREEN_LINES = 18
 """Greatest number of lines of facts in a terminal, before the counts and the remarks."""
 
@@ -76,6 +80,7 @@ def verdict_document(outcome: RegressionOutcome) -> Verdict:
                 "gates": [_gate(gate) for gate in outcome.gates],
                 "passes": [_pass(one) for one in outcome.passes],
                 "remarks": outcome.remarks,
+                **({} if outcome.noise is None else {"noise": [one.model_dump() for one in outcome.noise]}),
             }
         )
     )
@@ -206,7 +211,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         passes=tuple(_regression_pass(one) for one in judged),
         craters=changed_craters(judged),
         changed_tracks=tuple(changed_tracks(ground, judged)),
-        verdict=headline(outcome).capitalize() + ".",
+        verdict=f"{outcome.verdict.capitalize()}{headline(outcome).removeprefix(outcome.verdict)}.",
         verdict_level=outcome.verdict,
         evidence_level=weakest_evidence([one.context.evidence for one in judged if one.context]),
         headline=_headline(outcome),
@@ -318,7 +323,8 @@ def _side(
         int(np.clip(round(centre) - CROP_PX // 2, 0, max(size - CROP_PX, 0)))
         for centre, size in zip((expected.v_px[row], expected.u_px[row]), image.shape[:2], strict=True)
     )
-    shown = gallery_frame(detections, expected, matches, 0, image[top : top + CROP_PX, left : left + CROP_PX])
+    part = stretched(image[top : top + CROP_PX, left : left + CROP_PX])
+    shown = gallery_frame(detections, expected, matches, 0, part)
     return replace(
         shown,
         detection_u_px=shown.detection_u_px - left,
@@ -327,6 +333,12 @@ def _side(
         catalogue_v_px=shown.catalogue_v_px - top,
         caption=f"{label}: {'detected' if matches.detection_of_crater[row] >= 0 else 'not detected'}",
     )
+
+
+def stretched(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image with full contrast: frames with a low Sun are dark."""
+    low, high = np.percentile(image, DARKEST_BRIGHTEST)
+    return np.asarray(np.clip((image - low) / max(high - low, 1.0) * 255.0, 0.0, 255.0), dtype=np.uint8)
 
 
 def _build(build: Any) -> dict[str, Any]:

@@ -62,11 +62,11 @@ def _reason(outcome: RegressionOutcome) -> str:
         more = f"; about {needed:,} frames decide, {outcome.frames_judged:,} were compared" if needed else ""
         told = "; ".join(f"{_name(gate)} {_figures(gate)}, {gate.reason}" for gate in open_gates[:2])
         return told + more
-    if any(gate.reason == IDENTICAL for gate in gates):
+    if any(gate.reason.startswith(IDENTICAL) for gate in gates):
         return f"{IDENTICAL} on {outcome.frames_judged} frames"
     better = [gate for gate in gates if gate.outcome == PASS and gate.change_high < 0.0]
     if better:
-        return f"better: {_changes(better)}, no other loss; {_navigation(outcome.gates)}"
+        return f"better: {_changes(better)}, no loss beyond the margins; {_navigation(outcome.gates)}"
     return f"no loss beyond the margins on {outcome.frames_judged} frames; {_navigation(outcome.gates)}"
 
 

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.jobs.store import set_progress
@@ -17,9 +18,10 @@ from ground_service.regression.archives import kept_archives
 from ground_service.regression.baseline import baseline_figures
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
 from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
-from ground_service.regression.model import Comparison
+from ground_service.regression.model import COMPLETE, Comparison
 from ground_service.regression.outcome import RegressionOutcome
 from ground_service.regression.pass_archives import archive_of_pass
+from ground_service.regression.placebo import run_placebo
 from ground_service.regression.rendering import settle_archive
 from ground_service.regression.service import (
     do_replay,
@@ -90,6 +92,16 @@ def missing_replays(ground: Ground, arguments: Mapping[str, Any]) -> list[dict[s
     ]
 
 
+def nightly_placebo(ground: Ground, passes: int) -> dict[str, Any] | None:
+    """Return the arguments of the placebo of this night over so many archives by turns; None without any."""
+    kept = [one.digest for one in kept_archives(ground) if one.state == COMPLETE]
+    if not kept or not passes:
+        return None
+    night = utc_now_ns() // 86_400_000_000_000
+    chosen = dict.fromkeys(kept[(night * passes + k) % len(kept)] for k in range(passes))
+    return {**prepared(ground, CURRENT, CURRENT, list(chosen)), "placebo": night}
+
+
 def replay_job(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
     """One build over one archive."""
     replay = do_replay(ground, str(arguments["archive"]), registered_build(ground, str(arguments["build"])))
@@ -131,13 +143,8 @@ def _outcome(
     candidate, baseline = (
         registered_build(ground, str(arguments[side])) for side in ("candidate", "baseline")
     )
-    return run_regression(
-        ground,
-        archives,
-        candidate,
-        baseline,
-        policy,
-        workers=arguments.get("workers"),
-        progress=progress,
-        minutes=arguments.get("minutes"),
-    )
+    options: dict[str, Any] = {"workers": arguments.get("workers"), "progress": progress}
+    if seed := arguments.get("placebo"):
+        return run_placebo(ground, archives, baseline, policy, int(seed), **options)
+    minutes = arguments.get("minutes")
+    return run_regression(ground, archives, candidate, baseline, policy, minutes=minutes, **options)

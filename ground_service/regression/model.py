@@ -136,6 +136,47 @@ class RegressionRequest(Comparison):
         le=1e5,
         description="Sequential: add passes in the most informative order until the verdict is clear, for so long",
     )
+    placebo: int | None = Field(
+        default=None,
+        ge=1,
+        le=2**31 - 1,
+        description="Compare the baseline with itself, with noise of this seed in the images",
+    )
+
+
+class Noise(Entity):
+    """Change of a metric between two replays of equal builds."""
+
+    metric: str
+    condition: str = Field(default="", description="Terrain and altitude of the pass")
+    loss: float | None = Field(
+        default=None, description="On the scale of the test: a difference or a log ratio"
+    )
+    square: float | None = Field(default=None, description="Square of the loss over its standard error")
+    p_value: float
+    level: float
+
+
+class Calibration(Entity):
+    """Noise of a metric in placebos, and whether its gate rejects them as rarely as its level allows."""
+
+    metric: str
+    condition: str = Field(description="Terrain and altitude; empty: all placebos")
+    placebos: int
+    rejected: int
+    level: float = Field(description="Share that may be rejected")
+    spread: float | None = Field(description="Root mean square of the losses")
+    mean_square: float | None = Field(
+        description="Of the losses over their standard errors; 1 if these are right"
+    )
+    calibrated: bool
+
+    @property
+    def text(self) -> str:
+        """Return the rejections in one line."""
+        state = "calibrated" if self.calibrated else "uncalibrated"
+        place = f" ({self.condition})" if self.condition else ""
+        return f"{state}: {self.metric}{place}: {self.rejected} of {self.placebos} placebos rejected at {self.level:g}"
 
 
 class JudgedBuild(Entity):
@@ -253,6 +294,7 @@ class Verdict(Entity):
     gates: list[JudgedGate]
     passes: list[JudgedPass]
     remarks: list[str]
+    noise: list[Noise] = Field(default=[], description="Of a placebo: what equal builds differ by")
 
     @property
     def exit_status(self) -> int:

@@ -12,7 +12,7 @@ from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED,
 from ground_service.regression.gates.metrics import outcome_shares
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
-from ground_service.regression.model import KeptReplay
+from ground_service.regression.model import KeptReplay, Noise
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 
 JUDGED, TELEMETRY_JUDGED = "judged", "telemetry judged"
@@ -53,6 +53,7 @@ class RegressionOutcome:
     gates: tuple[Gate, ...]
     passes: tuple[PassVerdict, ...]
     remarks: tuple[str, ...] = field(default=())
+    noise: tuple[Noise, ...] | None = None
 
     @property
     def verdict(self) -> str:

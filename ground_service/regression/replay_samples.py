@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.extras import sun_angles
 from ground_service.evaluation.inputs import evidence_of_frames, orientation_of
 from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.missions.ephemerides.attitudes import (
@@ -27,7 +28,7 @@ from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
-from ground_service.regression.gates.samples import CraterRows, PassFrames, TimeTags, pass_frames
+from ground_service.regression.gates.samples import KINDS, CraterRows, PassFrames, TimeTags, pass_frames
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
@@ -42,6 +43,8 @@ from tmtc.errors import TmtcError
 from tmtc.schema import Dictionary, Table
 
 FRAME_TIMES = "frame_times.csv"
+LOW_KM, LOW_SUN_DEG = 25.0, 20.0
+"""Altitude and elevation of the Sun that divide the passes into conditions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,6 +193,21 @@ def expected_rows(context: PassContext) -> CraterRows:
     """Return the craters that the frames of a pass should show, whatever a build finds."""
     nothing = np.zeros(0, np.int64)
     return _frames(context, no_detections(), {}, {}, nothing, nothing).craters
+
+
+def condition_of(context: PassContext) -> str:
+    """Return terrain, altitude and, where it is that of the ephemeris, elevation of the Sun of a pass in words."""
+    kind = KINDS[int(np.mean(np.append(expected_rows(context).kind, 0)) > 0.5)]
+    track = reference_states(context.reference, context.orientation, context.frame_utc_ns)
+    limits = [(float(np.nanmedian(track.altitude_m)) / 1e3, LOW_KM, "km")]
+    if context.manifest.get("light", "real") == "real":
+        limits.append((float(np.nanmedian(sun_angles(track).elevation_deg)), LOW_SUN_DEG, "degrees of Sun"))
+    return ", ".join(
+        [
+            kind,
+            *(f"{'below' if value < limit else 'above'} {limit:g} {unit}" for value, limit, unit in limits),
+        ]
+    )
 
 
 def _frames(context: PassContext, *received: Any) -> PassFrames:

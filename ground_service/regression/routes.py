@@ -35,6 +35,7 @@ from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import (
     ArchiveChange,
     Build,
+    Calibration,
     Comparison,
     KeptArchive,
     Pruned,
@@ -140,9 +141,9 @@ def start_regression(
     arguments = {
         **compared(ground, request),
         "policy": request.policy,
-        **request.model_dump(include={"policy_name", "minutes"}),
+        **request.model_dump(include={"policy_name", "minutes", "placebo"}),
     }
-    in_one_job = request.workers or request.minutes
+    in_one_job = request.workers or request.minutes or request.placebo
     missing = [] if in_one_job else missing_replays(ground, arguments)
     replays = {f"{one['archive']} {one['build']}": one for one in missing}
     for job in enter_jobs(ground, replays, "regression", arguments, identity):
@@ -168,6 +169,12 @@ def start_analysis(
 
 
 add_list(regressions, "/regressions", store.list_regressions)
+
+
+@regressions.get("/calibrations")
+def list_calibrations(ground: GroundOf, _: Viewer) -> list[Calibration]:
+    """Return the noise of each metric in placebos, and whether its gate is calibrated."""
+    return service.calibrations_of(ground)
 
 
 @regressions.get("/regressions/{regression_id}")

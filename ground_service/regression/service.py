@@ -39,15 +39,17 @@ from ground_service.regression.archives import (
 from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
+from ground_service.regression.gates.calibration import calibrations
 from ground_service.regression.gates.core import NOT_JUDGED, ONLY_LOOK, Look, judge
 from ground_service.regression.gates.faults import first_difference
-from ground_service.regression.gates.policy import PolicyFile
+from ground_service.regression.gates.policy import PolicyFile, load_policy
 from ground_service.regression.gates.samples import KINDS, PassFrames
 from ground_service.regression.gates.sequence import informative_order, is_clear, planned_looks
 from ground_service.regression.model import (
     COMPLETE,
     OK,
     TELEMETRY_ONLY,
+    Calibration,
     KeptArchive,
     KeptReplay,
     Regression,
@@ -63,6 +65,7 @@ from ground_service.regression.rendering import LIVE_BEGINNING, settle_archive
 from ground_service.regression.replay_samples import (
     PassContext,
     ReadDownlink,
+    condition_of,
     expected_rows,
     pass_context,
     read_downlink,
@@ -101,7 +104,8 @@ def run_regression(
     """
     if not archives:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
-    kept = [_kept(ground, given) for given in archives]
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1, "archives") as pool:
+        kept = list(pool.map(lambda given: _kept(ground, given), archives))
     builds = tuple(dict.fromkeys((baseline, candidate)))
     usable = {
         one.digest: one for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)
@@ -156,6 +160,14 @@ def _tracks(ground: Ground, archive: PassArchive) -> list[int]:
 def _context(ground: Ground, digest: str) -> PassContext:
     with working_folder(ground) as folder:
         return pass_context(check_out(ground, digest, folder / "a", images=False), ground.data)
+
+
+def condition_of_archive(ground: Ground, digest: str) -> str:
+    """Return the condition of a kept archive; empty if it cannot be read."""
+    try:
+        return condition_of(_context(ground, digest))
+    except (GroundError, LunarError):
+        return ""
 
 
 def fly_shards(
@@ -296,18 +308,23 @@ def judge_regression(
         before[name], after[name] = old, new
     if apart:
         remarks.append(
-            f"{apart} passes were not replayed by both builds at the same time: no latency is compared"
+            f"no latency is compared on {apart} of {len(judged)} passes: the builds were not replayed at the same time"
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
     today = format_utc(utc_now_ns())[:10]
-    gates = judge(before, after, policy.policy, imaged=whole, today=today, look=look)
+    doubts = {
+        one.metric: one.text for one in calibrations_of(ground) if not (one.calibrated or one.condition)
+    }
+    gates = [
+        replace(gate, reason="; ".join(filter(None, (gate.reason, doubts.get(gate.name)))))
+        for gate in judge(before, after, policy.policy, imaged=whole, today=today, look=look)
+    ]
+    remarks += doubts.values()
     rows = {name: first_difference(before[name], after[name]) for name in before}
     differing = [f"{name}, frame {row}" for name, row in rows.items() if row is not None]
     if differing:
-        remarks.append(
-            f"first different packets: {differing[0]}; {len(before) - len(differing)} of {len(before)} passes are "
-            "identical in every octet"
-        )
+        same = f"; {len(before) - len(differing)} of {len(before)} passes are identical in every octet"
+        remarks.append(f"first different packets: {differing[0]}{same if len(before) > 1 else ''}")
     isolations = sorted(
         {
             re.sub(r"user \d+", "a user of its own", replay.isolation)
@@ -318,6 +335,11 @@ def judge_regression(
     )
     remarks += [f"builds were isolated by: {name}" for name in isolations]
     return RegressionOutcome(baseline, candidate, policy, tuple(gates), passes, tuple(remarks))
+
+
+def calibrations_of(ground: Ground) -> list[Calibration]:
+    """Return the noise of each metric in the placebos that the shipped policy judged."""
+    return calibrations(ground.read(store.placebo_noise, load_policy().policy.version))
 
 
 def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id: str | None = None) -> str:
@@ -335,7 +357,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
         )
         flown = {one.context.mission for one in outcome.passes if one.context is not None}
         added = store.add_regression(connection, regression, missions=sorted(flown), html_sha256=html.sha256)
-        if added:
+        if added and outcome.noise is None:
             publish(connection, RegressionJudged(id=identity, verdict=outcome.verdict))
     return identity
 

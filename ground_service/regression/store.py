@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from typing import Any
 
-from sqlalchemy import Connection, delete, func, select, update
+from sqlalchemy import Connection, delete, func, or_, select, update
 
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf, Paging
@@ -16,6 +17,7 @@ from ground_service.regression.model import (
     ArchiveRecord,
     Build,
     KeptReplay,
+    Noise,
     Regression,
     RegressionSummary,
 )
@@ -23,6 +25,9 @@ from ground_service.store import repository
 from ground_service.store.states import change_if
 
 BUILDS, ARCHIVES = repository.BUILDS, repository.REGRESSION_ARCHIVES
+PLACEBOS = 100
+"""Placebos whose noise counts: a quarter of a year of nights."""
+
 REPLAYS, REGRESSIONS = repository.REPLAYS, repository.REGRESSIONS
 
 
@@ -130,11 +135,9 @@ def list_archives(connection: Connection) -> list[ArchiveRecord]:
     return [_archive(row) for row in connection.execute(query).mappings()]
 
 
-def use_archive(connection: Connection, digest: str, now_utc_ns: int) -> ArchiveRecord:
-    """Note the use of a kept archive, which postpones its removal, and return it."""
-    if not change_if(connection, ARCHIVES, digest, {}, used_utc_ns=now_utc_ns):
-        raise NotFound("archive", digest)
-    return get_archive(connection, digest)
+def use_archive(connection: Connection, digest: str, now_utc_ns: int) -> None:
+    """Note the use of a kept archive, which postpones its removal."""
+    change_if(connection, ARCHIVES, digest, {}, used_utc_ns=now_utc_ns)
 
 
 def pin_archive(connection: Connection, digest: str, pinned: bool) -> None:
@@ -152,22 +155,29 @@ def remove_unused(connection: Connection, used_before_utc_ns: int) -> list[Archi
     return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
 
 
-def remove_above(connection: Connection, limit_octets: int) -> list[ArchiveRecord]:
+def remove_above(
+    connection: Connection, limit_octets: int, conditions: Mapping[str, str]
+) -> list[ArchiveRecord]:
     """Delete archives that are not pinned down to a total size; return them.
 
-    Those without frames go first, because they say nothing about a detector; then the longest unused.
+    Those without frames go first, because they say nothing about a detector; then the longest unused of the condition
+    that most archives have, pinned ones included.
     """
-    columns = (ARCHIVES.c.digest, ARCHIVES.c.octets, ARCHIVES.c.pinned)
-    order = (ARCHIVES.c.state != TELEMETRY_ONLY, ARCHIVES.c.used_utc_ns, ARCHIVES.c.digest)
-    kept = connection.execute(select(*columns).order_by(*order)).all()
-    excess = sum(octets for _, octets, _ in kept) - limit_octets
+    columns = (ARCHIVES.c.digest, ARCHIVES.c.octets, ARCHIVES.c.pinned, ARCHIVES.c.state)
+    query = select(*columns).order_by(ARCHIVES.c.used_utc_ns, ARCHIVES.c.digest)
+    left = {row.digest: row for row in connection.execute(query)}
     chosen = []
-    for digest, octets, pinned in kept:
-        if excess > 0 and not pinned:
-            chosen.append(digest)
-            excess -= octets
-    query = delete(ARCHIVES).where(ARCHIVES.c.pinned == 0, ARCHIVES.c.digest.in_(chosen))
-    return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
+    while sum(row.octets for row in left.values()) > limit_octets:
+        counts = Counter(conditions.get(digest) for digest in left)
+        free = [digest for digest, row in left.items() if not row.pinned]
+        if not free:
+            break
+        chosen.append(
+            min(free, key=lambda one: (left[one].state != TELEMETRY_ONLY, -counts[conditions.get(one)]))
+        )
+        del left[chosen[-1]]
+    removal = delete(ARCHIVES).where(ARCHIVES.c.pinned == 0, ARCHIVES.c.digest.in_(chosen))
+    return [_archive(row) for row in connection.execute(removal.returning(*ARCHIVES.c)).mappings()]
 
 
 def keep_replay(
@@ -213,6 +223,15 @@ def find_replay(connection: Connection, archive: str, build: str) -> KeptReplay 
     return None if row is None else KeptReplay.of(row)
 
 
+def remove_replays(connection: Connection, builds: Collection[str]) -> set[str]:
+    """Delete the replays of builds; return the hashes of their files that no other replay has."""
+    names = (REPLAYS.c.downlink_sha256, REPLAYS.c.performance_sha256)
+    removed = delete(REPLAYS).where(REPLAYS.c.build_digest.in_(builds)).returning(*names)
+    found = {one for row in connection.execute(removed) for one in row if one}
+    left = select(*names).where(or_(*(name.in_(found) for name in names)))
+    return found - {one for row in connection.execute(left) for one in row}
+
+
 def replay_id(archive: str, build: str) -> str:
     """Return the identity of a replay: the hash of the identities of archive and build."""
     return hashlib.sha256(f"{archive} {build}".encode()).hexdigest()
@@ -241,6 +260,20 @@ def add_regression(
 def get_regression(connection: Connection, regression_id: str) -> Regression:
     """Return a regression."""
     return Regression.of(repository.get(connection, REGRESSIONS, regression_id, "regression"))
+
+
+def placebo_noise(connection: Connection, policy_version: str) -> list[Noise]:
+    """Return the noise of the newest placebos that this version of a policy judged."""
+    query = select(REGRESSIONS.c.result).where(
+        REGRESSIONS.c.baseline_digest == REGRESSIONS.c.candidate_digest
+    )
+    newest = query.order_by(REGRESSIONS.c.created_utc_ns.desc(), REGRESSIONS.c.id).limit(PLACEBOS)
+    return [
+        Noise.model_validate(row)
+        for result in connection.execute(newest).scalars()
+        if result["policy"]["version"] == policy_version
+        for row in result.get("noise", ())
+    ]
 
 
 def get_report(connection: Connection, regression_id: str) -> str:

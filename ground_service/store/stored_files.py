@@ -26,6 +26,12 @@ def file_names(connection: Connection) -> list[str]:
     return sorted(connection.execute(select(repository.FILES.c.sha256)).scalars())
 
 
+def files_beginning(connection: Connection, prefix: str) -> list[str]:
+    """Return the SHA-256 of the files whose SHA-256 begins so."""
+    query = select(repository.FILES.c.sha256).where(repository.FILES.c.sha256.startswith(prefix))
+    return list(connection.execute(query).scalars())
+
+
 def recorded_name(connection: Connection, sha256: str) -> str:
     """Return the name of a file of the archive."""
     return str(repository.get(connection, repository.FILES, sha256, "file")["name"])

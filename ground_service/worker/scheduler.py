@@ -22,6 +22,7 @@ from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.jobs.store import repeat_ingests
 from ground_service.memory import give_back
 from ground_service.planning.standing import needs_plan
+from ground_service.regression.jobs import nightly_placebo
 from ground_service.store import leases
 from ground_service.worker.actions import repeat_due
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
@@ -159,6 +160,8 @@ class Scheduler:
             return
         self._dispatcher.submit("nightly", self._kept, job_id=identity)
         self._night = identity
+        if placebo := nightly_placebo(self._ground, int(self._kept.get("placebo_passes", 0))):
+            self._dispatcher.submit("regression", placebo, job_id=nightly_job_id(now, "placebo"))
 
     def _release(self) -> None:
         try:

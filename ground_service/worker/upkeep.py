@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ground_service.missions.rules import Channel
 from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends
 from ground_service.regression.archives import let_go, remove_unfinished
+from ground_service.regression.service import condition_of_archive
 from ground_service.store import audit, events
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
@@ -39,9 +41,9 @@ _HEAD = re.compile(r"\b([0-9]+):([0-9a-f]{64})\b(?:\W+(?:signature\W+)?([0-9a-f]
 """Number, hash and signature in a line of a file, a JSON document or an e-mail."""
 
 
-def nightly_job_id(utc_ns: int) -> str:
+def nightly_job_id(utc_ns: int, kind: str = "nightly") -> str:
     """Return the id of the nightly job of a day, which makes repeated additions the same job."""
-    return hashlib.sha256(f"nightly {format_utc(utc_ns)[:10]}".encode()).hexdigest()[:32]
+    return hashlib.sha256(f"{kind} {format_utc(utc_ns)[:10]}".encode()).hexdigest()[:32]
 
 
 def plan_job_id(utc_ns: int) -> str:
@@ -93,6 +95,7 @@ def remove_archives(ground: Ground, days: int, limit_mib: int) -> int:
         ground,
         unused_for_ns=days * DAY_NS if days else None,
         limit_octets=limit_mib << 20 if limit_mib else None,
+        condition=partial(condition_of_archive, ground),
     )
     return len(removed)
 

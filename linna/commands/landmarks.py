@@ -1,4 +1,4 @@
-"""`linna landmarks find | list | show | accept | reject | export | upload`: craters learned from flight."""
+"""`linna landmarks find | list | show | accept | reject | export | table | upload`: craters learned from flight."""
 
 from __future__ import annotations
 
@@ -50,6 +50,18 @@ def _export(
     return {"file": str(out), "landmarks": len(accepted), "octets": len(octets)}
 
 
+def _table(service: Client, pass_id: int, *, out: Path) -> dict[str, Any]:
+    from tmtc.tables import table_hash, unpack_catalogue_table
+
+    service.get_onboard_table(pass_id, out)
+    octets = out.read_bytes()
+    return {
+        "file": str(out),
+        "craters": len(unpack_catalogue_table(octets)),
+        "hash": f"{table_hash(octets):08x}",
+    }
+
+
 def _upload(
     service: Client, table: Path, *, transaction: int = 1, instance: str = "flight", spacecraft_id: int
 ) -> dict[str, Any]:
@@ -75,7 +87,7 @@ def _octets(path: Path) -> bytes:
 def _found(one: LandmarkUpdate) -> str:
     return (
         f"pass {one.pass_id}: {one.unmatched} of {one.detections} detections without a crater, {one.places} places, "
-        f"{one.added} new, {one.proposed} landmarks proposed"
+        f"{one.listed} further ones at listed craters, {one.added} new, {one.proposed} landmarks proposed"
     )
 
 
@@ -132,6 +144,12 @@ COMMANDS = {
             "labels": "labels for `linna detector train --landmarks`",
             "spacecraft_id": ONLY,
         },
+    ),
+    "table": Command(
+        _table,
+        "write the anchoring table that was on board at the end of a pass",
+        lambda made: f"{made['file']}: {made['craters']} craters, hash {made['hash']}",
+        options={"pass_id": Option(metavar="PASS"), "out": "file to write"},
     ),
     "upload": Command(
         _upload,

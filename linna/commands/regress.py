@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+import time
 import zipfile
 from collections.abc import Callable, Container
 from pathlib import Path
@@ -49,6 +50,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _archives(baseline)
     option(baseline, "--build BUILD", str, "build", "current")
     _finish(baseline, _baseline)
+    placebo = commands.add_parser(
+        "placebo",
+        help="compare a build with itself, with other noise in the images: do gates reject equal builds?",
+    )
+    _archives(placebo)
+    option(placebo, "--build BUILD", str, "build", "current")
+    option(placebo, "--runs N", int, "number of placebos", 1)
+    option(placebo, "--seed S", int, "seed of the first one (default: the time)", int(time.time()))
+    _finish(placebo, _placebo)
     suite = commands.add_parser(
         "suite", help="show what the passes of the regression suite can detect, or write their archives"
     )
@@ -171,6 +181,25 @@ def _baseline(arguments: argparse.Namespace) -> int:
         figures = service.wait(service.start_analysis(**request).id, progress=_percent()).result or {}
     emit(arguments, figures, text=baseline_text(figures))
     return 2 if figures["not_flown"] else 0
+
+
+def _placebo(arguments: argparse.Namespace) -> int:
+    verdicts = []
+    with ground_client(arguments, background=True) as service:
+        request = _comparison(service, arguments, arguments.build, arguments.build)
+        for seed in range(arguments.seed, arguments.seed + arguments.runs):
+            job = service.wait(service.start_regression({**request, "placebo": seed}).id)
+            verdicts.append(service.get_regression(job.id).verdict)
+            log(f"placebo {len(verdicts)} of {arguments.runs}: {verdicts[-1]}")
+        noise = service.list_calibrations()
+    counts = {name: verdicts.count(name) for name in ("fail", "pass", "inconclusive")}
+    told = ", ".join(f"{count} {name}" for name, count in counts.items())
+    figures = {"placebos": counts, "calibrations": [one.model_dump() for one in noise]}
+    return emit(
+        arguments,
+        figures,
+        text="\n".join([told, *(one.text for one in noise if not (one.condition and one.calibrated))]),
+    )
 
 
 def _suite(arguments: argparse.Namespace) -> int:

@@ -271,6 +271,21 @@ def sent_for_pass(connection: Connection, pass_id: int) -> bytes:
     return b"".join(row.octets for row in rows[: last + 1])
 
 
+def sent_parts(connection: Connection, vehicle: int) -> bytes:
+    """Return the telecommand packets of uploads that were sent to a vehicle, in order of release."""
+    query = (
+        select(TELECOMMANDS.c.octets)
+        .where(
+            TELECOMMANDS.c.vehicle_id == vehicle,
+            TELECOMMANDS.c.name.startswith("uplink_"),
+            TELECOMMANDS.c.sent_utc_ns.is_not(None),
+            TELECOMMANDS.c.octets.is_not(None),
+        )
+        .order_by(TELECOMMANDS.c.decided_utc_ns, TELECOMMANDS.c.id)
+    )
+    return b"".join(connection.execute(query).scalars())
+
+
 def states_of_window(connection: Connection, window_id: int) -> set[str]:
     """Return the stored states of the telecommands of a window."""
     query = select(TELECOMMANDS.c.state).where(TELECOMMANDS.c.window_id == window_id)

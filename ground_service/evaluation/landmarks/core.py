@@ -94,15 +94,12 @@ class PassPlaces:
         Number of triangulated catalogued craters.
     offset_m
         Their median offset from the catalogue, east, north, up, that was removed; NaN if nothing was removed.
-    scale
-        Factor of the formal uncertainty.
     """
 
     places: tuple[Place, ...]
     unmatched: int
     controls: int
     offset_m: tuple[float, float, float]
-    scale: float
 
 
 def places_of_pass(
@@ -145,7 +142,6 @@ def places_of_pass(
         len(free),
         len(controls),
         offset,
-        scale,
     )
 
 
@@ -167,6 +163,19 @@ def same_place(one: Place, other: Place) -> bool:
     )
     alike = abs(math.log(one.diameter_m / other.diameter_m)) < math.log(SIZE_RATIO)
     return alike and distance_m(one, other) < reach
+
+
+def is_listed(place: Place, catalogue: CraterCatalogue) -> bool:
+    """Return whether a place is a crater of a catalogue."""
+    near = catalogue.near(place.latitude_rad, place.longitude_rad, REACH * place.diameter_m)
+    columns = (catalogue.latitude_rad[near], catalogue.longitude_rad[near], catalogue.diameter_m[near])
+    return any(
+        same_place(
+            place,
+            replace(place, latitude_rad=lat, longitude_rad=lon, diameter_m=size, sigma_m=(0.0, 0.0, 0.0)),
+        )
+        for lat, lon, size in zip(*(one.tolist() for one in columns), strict=True)
+    )
 
 
 def distance_m(one: Place, other: Place) -> float:
@@ -380,14 +389,14 @@ def _controls(
 
 def _calibration(
     controls: Sequence[tuple[Place, FloatArray, float]], reference_sigma_m: float, frames: Frames
-) -> tuple[tuple[float, float, float], float, FloatArray, float, float]:
-    """Return offset, factor of the formal uncertainty, its further part (3,), and ratio and scatter of diameters."""
+) -> tuple[tuple[float, float, float], FloatArray, FloatArray, float, float]:
+    """Return offset, factors (3,) of the formal uncertainty, its further part (3,), ratio and scatter of diameters."""
     nan = float("nan")
     if len(controls) < CONTROLS_NEEDED:
         height = np.linalg.norm(frames.position_mcmf_m, axis=1) - MOON_RADIUS_M
         range_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
         error = math.hypot(reference_sigma_m, ATTITUDE_SIGMA_RAD * range_m)
-        return (nan, nan, nan), 1.0, np.full(3, error), 1.0, 0.1
+        return (nan, nan, nan), np.ones(3), np.full(3, error), 1.0, 0.1
     offsets = np.array([one[1] for one in controls])
     formal = np.array([one[0].sigma_m for one in controls])
     heights = np.isfinite(offsets[:, 2])
@@ -397,20 +406,26 @@ def _calibration(
     else:
         middle[2] = np.median(offsets[heights, 2])
     left = offsets - middle
-    scale = max(1.0, 1.4826 * float(np.median(np.abs(left[:, :2] / formal[:, :2]))))
+    # The scatter decides, also below the formal uncertainty; that of few craters may be small by chance. It is bounded,
+    # because a crater is matched within half its radius.
+    ratio = (left / formal) ** 2
+    level = np.full(3, float(np.mean(ratio[:, :2])))
+    if np.count_nonzero(heights) >= CONTROLS_NEEDED:
+        level[2] = float(np.mean(ratio[heights, 2]))
+    scale = np.sqrt(level * (1.0 + CONTROLS_NEEDED / len(controls)))
     scatter = 1.4826 * np.median(np.abs(left[:, :2]), axis=0)
     up = 1.4826 * float(np.median(np.abs(left[heights, 2]))) if heights.any() else HEIGHT_SIGMA_M
     error_m = np.array([*scatter, up]) * 1.2533 / math.sqrt(len(controls))  # of a median
-    ratio = np.log([one[2] for one in controls])
-    size = float(np.exp(np.median(ratio)))
-    size_sigma = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
+    sizes = np.log([one[2] for one in controls])
+    size = float(np.exp(np.median(sizes)))
+    size_sigma = 1.4826 * float(np.median(np.abs(sizes - np.median(sizes))))
     return (float(middle[0]), float(middle[1]), float(middle[2])), scale, error_m, size, size_sigma
 
 
 def _calibrated(
     place: Place,
     offset_m: tuple[float, float, float],
-    scale: float,
+    scale: FloatArray,
     error_m: FloatArray,
     size: float,
     size_sigma: float,

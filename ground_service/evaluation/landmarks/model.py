@@ -94,7 +94,10 @@ class LandmarkUpdate(Entity):
     pass_id: int
     detections: int
     unmatched: int = Field(description="Detections that no catalogued crater explains")
-    places: int = Field(description="Places that at least two frames have seen")
+    places: int = Field(description="New places that at least two frames have seen")
+    listed: int = Field(
+        description="Further places: craters that the catalogue of the pass lacks and the full list has"
+    )
     controls: int = Field(description="Catalogued craters that calibrate the pass")
     offset_east_m: float | None = Field(
         description="Offset of these craters that was removed; null: none was"

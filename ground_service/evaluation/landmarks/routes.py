@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fastapi import Response
+
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.evaluation.landmarks import service, store
 from ground_service.evaluation.landmarks.model import (
@@ -48,3 +50,13 @@ def reject_landmark(
 def find_landmarks(ground: GroundOf, caller: Operator, pass_id: PassId) -> LandmarkUpdate:
     """Search a pass for landmarks and enter them; what the pass said before is replaced."""
     return service.update_landmarks(ground, pass_id)
+
+
+@landmarks.get(
+    "/passes/{pass_id}/anchoring-table",
+    response_class=Response,
+    responses={200: {"content": {"application/octet-stream": {}}, "description": "The table"}},
+)
+def get_onboard_table(ground: GroundOf, _: Viewer, pass_id: PassId) -> Response:
+    """Return the anchoring table that was on board at the end of a pass."""
+    return Response(service.onboard_table(ground, pass_id), media_type="application/octet-stream")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
-from ground_service.errors import EvaluationError
+from ground_service.contacts.commanding.store import sent_parts
+from ground_service.errors import EvaluationError, NotFound
 from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.inputs import load_pass_inputs
@@ -21,6 +24,7 @@ from ground_service.evaluation.landmarks.core import (
     Place,
     combined,
     in_view,
+    is_listed,
     is_persistent,
     places_of_pass,
     same_place,
@@ -36,10 +40,21 @@ from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.events import LandmarkChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
+from ground_service.missions.catalogues import listed_craters
+from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
 from ground_service.passes.images import list_images
+from ground_service.passes.sample_store import sample_arrays
 from ground_service.passes.samples import DetectionSamples
+from ground_service.passes.span import pass_span
+from ground_service.store.stored_files import files_beginning
 from ground_service.store.vehicles import get_vehicle
+from tmtc.dictionary import DICTIONARY
+from tmtc.errors import TmtcError
+from tmtc.large_data import LargeDataReceiver
+from tmtc.packets import TYPE_TELECOMMAND
+from tmtc.stream import cut_packets
+from tmtc.tables import table_hash, unpack_catalogue_table
 
 DECIDED = ("accepted", "rejected")
 
@@ -54,8 +69,14 @@ def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
     """
     inputs = load_pass_inputs(ground, pass_id)
     found, frames = _places(inputs)
-    with ground.database.writing() as connection:
+    with ground.database.reading() as connection:
         record = passes.get_pass(connection, pass_id)
+        mission = mission_of_pass(connection, record.mission_id, record.manifest)
+    lists = listed_craters(ground, mission)
+    new = tuple(one for one in found.places if not any(is_listed(one, catalogue) for catalogue in lists))
+    listed = len(found.places) - len(new)
+    found = replace(found, places=new)
+    with ground.database.writing() as connection:
         spacecraft = get_vehicle(connection, record.vehicle_id).ccsds_id
         store.lock_landmarks(connection, spacecraft)
         added = _entered(connection, spacecraft, pass_id, found, frames, inputs.detections)
@@ -67,6 +88,7 @@ def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
         detections=len(inputs.detections.u_px),
         unmatched=found.unmatched,
         places=len(found.places),
+        listed=listed,
         controls=found.controls,
         offset_east_m=east if math.isfinite(east) else None,
         offset_north_m=north if math.isfinite(north) else None,
@@ -107,6 +129,41 @@ def decide_landmark(
             LandmarkChanged(spacecraft_id=decided.spacecraft_id, pass_id=None, proposed=proposed),
         )
     return get_landmark(ground, landmark_id)
+
+
+def onboard_table(ground: Ground, pass_id: int) -> bytes:
+    """Return the anchoring table that was on board at the end of a pass, of the hash that housekeeping reports.
+
+    It is a file of an archive, or was uploaded by telecommands.
+
+    Raises
+    ------
+    NotFound
+        No housekeeping reports it, or the ground has no table of this hash.
+    """
+    with ground.database.reading() as connection:
+        record = passes.get_pass(connection, pass_id)
+        span = pass_span(connection, record)
+        reported = sample_arrays(connection, span, "housekeeping", ("catalogue_hash",))["catalogue_hash"]
+        if len(reported) == 0:
+            raise NotFound("housekeeping of pass", pass_id)
+        identity = f"{int(reported[-1]):08x}"
+        archived = [ground.files.get(one) for one in files_beginning(connection, identity)]
+        uploaded = list(uploaded_tables(sent_parts(connection, record.vehicle_id)))
+    for octets in (*archived, *uploaded):
+        with suppress(TmtcError):
+            if f"{table_hash(octets):08x}" == identity and len(unpack_catalogue_table(octets)):
+                return octets
+    raise NotFound("archived or uploaded anchoring table of the reported hash", identity)
+
+
+def uploaded_tables(telecommands: bytes) -> Iterator[bytes]:
+    """Yield the tables that telecommand packets upload."""
+    receiver, cut = LargeDataReceiver(), cut_packets(telecommands, packet_type=TYPE_TELECOMMAND)
+    for start, length in zip(cut.offsets.tolist(), cut.lengths.tolist(), strict=True):
+        command = DICTIONARY.unpack_command(telecommands[start : start + length])
+        if command.name.startswith("uplink_") and (whole := receiver.accept(command.name, command.values)):
+            yield whole.octets
 
 
 def _places(inputs: PassInputs) -> tuple[PassPlaces, Frames]:

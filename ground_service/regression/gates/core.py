@@ -466,9 +466,7 @@ def _decided(
     if loss - reach * error > claim:
         return replace(gate, outcome=FAIL)
     if by_pass and change.units < FEWEST_PASSES:
-        told = (
-            f"{_size(change, metric)} on {change.units} passes, which inform only; {FEWEST_PASSES} judge it"
-        )
+        told = f"{_size(change, metric)}; fewer than {FEWEST_PASSES} passes inform only"
         return replace(gate, outcome=NOT_JUDGED, reason=told)
     if few:
         needed = math.ceil(frames * FEWEST_TRACKS / max(change.units, 1))

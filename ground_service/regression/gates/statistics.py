@@ -160,6 +160,13 @@ def student_upper_tail(t: float, freedom: float) -> float:
     return float(special.stdtr(freedom, -t))
 
 
+def binomial_upper_tail(count: int, trials: int, rate: float) -> float:
+    """Return the probability that a binomial of this rate reaches a count above 0."""
+    from scipy import special
+
+    return float(special.bdtrc(count - 1, trials, rate))
+
+
 def frames_needed(frames: int, error: float, distance: float, reach: float) -> int | None:
     """Return the number of similar frames whose error is `distance` over `reach` quantiles; None if unknown.
 

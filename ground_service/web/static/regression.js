@@ -110,7 +110,7 @@ const passWithout = (pass) =>
   element("label", {}, element("input", { type: "checkbox", disabled: true }), element("span", {}, element("a", { href: `/passes/${pass.id}` }, `pass ${pass.id}, ${pass.name}`), ": no archive is kept; upload it below"));
 
 async function load() {
-  const [found, archives, passes] = await Promise.all([get("builds", { limit: 200 }), get("regression-archives"), get("passes", { limit: 200 })]);
+  const [found, archives, passes, calibrations] = await Promise.all([get("builds", { limit: 200 }), get("regression-archives"), get("passes", { limit: 200 }), get("calibrations")]);
   builds = found.items;
   const chosen = { candidate: byId("candidate").value, baseline: byId("baseline").value };
   for (const name of ["candidate", "baseline"]) {
@@ -133,6 +133,22 @@ async function load() {
       ],
       builds,
       "No build registered.",
+    ),
+  );
+  show(
+    "placebos",
+    table(
+      "Placebos",
+      [
+        ["Gate", (row) => row.metric.replaceAll("_", " ")],
+        ["Passes", (row) => row.condition || "all"],
+        ["Rejected", (row) => `${figure(row.rejected)} of ${figure(row.placebos)}`, "num"],
+        ["Allowed share", (row) => figure(row.level), "num"],
+        ["Spread", (row) => figure(row.spread), "num"],
+        ["State", (row) => stateMark(row.calibrated ? "calibrated" : "uncalibrated")],
+      ],
+      calibrations,
+      "No placebo has been run.",
     ),
   );
   await loadRegressions();

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,12 +37,13 @@ from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
-from ground_service.regression.model import ArchiveRecord, Comparison, KeptReplay
+from ground_service.regression.model import ArchiveRecord, Comparison, KeptArchive, KeptReplay
 from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_pass, keep_pass
 from ground_service.regression.service import find_replay, run_regression
 from ground_service.worker.automation.model import ActionFilter
 from ground_service.worker.automation.store import list_automation_actions
 from linna.commands import regress
+from lunar.datafolder import find_data
 from tests.ground_service.conftest import (
     SPACECRAFT,
     START,
@@ -380,6 +382,51 @@ def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
     write_flight_view(folder, tmp_path / "partial")
     assert (tmp_path / "partial/payload/detections.jsonl").is_file()
     assert not (tmp_path / "partial/frames").exists()
+
+
+def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(
+    flown: FlyablePass, tmp_path: Path
+) -> None:
+    images, hashes = [], []
+    for k, seed in enumerate((5, 5, 6)):
+        view = tmp_path / str(k)
+        write_flight_view(flown.folder, view, noise=seed)
+        images.append(np.asarray(Image.open(view / "frames/000001.png"), dtype=float))
+        rows = [json.loads(line) for line in (view / "payload/inputs.jsonl").read_text().splitlines()]
+        hashes.append(next(row["pixels_sha256"] for row in rows if row["frame"] == 1))
+    assert hashes[0] == hashlib.sha256(images[0].astype(np.uint8).tobytes()).hexdigest()
+    assert hashes[0] == hashes[1] != hashes[2]
+    one, _, other = (image - 90.0 for image in images)
+    # Noise of 1 DN, rounded: variance 1 + 1/12.
+    assert np.var(one) == pytest.approx(13 / 12, rel=0.02) == np.var(other)
+    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
+
+
+def test_archives_of_one_regression_are_rendered_at_the_same_time(
+    ground: Ground, make_flyable: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    digests = [keep_archive(ground, make_flyable(frames=4, seed=seed).folder).digest for seed in (1, 2)]
+    both, settle = threading.Barrier(2, timeout=20.0), service.settle_archive
+
+    def rendered(ground: Ground, digest: str) -> KeptArchive:
+        both.wait()  # broken if the second archive waits for the first one
+        return settle(ground, digest)
+
+    monkeypatch.setattr(service, "settle_archive", rendered)
+    monkeypatch.setattr(service, "fly_shards", lambda *_, **__: None)
+    build = register_build(ground, load_build("current"))
+    outcome = run_regression(ground, digests, build, build, load_policy(), workers=2)
+    assert [one.detail for one in outcome.passes] == 2 * ["it was not flown"]
+
+
+def test_data_products_that_are_mounted_later_are_noticed(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    with open_ground(tmp_path / "home", find_data(tmp_path / "data")) as ground:
+        assert ground.data.catalogue_lu is None
+        (tmp_path / "data/craters").mkdir()
+        listed = tmp_path / "data/craters/lu1319381.csv"
+        listed.touch()
+        assert ground.data.catalogue_lu == listed
 
 
 def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_known(

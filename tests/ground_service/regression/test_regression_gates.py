@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
     COSTS,
     FEWEST_PASSES,
@@ -256,7 +257,7 @@ def test_position_errors_are_judged_by_passes_from_ten_on() -> None:
     fewer = judge(suite(0, FEWEST_PASSES - 1), suite(1, FEWEST_PASSES - 1, error=1.2), POLICY)
     gate = by_name(fewer)["navigation.anchored.p50"]
     assert gate.outcome == "not judged"
-    assert gate.reason.endswith("% on 9 passes, which inform only; 10 judge it")
+    assert gate.reason.endswith("%; fewer than 10 passes inform only")
     assert PASS_SPREAD / 3.0 > 0.1 and verdict_of(fewer) == "pass"
 
 
@@ -374,6 +375,37 @@ def test_a_look_that_is_not_the_last_applies_the_sizes_of_the_plan_and_its_share
     # Identical so far is no proof of what follows.
     same = by_name(judge(suite(0, 2), suite(0, 2), POLICY, look=early))["detector.recall"]
     assert same.reason != "identical in every octet"
+
+
+def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metric_is_uncalibrated() -> None:
+    before, after = suite(0, 60), suite(1, 60)
+    noise = [
+        one
+        for name in before
+        for one in pass_noise(before[name], after[name], POLICY, "sparse" if name < "pass 3" else "cratered")
+    ]
+    found = {(one.metric, one.condition): one for one in calibrations(noise)}
+    recall = found["detector.recall", ""]
+    assert recall.calibrated and recall.placebos == 60 and 0.3 < recall.mean_square < 2.0
+    assert recall.rejected <= largest_count(60, 0.05)
+    parts = [found["detector.recall", kind].placebos for kind in ("cratered", "sparse")]
+    assert sum(parts) == 60 and min(parts) > 20
+    worse = [one.model_copy(update={"p_value": 0.01}) if k < 60 else one for k, one in enumerate(noise)]
+    told = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
+    assert not told.calibrated
+    assert told.text == f"uncalibrated: detector.recall: {told.rejected} of 60 placebos rejected at 0.05"
+
+
+def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail() -> None:
+    gates = judge(suite(0, 1), {"pass 0": replace(simulated(0, 1), undecodable=1)}, POLICY)
+    noise = gate_noise(gates, POLICY)
+    assert gate_noise([], POLICY) == []
+    rows = {one.metric: one.p_value for one in noise}
+    assert rows["telemetry.undecodable"] == rows["verdict"] == 0.0 < rows["memory"]
+    assert "latency.total" not in rows  # not measured
+    assert all(one.calibrated for one in calibrations(noise))  # one failure may be chance
+    doubted = {one.metric for one in calibrations(2 * noise) if not one.calibrated}
+    assert doubted == {"telemetry.undecodable", "verdict"}
 
 
 def test_a_position_without_a_reference_is_a_value() -> None:

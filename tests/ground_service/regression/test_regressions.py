@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from sqlalchemy import Connection, select
 
 from benchmarks.gate_error_rates import each, late_headers, late_states, longer_packet, with_values
 from ground_service.client.local import local_client
@@ -33,18 +34,23 @@ from ground_service.regression.documents import (
     regression_junit,
     regression_report,
     regression_text,
+    stretched,
     verdict_document,
 )
 from ground_service.regression.gates.core import GatePolicy
 from ground_service.regression.gates.policy import load_policy
-from ground_service.regression.model import TELEMETRY_ONLY, KeptReplay
+from ground_service.regression.model import TELEMETRY_ONLY, ArchiveRecord, KeptReplay
 from ground_service.regression.outcome import RegressionOutcome
+from ground_service.regression.placebo import run_placebo
 from ground_service.regression.service import (
+    calibrations_of,
+    condition_of_archive,
     find_replay,
     keep_regression,
     run_regression,
 )
-from ground_service.regression.store import ARCHIVES
+from ground_service.regression.store import ARCHIVES, REPLAYS, get_archive
+from ground_service.regression.store import keep_archive as store_archive_record
 from ground_service.settings import Settings
 from ground_service.store.states import change_if
 from ground_service.worker.upkeep import DAY_NS, remove_archives
@@ -107,6 +113,10 @@ def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callabl
     return run
 
 
+def replays(connection: Connection) -> list[Any]:
+    return list(connection.execute(select(REPLAYS.c.id, REPLAYS.c.downlink_sha256)))
+
+
 def failed(outcome: RegressionOutcome) -> set[str]:
     return {gate.name for gate in outcome.gates if gate.outcome == "fail" and not gate.waived}
 
@@ -138,10 +148,8 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) ->
     outcome = judge(network_ms=20.0)
     (latency,) = [gate for gate in outcome.gates if gate.name == "latency.total"]
     assert (outcome.verdict, latency.outcome) == ("pass", "not judged")
-    assert (
-        "2 passes were not replayed by both builds at the same time: no latency is compared"
-        in outcome.remarks
-    )
+    told = "no latency is compared on 2 of 2 passes: the builds were not replayed at the same time"
+    assert told in outcome.remarks
     one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
     changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
     beside = [one.beside(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
@@ -235,6 +243,35 @@ def test_a_sequence_ends_when_the_verdict_is_clear_or_the_time_is_used(
     whole = run_regression(home, folders, same, base, policy, workers=2, minutes=60.0)
     assert (whole.verdict, len(whole.passes)) == ("pass", 2)
     assert whole.remarks[-1].endswith("pass after 2 of 2 passes (0.75 of the level)")
+
+
+def test_a_placebo_leaves_the_noise_of_its_metrics_and_marks_gates_that_reject_equal_builds(
+    judge, home: Ground, passes: list[Any], packets: Packets, make_build: Callable, policy: Any
+) -> None:
+    build = register_build(home, load_build(make_build("itself", packets)))
+    digests = [keep_archive(home, one.folder).digest for one in passes]
+    before = home.read(replays)
+    outcome = run_placebo(home, digests, build, policy, 7, workers=2)
+    assert (outcome.verdict, outcome.baseline, outcome.candidate) == ("pass", build, build)
+    assert outcome.remarks[-1].endswith("other noise in the images, seed 7")
+    recall = [one for one in outcome.noise if one.metric == "detector.recall"]
+    assert [(one.loss, one.condition.split(", ")[1]) for one in recall] == 2 * [(0.0, "above 25 km")]
+    # No replay is kept; the files that an archive has are, also if the placebo sent the same octets.
+    assert home.read(replays) == before
+    check_out(home, digests[0], passes[0].folder.parent / "again")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("ground_service.regression.service.publish", publish := MagicMock())
+        keep_regression(home, outcome)
+    publish.assert_not_called()  # nobody is notified
+    assert all(one.calibrated for one in calibrations_of(home))
+    recall = [one.model_copy(update={"p_value": 0.0}) for one in recall]
+    for _ in range(2):
+        keep_regression(home, dataclasses.replace(outcome, noise=tuple(recall)))
+    told = "uncalibrated: detector.recall: 4 of 6 placebos rejected at 0.05"
+    marked = judge()
+    (gate,) = [gate for gate in marked.gates if gate.name == "detector.recall"]
+    assert gate.reason == f"identical in every octet; {told}" and told in marked.remarks
+    assert verdict_document(marked).headline == "pass: identical in every octet on 60 frames"
 
 
 def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy: Path) -> None:
@@ -370,6 +407,8 @@ def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, pac
         assert one.baseline.caption == "baseline: detected"
         assert one.candidate.caption == "candidate: not detected"
     assert [one.first_difference for one in report.passes] == [0, 0]
+    dark = stretched(np.arange(10, 30, dtype=np.uint8).reshape(4, 5))
+    assert (dark.min(), dark.max()) == (0, 255) and np.ptp(np.diff(dark.ravel()[1:-1].astype(int))) <= 1
     assert "tracks of craters lost" in page and "Left the baseline, right the candidate" in page
     assert len(keep_regression(home, outcome)) == 32
 
@@ -425,6 +464,21 @@ def test_archives_go_by_age_and_by_size_with_a_record(passes, ground: Ground) ->
     assert removals[1].detail["octets"] == octets[first.digest]
 
 
+def test_the_archive_of_a_rare_condition_outlasts_one_that_was_used_later(passes, ground: Ground) -> None:
+    kept = [keep_archive(ground, passes[0].folder).digest]
+    for name in "xyz":
+        add = ArchiveRecord(**ground.read(get_archive, kept[0]).model_dump() | {"digest": name})
+        with ground.database.writing() as connection:
+            store_archive_record(connection, add)
+    place = {kept[0]: "sparse", "x": "cratered", "y": "cratered", "z": "cratered"}
+    octets = kept_archives(ground)[0].octets
+    assert let_go(ground, unused_for_ns=None, limit_octets=2 * octets, condition=place.__getitem__) == [
+        "x",
+        "y",
+    ]
+    assert condition_of_archive(ground, kept[0]) == "cratered, above 25 km"
+
+
 def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LINNA_ARCHIVE_DAYS", "400")
     monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
@@ -434,12 +488,14 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
         "archive_days": 400,
         "archive_limit_mib": 2000,
         "audit_heads": None,
+        "placebo_passes": 3,
     }
     with pytest.MonkeyPatch.context() as patched:
         called = MagicMock(return_value=[])
         patched.setattr("ground_service.worker.upkeep.let_go", called)
         assert remove_archives(MagicMock(), kept["archive_days"], kept["archive_limit_mib"]) == 0
-    assert called.call_args.kwargs == {"unused_for_ns": 400 * DAY_NS, "limit_octets": 2000 << 20}
+    kept_for = {"unused_for_ns": 400 * DAY_NS, "limit_octets": 2000 << 20}
+    assert kept_for.items() <= called.call_args.kwargs.items()
 
 
 def test_a_registered_build_is_found_by_the_beginning_of_its_identity(

@@ -8,11 +8,14 @@ import textwrap
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
 from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
+from ground_service.regression import jobs
+from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY
 from ground_service.store import leases
 from ground_service.worker import scheduler as scheduling
 from ground_service.worker.scheduler import LEASE, LEASE_NS, Scheduler, has_scheduler
@@ -33,7 +36,7 @@ class Recorder:
         self.resumed += 1
 
     def submit(self, kind: str, arguments: object, *, job_id: str | None = None) -> str:
-        assert kind in ("nightly", "plan")
+        assert kind in ("nightly", "plan", "regression")
         self.submitted.append(job_id)
         return str(job_id)
 
@@ -99,6 +102,30 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(
         one.tick()
         assert len(work.submitted) == entered, minute
     assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
+
+
+def test_each_night_a_placebo_takes_kept_archives_by_turns(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = [MagicMock(digest=f"{k}" * 64, state=COMPLETE if k else TELEMETRY_ONLY) for k in range(5)]
+    monkeypatch.setattr(jobs, "kept_archives", lambda ground: kept)
+    chosen = []
+    for night in range(3):
+        now = parse_utc(f"2029-08-0{7 + night}T00:40:00Z")
+        monkeypatch.setattr(jobs, "utc_now_ns", lambda now=now: now)
+        placebo = jobs.nightly_placebo(ground, 3)
+        assert placebo is not None and placebo["candidate"] == placebo["baseline"]
+        assert placebo["placebo"] == now // DAY_NS
+        chosen.append({one[0] for one in placebo["archives"]})
+    assert [len(one) for one in chosen] == [3, 3, 3] and chosen[0] | chosen[1] == set("1234")
+    assert chosen[0] != chosen[1] != chosen[2] and jobs.nightly_placebo(ground, 0) is None
+    monkeypatch.setattr(scheduling, "utc_now_ns", lambda: now)
+    monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
+    work = Recorder()
+    Scheduler(ground, work, lambda: None, {"retention_days": 90, "placebo_passes": 3}).tick()
+    assert work.submitted == [nightly_job_id(now), nightly_job_id(now, "placebo")]
+    kept.clear()
+    assert jobs.nightly_placebo(ground, 3) is None
 
 
 @pytest.mark.parametrize("hourly", [False, True])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.landmarks.service import decide_landmark
+from ground_service.evaluation.landmarks.service import decide_landmark, uploaded_tables
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
@@ -25,10 +25,6 @@ from lunar.datafolder import DataFolder
 from payload_emulator.session.replay import FlightBuild, replay_archive
 from payload_emulator.session.suite import suite_scenarios, write_suite
 from tests.ground_service.conftest import write_manifest
-from tmtc.dictionary import DICTIONARY
-from tmtc.large_data import LargeDataReceiver
-from tmtc.packets import TYPE_TELECOMMAND
-from tmtc.stream import cut_packets
 from tmtc.tables import pack_catalogue_table, unpack_catalogue_table
 
 SCENARIO = "suite-real-sun"
@@ -107,7 +103,7 @@ def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) 
     for one in queued["telecommands"]:
         linna("command", "release", one, "--as", "bob")
     linna("command", "uplink", "--spacecraft-id", 76, "--format", "packets", "--out", folder / "uplink.bin")
-    onboard = _received((folder / "uplink.bin").read_bytes())
+    [onboard] = uploaded_tables((folder / "uplink.bin").read_bytes())
     assert onboard == (folder / "new.bin").read_bytes()
     assert len(unpack_catalogue_table(onboard)) == len(old) + learned.proposed - 1 == queued["craters"]
 
@@ -121,6 +117,10 @@ def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) 
         ids = [import_archive(ground, one) for one in archives]
         unaware, aware = (pass_summary(ground, one)["detector"]["precision"] for one in ids)
         used = [_matched(ground, one) for one in ids]
+    for one, name in zip(ids, ("old.bin", "new.bin"), strict=True):
+        made = linna("landmarks", "table", one, "--out", folder / "onboard.bin")
+        assert (folder / "onboard.bin").read_bytes() == (folder / name).read_bytes()
+        assert made["craters"] == len(unpack_catalogue_table((folder / name).read_bytes()))
     assert used[1] > 2 * used[0] > 0
     assert aware > 0.8 > 0.3 > unaware
     after = linna("landmarks", "find", ids[1])["passes"][0]
@@ -154,14 +154,3 @@ def _matched(ground: Ground, pass_id: int) -> int:
     """Return the number of landmarks that the anchored estimator used in all frames."""
     [anchored] = [one for one in load_pass_inputs(ground, pass_id).navigation if one.estimator == "anchored"]
     return int(anchored.matched.sum())
-
-
-def _received(octets: bytes) -> bytes:
-    """Return the table that the parts in telecommand packets give on board."""
-    receiver, cut = LargeDataReceiver(), cut_packets(octets, packet_type=TYPE_TELECOMMAND)
-    for start, length in zip(cut.offsets.tolist(), cut.lengths.tolist(), strict=True):
-        command = DICTIONARY.unpack_command(octets[start : start + length])
-        whole = receiver.accept(command.name, command.values)
-        if whole is not None:
-            return whole.octets
-    raise AssertionError("the transfer is not complete")
