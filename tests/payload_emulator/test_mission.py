@@ -14,7 +14,13 @@ from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.session.mission import mission_text, trained_ground, unseen_share
+from payload_emulator.session.mission import (
+    OPERATIONS,
+    live_mission_text,
+    mission_text,
+    trained_ground,
+    unseen_share,
+)
 from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
@@ -114,6 +120,25 @@ def test_ground_is_seen_where_the_recipe_of_the_shipped_detector_looked(
 ) -> None:
     place = np.array([latitude_deg]), np.array([longitude_deg])
     assert any(region.contains(*place).all() for region in trained_ground()) is seen
+
+
+def test_what_windows_need_is_stated(world) -> None:
+    """The light, and the tables that the ground uploads for each estimator."""
+    scenario = world.scenario
+    for mode, needed in (("paper", False), ("real", True)):
+        lit = replace(world, scenario=replace(scenario, light=replace(scenario.light, mode=mode)))
+        assert parse_mission(mission_text(lit, DataFolder())).observation.needs_daylight is needed
+    for estimators, tables in (
+        (("spherical", "anchored"), ("orientation", "anchor_ephemeris", "initial_state")),
+        (("anchored",), ("orientation", "initial_state")),
+        (("paper",), ("anchor_ephemeris",)),
+    ):
+        navigation = replace(scenario.navigation, estimators=estimators)
+        flown = replace(world, scenario=replace(scenario, navigation=navigation))
+        text = live_mission_text(flown, DataFolder(), "127.0.0.1", {"earth": (1, 2)}, OPERATIONS)
+        stated = parse_mission(text)
+        assert stated.uploads is not None and stated.uploads.tables == tables
+        assert stated.time.correlation == "automatic" and stated.critical_in_windows == ()
 
 
 class RealTerrain:
