@@ -1,7 +1,7 @@
 """`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
 
-Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load,
-loss, locks, campaigns) has a command of its own and is not in this list.
+Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load and
+campaigns) has a command of its own and is not in this list.
 """
 
 import argparse

@@ -47,10 +47,7 @@ def describe(found: PassFigures) -> str:
 
 
 def requirement_lines(requirements: list[dict[str, Any]]) -> list[str]:
-    """Return the judged requirements as lines of text, failures first, with what is noted on those not met.
-
-    Those of the experiment are marked: the verdict of operations does not count them.
-    """
+    """Return the judged requirements as lines of text, failures first, those of the experiment marked."""
     order = ("not met", "unknown", "met")
     judged = [one for one in requirements if one["status"] in order]
     marks = {"experiment": "experiment, "}
