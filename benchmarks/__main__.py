@@ -1,6 +1,6 @@
 """`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
 
-Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load and
+Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load,
 campaigns) has a command of its own and is not in this list.
 """
 
