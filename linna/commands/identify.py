@@ -97,11 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         + rows["all sets of four"].wrong
         + sum(one.fixes for one in hostile),
         "searches": len(single) + len(sets) + sum(one.searches for one in hostile),
-        "hostile": [
-            asdict(one) | {"least_log10_false": least if math.isfinite(least) else None}
-            for one in hostile
-            for least in (one.least_log10_false,)
-        ],
+        "hostile": [_hostile_as_json(one) for one in hostile],
         "scores": {name: _as_json(row) for name, row in rows.items()},
         "by_altitude": [
             {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}
@@ -153,6 +149,11 @@ def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Sha
         f"{name:<24}{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
         for name, row in named
     ]
+
+
+def _hostile_as_json(one: Any) -> dict[str, Any]:
+    least = one.least_log10_false
+    return asdict(one) | {"least_log10_false": least if math.isfinite(least) else None}
 
 
 def _as_json(row: Share) -> dict[str, Any]:

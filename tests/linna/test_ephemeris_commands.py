@@ -49,7 +49,7 @@ def error_line(capsys, *arguments):
     assert cli.run([*map(str, arguments)]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    (line,) = [line for line in captured.err.strip().splitlines() if line.startswith("linna: error: ")]
+    (line,) = [line for line in captured.err.strip().splitlines() if ": error: " in line]
     return line
 
 

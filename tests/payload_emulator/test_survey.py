@@ -145,8 +145,8 @@ def test_windows_over_the_region_are_flown_and_a_finished_seed_is_not_flown_agai
     ("words", "expected"),
     [
         (("--region", "5"), "--region: expected four numbers"),
-        (("--region", "0,10,0,10", "--seeds", "0"), "--seeds: expected 1 or more, found 0"),
-        (("--region", "0,10,0,10", "--windows", "0"), "--windows: expected 1 or more, found 0"),
+        (("--region", "0,10,0,10", "--seeds", "0"), "--seeds: expected a number from 1, found '0'"),
+        (("--region", "0,10,0,10", "--windows", "0"), "--windows: expected a number from 1, found '0'"),
     ],
 )
 def test_bad_options_are_one_line(survey_of, words: tuple[str, ...], expected: str) -> None:

@@ -78,7 +78,7 @@ def test_passes_chosen_on_the_list_are_compared_side_by_side(view):
     high = [one["conditions"]["altitude_km"] for one in figures]
     first, second, change = row(view, "Altitude, km")
     assert [float(first), float(second)] == pytest.approx(high, rel=6e-3) and change[0] in "±+−"
-    assert row(view, "Sun elevation, deg") == ["–", "–", "–"]
+    assert row(view, "Sun elevation, deg") == ["unknown", "unknown", ""]
     expect(view.locator("#figures thead")).to_contain_text("synthetic pass (2)")
     assert row(view, "Frames") == ["40", "30", "−10"]
     verdicts = row(view, "Verdict")
