@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         + rows["all sets of four"].wrong
         + sum(one.fixes for one in hostile),
         "searches": len(single) + len(sets) + sum(one.searches for one in hostile),
-        "hostile": [_hostile_as_json(one) for one in hostile],
+        "hostile": [*map(_hostile_as_json, hostile)],
         "scores": {name: _as_json(row) for name, row in rows.items()},
         "by_altitude": [
             {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}

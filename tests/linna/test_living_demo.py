@@ -22,7 +22,7 @@ from tests.serving import wait_for
 def test_a_part_that_ends_is_named_after_the_documents_were_posted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, client, said = tmp_path / "demo", MagicMock(), list[str]()
+    folder, client, said = tmp_path / "demo", MagicMock(), []
     client.__enter__.return_value = client
 
     def written(*_: object) -> str:
@@ -43,7 +43,7 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
     posted = [name for name, _, _ in client.method_calls]
     assert posted == ["add_catalogue", "add_mission", "add_ephemeris", "add_request"]
     client.add_request.assert_called_once_with({"windows": 12})
-    assert said[-1] == "http://127.0.0.1:8042/ shows the shift at 60 times real time; Ctrl-C ends"
+    assert said.pop() == "http://127.0.0.1:8042/ shows the shift at 60 times real time; Ctrl-C ends"
     with pytest.raises(ScenarioError, match="expected a new folder for a living demo, found one with files"):
         living.living_demo(*demo)
 
