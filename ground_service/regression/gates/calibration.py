@@ -35,7 +35,7 @@ from ground_service.regression.model import Calibration, Noise
 
 PLACEBO_LEVEL = 0.05
 DOUBT = 1e-3
-"""Small, because the rejections are counted anew after every placebo."""
+"""Small, because the rejections are counted again after every placebo."""
 
 VERDICT = "verdict"
 
