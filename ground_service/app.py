@@ -89,7 +89,8 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             app.state.dispatcher.start(job)
         if inline_jobs or settings.resolved_broker_url() is None:
             app.state.dispatcher.resume()
-        app.state.follow_up.drain()
+        if inline_jobs or ground.database.dialect == "sqlite":
+            app.state.follow_up.drain()  # otherwise the scheduler does: no start waits for the backlog of others
         clock = ExitStack()
         clock.enter_context(mission_clock(ground))
         supervisor = LinkSupervisor(ground) if settings.links else None

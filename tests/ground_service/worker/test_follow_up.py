@@ -5,12 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy import select, update
 
 from ground_service import events
+from ground_service.app import create_app
 from ground_service.errors import StorageFull
 from ground_service.evaluation.model import ChangedFigure
 from ground_service.evaluation.service import changed_figures, make_report
@@ -27,6 +30,7 @@ from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
 from ground_service.passes.service import define_pass
+from ground_service.settings import Settings
 from ground_service.store import events as log
 from ground_service.store import repository
 from ground_service.worker import follow_up
@@ -196,6 +200,22 @@ def test_several_processes_handle_each_event_once(
     assert position(grounds[0]) == 24
     for ground in grounds:
         ground.close()
+
+
+def test_a_service_starts_while_another_process_handles_a_backlog(
+    migrated_postgres: Callable[[], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def waits(_seconds: float) -> None:
+        raise AssertionError("the start waits for another process")
+
+    url = migrated_postgres()
+    settings = Settings(home=tmp_path / "home", database_url=url, allow_database_owner=True)
+    with open_ground(tmp_path / "other", database_url=url) as other, other.database.alone("events") as alone:
+        assert alone
+        say(other, CommandsSent(vehicle_id=1, telecommands=(1,)))
+        monkeypatch.setattr(follow_up, "time", SimpleNamespace(sleep=waits))
+        with TestClient(create_app(settings)):
+            assert position(other) == 0
 
 
 def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, recorded: Recorded) -> None:
