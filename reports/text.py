@@ -52,6 +52,12 @@ def count_text(count: int | None) -> str:
     return NOT_A_VALUE if count is None else f"{count:,}".replace(",", THIN_SPACE)
 
 
+def counted(count: int, units: str) -> str:
+    """Return a count and its units, stated in the plural: 1 pass, 2 passes."""
+    one = units.removesuffix("es") if units.endswith("sses") else units.removesuffix("s")
+    return f"{count} {one if count == 1 else units}"
+
+
 def computed_text(count: int | None, absent: str = "not computed") -> str:
     """Return a count with thin spaces between thousands, or a text if it was not computed."""
     return absent if count is None else count_text(count)

@@ -10,6 +10,7 @@ from ground_service.regression.gates.metrics import metrics_of
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.gates.statistics import joined_sums, ratio_error
 from ground_service.regression.outcome import RegressionOutcome, pass_figures
+from reports.text import counted
 
 
 def baseline_figures(outcome: RegressionOutcome) -> dict[str, Any]:
@@ -40,7 +41,7 @@ def baseline_figures(outcome: RegressionOutcome) -> dict[str, Any]:
 
 def baseline_text(figures: dict[str, Any]) -> str:
     """The figures of the suite as lines."""
-    lines = [f"{figures['build']['name']} over {len(figures['passes'])} passes"]
+    lines = [f"{figures['build']['name']} over {counted(len(figures['passes']), 'passes')}"]
     for name, row in figures["suite"].items():
         if row["value"] is None:
             continue

@@ -80,8 +80,8 @@ def _name(gate: Gate) -> str:
 
 def _figures(gate: Gate) -> str:
     change = gate.candidate - gate.baseline
-    figures = f"({gate.baseline:.3g} to {gate.candidate:.3g} {gate.unit}".rstrip()
-    return f"{'rises' if change > 0.0 else 'falls'} by {abs(change):.3g} {figures})"
+    size = f"{abs(change):.3g} {gate.unit}".rstrip()
+    return f"{'rises' if change > 0.0 else 'falls'} by {size} ({gate.baseline:.3g} to {gate.candidate:.3g})"
 
 
 def _navigation(gates: Sequence[Gate]) -> str:

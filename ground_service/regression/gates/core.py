@@ -60,6 +60,7 @@ from ground_service.regression.gates.statistics import (
     student_quantile,
     student_upper_tail,
 )
+from reports.text import counted
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
@@ -437,7 +438,7 @@ def _decided(
     limit = change.baseline * math.exp(sign * margin) if metric.relative else change.baseline + sign * margin
     gate = Gate(
         metric.name, INCONCLUSIVE, change.baseline, change.candidate, stated, limit, metric.unit, place,
-        level=level, resolution=math.inf, frames=frames, evidence=f"{change.units} {metric.evidence}",
+        level=level, resolution=math.inf, frames=frames, evidence=counted(change.units, metric.evidence),
     )  # fmt: skip
     if not math.isfinite(change.estimate):
         if math.isfinite(change.baseline):
@@ -509,12 +510,12 @@ def _informing(
         told = ""
         if p <= level:
             better = metric.higher_is_better == (change.estimate > 0.0)
-            told = f"{'better' if better else 'worse'} ({_size(change, metric)}, {change.units} passes)"
+            told = f"{'better' if better else 'worse'} ({_size(change, metric)}, {counted(change.units, 'passes')})"
         gates.append(
             Gate(
                 metric.name, INFORMS, change.baseline, change.candidate, math.nan, math.nan, metric.unit,
                 p_value=p, level=level, resolution=math.inf, frames=frames,
-                evidence=f"{change.units} passes", reason=told,
+                evidence=counted(change.units, "passes"), reason=told,
             )
         )  # fmt: skip
     return gates

@@ -258,6 +258,7 @@ def test_position_errors_are_judged_by_passes_from_ten_on() -> None:
     gate = by_name(fewer)["navigation.anchored.p50"]
     assert gate.outcome == "not judged"
     assert gate.reason.endswith("%; fewer than 10 passes inform only")
+    assert by_name(judge(suite(0, 1), suite(1, 1), POLICY))["navigation.anchored.p50"].evidence == "1 pass"
     assert PASS_SPREAD / 3.0 > 0.1 and verdict_of(fewer) == "pass"
 
 
