@@ -1,7 +1,16 @@
-"""Compiled functions; the import of this package alone does not import numba."""
+"""Compiled functions, and files kept in their folder; the import of this package alone does not import numba."""
 
+import hashlib
 import os
+import time
+import uuid
+from contextlib import suppress
 from pathlib import Path
+
+KEPT_S = 90 * 86_400.0
+"""Age at which a file is deleted: the version of the program that it belongs to may be gone."""
+
+_DIGEST_OCTETS = 32
 
 
 def cache_folder() -> Path:
@@ -9,3 +18,26 @@ def cache_folder() -> Path:
     if named := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "linna" / "kernels"
+
+
+def kept(name: str) -> bytes | None:
+    """Return what was kept under a name; None if there is none or it is damaged."""
+    try:
+        content = (cache_folder() / name).read_bytes()
+    except OSError:
+        return None
+    octets = content[_DIGEST_OCTETS:]
+    return octets if hashlib.sha256(octets).digest() == content[:_DIGEST_OCTETS] else None
+
+
+def keep(name: str, octets: bytes) -> None:
+    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files."""
+    folder = cache_folder()
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        part = folder / uuid.uuid4().hex
+        part.write_bytes(hashlib.sha256(octets).digest() + octets)
+        part.replace(folder / name)
+        for other in folder.iterdir():
+            if other.stat().st_mtime < time.time() - KEPT_S:
+                other.unlink()

@@ -15,10 +15,7 @@ import hashlib
 import inspect
 import os
 import pickle
-import time
-import uuid
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any, TypeVar, overload
@@ -32,16 +29,12 @@ from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
-from kernels import cache_folder
+from kernels import cache_folder, keep, kept
 
 __all__ = ["njit"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-KEPT_S = 90 * 86_400.0
-"""Age at which a file is deleted: the version of the program that it belongs to may be gone."""
-
-_DIGEST_OCTETS = 32
 _texts: dict[str, str] = {}
 
 
@@ -69,35 +62,19 @@ class _KernelCache:
 
     def __init__(self, kernel: Any) -> None:
         self._kernel = kernel
-        self._folder = cache_folder()
-        self.cache_path = str(self._folder)
+        self.cache_path = str(cache_folder())
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled version for a signature, or None."""
         target.refresh()
-        try:
-            content = self._file(signature, target.codegen()).read_bytes()
-        except OSError:
-            return None
-        digest, octets = content[:_DIGEST_OCTETS], content[_DIGEST_OCTETS:]
-        if hashlib.sha256(octets).digest() != digest:
-            return None
-        return CompileResult._rebuild(target, *pickle.loads(octets))
+        octets = kept(self._name(signature, target.codegen()))
+        return None if octets is None else CompileResult._rebuild(target, *pickle.loads(octets))
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Store a compiled version, unless the folder cannot be written."""
         if compiled.library.has_dynamic_globals or not all(part.can_cache for part in compiled.lifted):
             return
-        octets = dumps(compiled._reduce())
-        file = self._file(signature, compiled.codegen)
-        with suppress(OSError):
-            self._folder.mkdir(parents=True, exist_ok=True)
-            part = self._folder / uuid.uuid4().hex
-            part.write_bytes(hashlib.sha256(octets).digest() + octets)
-            part.replace(file)
-            for other in self._folder.iterdir():
-                if other.stat().st_mtime < time.time() - KEPT_S:
-                    other.unlink()
+        keep(self._name(signature, compiled.codegen), dumps(compiled._reduce()))
 
     def flush(self) -> None:
         """Delete nothing: a file never becomes wrong."""
@@ -108,10 +85,10 @@ class _KernelCache:
         versions = (numba.__version__, np.__version__, numba.config.SLP_VECTORIZE)
         return _hash("\n".join([repr(versions), *_parts(self._kernel, set())]))
 
-    def _file(self, signature: Any, codegen: Any) -> Path:
+    def _name(self, signature: Any, codegen: Any) -> str:
         types = [part for one in signature for part in _type_parts(one)]
         key = _hash(repr((types, codegen.magic_tuple(), self._dependencies)))
-        return self._folder / f"{self._kernel.py_func.__name__}-{key}"
+        return f"{self._kernel.py_func.__name__}-{key}"
 
 
 def _type_parts(one: Any) -> Iterator[str]:

@@ -50,12 +50,18 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
         import logging
 
         from ground_service.client.local import local_client
-        from ground_service.missions.clocks import read_mission_clock
+        from ground_service.clock import follow_missions, mission_now_ns
+
+        def read_clock() -> int:
+            from ground_service.missions.clocks import read_mission_clock
+
+            read_mission_clock(ground)
+            return mission_now_ns()
 
         # The error of a failed job is that of the command, which prints it.
         logging.getLogger("ground_service.worker").setLevel(logging.ERROR)
         ground = open_ground_only(arguments)
-        read_mission_clock(ground)
+        follow_missions(read_clock)  # when the time is first asked for: few lists need it
         return local_client(ground, str(arguments.actor or local_actor()), background=background)
     from ground_service.client import Client
     from linna.errors import UsageError

@@ -12,7 +12,8 @@ import numpy as np
 from lunar.arrays import BoolArray
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import CraterCatalogue
-from payload_emulator.session.world import World, rims_of
+from payload_emulator.session.rims import rims_of
+from payload_emulator.session.world import World
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 
 CELL_DEG = 15
@@ -106,7 +107,7 @@ def observed_craters(world: World, latitude_limit_deg: float = WINDOW_LATITUDE_D
     near = [one.widened(CATALOGUE_MARGIN_DEG) for one in observed_boxes(world.terrain, latitude_limit_deg)]
     places = np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad)
     inside = np.any([inside_box(one, *places) for one in near], axis=0)
-    catalogue = rims_of(world, np.flatnonzero(inside))
+    catalogue = rims_of(world.scenario, world.terrain, np.flatnonzero(inside))
     world.terrain.release_ground()
     world.terrain.release_thread()
     return catalogue

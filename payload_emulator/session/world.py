@@ -34,6 +34,7 @@ from lunar.timescales import (
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.external import ExternalFrames, external_scenario
 from payload_emulator.session.orbit import force_model, propagate_from, propagate_scenario
+from payload_emulator.session.rims import rims_of, sources_of
 from payload_emulator.session.scenario import ReferenceSection, Scenario, WindowSection
 from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
 from payload_emulator.sim.orbit.truth import (
@@ -204,7 +205,7 @@ def open_world(scenario: Scenario, data: DataFolder, *, is_declared: bool = Fals
 def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
     """Return the terrain of a scenario."""
     section = scenario.terrain
-    return open_terrain(
+    terrain = open_terrain(
         section.source,
         data,
         scenario.seed,
@@ -212,6 +213,8 @@ def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
         photographs=section.photographs,
         heights=section.heights,
     )
+    terrain.sources = sources_of(scenario, data)
+    return terrain
 
 
 def _register(terrain: TiledTerrain, truth: Truth, frame_utc_ns: IntArray) -> None:
@@ -523,15 +526,4 @@ def catalogue_near_track(world: World) -> CraterCatalogue:
         )
         for i in range(latitude.size)
     ]
-    return rims_of(world, np.unique(np.concatenate(near)))
-
-
-def rims_of(world: World, craters: IntArray) -> CraterCatalogue:
-    """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground."""
-    listed, navigation = world.terrain.catalogue, world.scenario.navigation
-    diameter_m = listed.diameter_m[craters]
-    least_km, most_km = navigation.catalogue_min_diameter_km, navigation.catalogue_max_diameter_km
-    useful = craters[(diameter_m >= 1e3 * least_km) & (diameter_m <= 1e3 * most_km)]
-    if world.scenario.has_flat_ground:
-        return replace(listed.select(useful), rim_height_m=np.zeros(len(useful)))
-    return world.terrain.measured(useful)
+    return rims_of(world.scenario, world.terrain, np.unique(np.concatenate(near)))

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from kernels import compiled
+from kernels import KEPT_S
 
 ROOT = Path(__file__).resolve().parents[2]
 CALLEE = """
@@ -122,7 +122,7 @@ def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path: Path) -> No
     run(folder, cache)
     forgotten = cache / "forgotten"
     forgotten.touch()
-    os.utime(forgotten, (0.0, time.time() - compiled.KEPT_S - 60.0))
+    os.utime(forgotten, (0.0, time.time() - KEPT_S - 60.0))
     for file in cache.glob("outer-*"):
         file.write_bytes(file.read_bytes()[:-1])
     assert run(folder, cache) == "20 0"
@@ -173,13 +173,13 @@ def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path: Path, monkeypatch: 
     from numba import typeof
     from numba.core.registry import cpu_target
 
-    files = []
+    names = []
     for folder, old, new in (
         ("one", "", ""),
         ("two", "first: float\n    second", "second: float\n    first"),
     ):
         module = imported(write(tmp_path / folder, old, new), monkeypatch)
         signature = (typeof((module.callee.Pair(1.0, 2.0),)),)
-        files.append(module.of_pair._cache._file(signature, cpu_target.target_context.codegen()))
-    assert files[0] != files[1]
-    assert files[0].name.startswith("of_pair-")
+        names.append(module.of_pair._cache._name(signature, cpu_target.target_context.codegen()))
+    assert names[0] != names[1]
+    assert names[0].startswith("of_pair-")

@@ -12,7 +12,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -89,47 +89,6 @@ class TerrainPatch:
         return rows, unwrapped * self.pixels_per_radian - 0.5 - self.first_column
 
 
-class Terrain(Protocol):
-    """What a renderer and a labeller need of a Moon."""
-
-    name: str
-    data_names: tuple[str, ...]
-    catalogue: CraterCatalogue
-    pixel_m: float
-
-    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
-        """Whether the source itself holds each place."""
-        ...
-
-    def height_m(
-        self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0
-    ) -> FloatArray:
-        """Height above the map sphere, bilinear on the grid of a level of detail."""
-        ...
-
-    def level_for(self, sample_m: float) -> int:
-        """The level of detail that suits a picture with this sample on the ground."""
-        ...
-
-    def patch(
-        self, latitude_rad: FloatArray, longitude_rad: FloatArray, spacing_m: float = 0.0, level: int = 0
-    ) -> TerrainPatch:
-        """Tiles of a level within ``spacing_m`` of places that lie within half a turn of each other."""
-        ...
-
-    def measured(self, indices: IntArray) -> CraterCatalogue:
-        """Return catalogue craters of these indices, rim heights and depths measured on this terrain."""
-        ...
-
-    def rim_tilts_m(self, indices: IntArray) -> FloatArray:
-        """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2)."""
-        ...
-
-    def small_craters(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> CraterShapes:
-        """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
-        ...
-
-
 class TiledTerrain(ABC):
     """Cache of tiles and everything that follows from it; a source only has to make one tile.
 
@@ -141,6 +100,8 @@ class TiledTerrain(ABC):
     """Whether the heights are those of the Moon."""
     registration: Registration | None = None
     """How the catalogue was registered to the heights; None where that does not apply or is not known."""
+    sources: str = ""
+    """What the terrain was made of, so that equal texts and catalogues mean equal ground; empty if not known."""
 
     _small: SmallCraters | None = None
     """Craters below the catalogue's limit, where the source draws any."""
@@ -316,6 +277,16 @@ class TiledTerrain(ABC):
         chosen = self.catalogue.select(indices)
         return replace(chosen, rim_height_m=self._rim_m[indices], depth_m=self._depth_m[indices])
 
+    def measurements(self, indices: IntArray) -> FloatArray:
+        """Return rim height, depth and tilts to the north and to the east as measured or else listed, (n, 4)."""
+        return np.column_stack([self._rim_m[indices], self._depth_m[indices], self._rim_tilt_m[indices]])
+
+    def take_measurements(self, indices: IntArray, values: FloatArray) -> None:
+        """Take the `measurements` of an equal terrain after it measured these craters."""
+        self._rim_m[indices], self._depth_m[indices] = values[:, 0], values[:, 1]
+        self._rim_tilt_m[indices] = values[:, 2:]
+        self._measured[indices] = True
+
     def rim_tilts_m(self, indices: IntArray) -> FloatArray:
         """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""
         self._measure(indices[~self._measured[indices]])
@@ -329,7 +300,9 @@ class TiledTerrain(ABC):
         order = np.lexsort(
             (self.catalogue.longitude_rad[indices], np.round(self.catalogue.latitude_rad[indices], 1))
         )
-        for part in np.array_split(indices[order], max(1, indices.size // 256)):
+        parts = np.array_split(indices[order], max(1, indices.size // 256))
+        # From west to east, so that each tile and each cell of small craters is made once.
+        for part in sorted(parts, key=lambda one: self.catalogue.longitude_rad[one[:1]].tolist()):
             latitude = self.catalogue.latitude_rad[part][:, None]
             longitude = self.catalogue.longitude_rad[part][:, None]
             radius = 0.5 * self.catalogue.diameter_m[part][:, None] / MOON_RADIUS_M

@@ -1,0 +1,102 @@
+"""Measured rims are kept on disk and are never those of another ground."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.catalogue import make_catalogue
+from lunar.datafolder import DataFolder
+from payload_emulator.session import rims
+from payload_emulator.session.rims import rims_of, sources_of
+from payload_emulator.session.scenario import Scenario
+from payload_emulator.sim.terrain.tiles import Heights, TiledTerrain
+
+SCENARIO = Scenario(name="rims", seed=5)
+ALL = np.arange(6)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(rims, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr("kernels.cache_folder", lambda: tmp_path)
+    return tmp_path
+
+
+class Waves(TiledTerrain):
+    """Waves of 30 km about the equator, with craters in a row."""
+
+    def __init__(self, sources: str = "one", shift_rad: float = 0.0) -> None:
+        places = np.linspace(0.1, 0.11, 6)
+        craters = make_catalogue(places + shift_rad, places, 4e3 + 2e6 * (places - 0.1), source="a row")
+        super().__init__("waves", (), craters, 256, 8)
+        self.sources, self.made = sources, 0
+
+    def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
+        self.made += 1
+        heights = 300.0 * np.sin(360.0 * latitude_rad)[:, None] * np.cos(360.0 * longitude_rad)
+        return heights.astype(np.float32)
+
+    def make_albedo(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
+        return np.zeros((latitude_rad.size, longitude_rad.size), np.float32)
+
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
+        return np.isfinite(latitude_rad)
+
+
+def makes_ground(terrain: Waves, craters: IntArray = ALL) -> bool:
+    """Return whether the rims of these craters are measured."""
+    rims_of(SCENARIO, terrain, craters)
+    return terrain.made > 0
+
+
+def test_rims_are_measured_once_and_again_for_other_ground(folder: Path) -> None:
+    first, second = Waves(), Waves()
+    found = rims_of(SCENARIO, first, ALL)
+    assert not makes_ground(second)
+    again = second.measured(ALL)
+    assert np.array_equal(found.rim_height_m, again.rim_height_m)
+    assert np.array_equal(found.depth_m, again.depth_m)
+    assert np.array_equal(first.rim_tilts_m(ALL), second.rim_tilts_m(ALL))
+    assert np.isfinite(found.depth_m).all()
+    assert first.rim_tilts_m(ALL).all()
+    assert second.made == 0
+
+    assert makes_ground(Waves(sources="other"))
+    assert makes_ground(Waves(shift_rad=1e-9))
+    assert makes_ground(Waves(sources=""))  # not known
+    assert makes_ground(Waves(), ALL[1:])
+    assert not makes_ground(Waves())
+    for file in folder.glob("rims-*"):
+        file.write_bytes(file.read_bytes()[:-1])
+    assert makes_ground(Waves())
+
+
+def test_the_oldest_sets_of_rims_are_deleted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rims, "KEPT", 2)
+    files: list[Path] = []
+    for age_s in (300.0, 200.0, 100.0):
+        rims_of(SCENARIO, Waves(), ALL[len(files) :])
+        (new,) = set(folder.iterdir()) - set(files)
+        os.utime(new, (0.0, new.stat().st_mtime - age_s))
+        files.append(new)
+    assert set(folder.iterdir()) == set(files[1:])
+
+
+def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_path: Path) -> None:
+    raster, label = tmp_path / "heights.IMG", tmp_path / "heights.LBL"
+    for file in (raster, label):
+        file.write_bytes(b"heights")
+    data = DataFolder(dem_sldem=(label,))
+    texts = [sources_of(SCENARIO, data), sources_of(replace(SCENARIO, seed=6), data)]
+    texts.append(sources_of(replace(SCENARIO, terrain=replace(SCENARIO.terrain, source="procedural")), data))
+    os.utime(raster, ns=(0, 1))
+    texts.append(sources_of(SCENARIO, data))
+    raster.write_bytes(b"other heights")
+    os.utime(raster, ns=(0, 1))
+    texts.append(sources_of(SCENARIO, data))
+    assert len(set(texts)) == len(texts)
