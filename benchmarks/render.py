@@ -40,7 +40,7 @@ from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.renderer import Rendering
 from payload_emulator.sim.render.sensor import SensorModel, expose
 from payload_emulator.sim.terrain.opening import open_terrain
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 REPEATS = 9
 CAMERA = PinholeCamera()
@@ -89,7 +89,7 @@ class Agreement:
     dark_pixels: int
 
 
-def speed(terrain: TiledTerrain, region: Region, blender: str) -> dict[str, object]:
+def speed(terrain: Terrain, region: Region, blender: str) -> dict[str, object]:
     """Milliseconds of processor time per stage at three altitudes."""
     return {
         f"{km:g} km": _speed_at(terrain, region, km, n, blender) for n, km in enumerate((14.0, 30.0, 48.6))
@@ -97,7 +97,7 @@ def speed(terrain: TiledTerrain, region: Region, blender: str) -> dict[str, obje
 
 
 def _speed_at(
-    terrain: TiledTerrain, region: Region, altitude_km: float, number: int, blender: str
+    terrain: Terrain, region: Region, altitude_km: float, number: int, blender: str
 ) -> dict[str, object]:
     place = math.radians(region.timed_deg[0]), math.radians(region.timed_deg[1])
     position = mcmf_from_spherical(*place, 1000.0 * altitude_km)
@@ -129,7 +129,7 @@ def _speed_at(
     return row
 
 
-def agreement(terrain: TiledTerrain, region: Region, poses: int, every: int) -> dict[str, object]:
+def agreement(terrain: Terrain, region: Region, poses: int, every: int) -> dict[str, object]:
     """Fast against the ray march, and labels against cast rims, over the same random poses."""
     rng = np.random.default_rng(20)
     fast, marched = [], []

@@ -14,7 +14,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.raymarch import cast
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 AZIMUTHS = 48
 ROUNDS = 8
@@ -46,7 +46,7 @@ class RimErrors:
 
 
 def rim_errors(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,

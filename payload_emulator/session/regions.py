@@ -14,7 +14,7 @@ from lunar.boxes import Box, inside_box
 from lunar.catalogue import CraterCatalogue
 from payload_emulator.session.rims import rims_of
 from payload_emulator.session.world import World
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 CELL_DEG = 15
 """Cells of the choice: the size of the tiles of the height rasters, half that of the tiles of the crater catalogue."""
@@ -32,7 +32,7 @@ WINDOW_LATITUDE_DEG = 20.0
 """Half the band of latitudes that a pass crosses in 12 minutes."""
 
 
-def observed_boxes(terrain: TiledTerrain, latitude_limit_deg: float) -> list[Box]:
+def observed_boxes(terrain: Terrain, latitude_limit_deg: float) -> list[Box]:
     """Return the boxes of the windows, each twice `latitude_limit_deg` high.
 
     A terrain without data is the same everywhere: its windows are at the equator. On real terrain, each 15 deg of
@@ -75,7 +75,7 @@ def _cells() -> tuple[int, int]:
     return 2 * LATITUDE_LIMIT_DEG // CELL_DEG, 360 // CELL_DEG
 
 
-def _catalogued(terrain: TiledTerrain) -> BoolArray:
+def _catalogued(terrain: Terrain) -> BoolArray:
     """Return whether the catalogue is complete in each cell (rows from the south, columns from 0 E)."""
     listed = terrain.catalogue
     scored = listed.diameter_m >= CRATER_DIAMETER_M
@@ -91,7 +91,7 @@ def _catalogued(terrain: TiledTerrain) -> BoolArray:
     return np.asarray((counts[0] > 0) & (counts[1] == 0))
 
 
-def _covered(terrain: TiledTerrain) -> BoolArray:
+def _covered(terrain: Terrain) -> BoolArray:
     """Return whether height rasters cover each cell (rows from the south, columns from 0 E)."""
     rows, columns = _cells()
     steps = (np.arange(SAMPLES) + 0.5) * CELL_DEG / SAMPLES

@@ -6,23 +6,20 @@ import functools
 import hashlib
 from contextlib import suppress
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from kernels import cache_folder, keep, kept
+from lunar import constants
 from lunar.arrays import IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain import tiles
 
 KEPT = 32
 """Sets of craters that are kept, up to 2 MB each."""
-
-CODE = ("payload_emulator.sim.terrain", "lunar", "kernels")
-"""Packages that decide what is measured."""
 
 
 def sources_of(scenario: Scenario, data: DataFolder) -> str:
@@ -34,7 +31,7 @@ def sources_of(scenario: Scenario, data: DataFolder) -> str:
     return repr((scenario.terrain, scenario.seed, stated))
 
 
-def rims_of(scenario: Scenario, terrain: TiledTerrain, craters: IntArray) -> CraterCatalogue:
+def rims_of(scenario: Scenario, terrain: tiles.Terrain, craters: IntArray) -> CraterCatalogue:
     """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground."""
     listed, navigation = terrain.catalogue, scenario.navigation
     diameter_m = listed.diameter_m[craters]
@@ -42,19 +39,18 @@ def rims_of(scenario: Scenario, terrain: TiledTerrain, craters: IntArray) -> Cra
     useful = craters[(diameter_m >= 1e3 * least_km) & (diameter_m <= 1e3 * most_km)]
     if scenario.has_flat_ground:
         return replace(listed.select(useful), rim_height_m=np.zeros(len(useful)))
-    if not terrain.sources:
-        return terrain.measured(useful)
     places = (listed.latitude_rad, listed.longitude_rad, listed.diameter_m, listed.depth_m, useful)
     key = hashlib.sha256(f"{_code()} {terrain.sources}".encode())
     for part in places:
         key.update(part.tobytes())
     name = f"rims-{key.hexdigest()}"
-    octets = kept(name)
+    octets = kept(name) if terrain.sources else None
     if octets is not None:
         terrain.take_measurements(useful, np.frombuffer(octets).reshape(-1, 4))
-        return terrain.measured(useful)
     found = terrain.measured(useful)
-    keep(name, terrain.measurements(useful).tobytes())
+    if octets is not None or not terrain.sources:
+        return found
+    keep(name, terrain.measurements_m(useful).tobytes())
     with suppress(OSError):  # another process has deleted one
         newest = sorted(cache_folder().glob("rims-*"), key=lambda file: file.stat().st_mtime)
         for file in newest[:-KEPT]:
@@ -71,9 +67,7 @@ def _code() -> str:
     key = hashlib.sha256(
         f"{numba.__version__} {np.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
     )
-    for package in CODE:
-        spec = find_spec(package)
-        assert spec is not None and spec.origin is not None
-        for file in sorted(Path(spec.origin).parent.glob("*.py")):
+    for module in (tiles, constants):
+        for file in sorted(Path(module.__file__).parent.glob("*.py")):
             key.update(file.read_bytes())
     return key.hexdigest()

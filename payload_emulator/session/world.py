@@ -48,7 +48,7 @@ from payload_emulator.sim.orbit.truth import (
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 from tmtc.cuc import TICKS_PER_SECOND
 
 CHUNK_S = 86_400.0
@@ -81,7 +81,7 @@ class World:
 
     scenario: Scenario
     truth: Truth
-    terrain: TiledTerrain
+    terrain: Terrain
     model: ForceModel
     burns: tuple[TrueBurn, ...]
     frame_utc_ns: IntArray
@@ -159,7 +159,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
 
 
 def _external_world(
-    scenario: Scenario, external: ExternalFrames, terrain: TiledTerrain, model: ForceModel
+    scenario: Scenario, external: ExternalFrames, terrain: Terrain, model: ForceModel
 ) -> World:
     """Return the world of external frames."""
     truth = _truth_of_ephemeris(load_oem(external.ephemeris), model.orientation)
@@ -202,7 +202,7 @@ def open_world(scenario: Scenario, data: DataFolder, *, is_declared: bool = Fals
     return replace(world, scenario=scenario, truth=truth, burns=burns)
 
 
-def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
+def scenario_terrain(scenario: Scenario, data: DataFolder) -> Terrain:
     """Return the terrain of a scenario."""
     section = scenario.terrain
     terrain = open_terrain(
@@ -217,7 +217,7 @@ def scenario_terrain(scenario: Scenario, data: DataFolder) -> TiledTerrain:
     return terrain
 
 
-def _register(terrain: TiledTerrain, truth: Truth, frame_utc_ns: IntArray) -> None:
+def _register(terrain: Terrain, truth: Truth, frame_utc_ns: IntArray) -> None:
     """Register the catalogue to rasters for which no product was made, from the rims near the frames."""
     if not isinstance(terrain, RasterTerrain) or terrain.registration is not None:
         return
@@ -233,7 +233,7 @@ def _register(terrain: TiledTerrain, truth: Truth, frame_utc_ns: IntArray) -> No
         terrain.register(registration)
 
 
-def _names(terrain: TiledTerrain, model: ForceModel) -> tuple[str, ...]:
+def _names(terrain: Terrain, model: ForceModel) -> tuple[str, ...]:
     """Data that a world is made of."""
     return (
         *terrain.data_names,
@@ -324,7 +324,7 @@ def frame_utc_ns(world: World, ticks: int) -> int:
 
 
 def _fly_to_windows(
-    scenario: Scenario, model: ForceModel, terrain: TiledTerrain
+    scenario: Scenario, model: ForceModel, terrain: Terrain
 ) -> tuple[Truth, tuple[TrueBurn, ...], list[tuple[int, int]]]:
     """Propagate in chunks until the wanted windows are found; truth, burns on the way, windows."""
     window = scenario.window
@@ -379,7 +379,7 @@ def _band_rad(scenario: Scenario) -> tuple[float, float]:
 
 
 def _windows(
-    scenario: Scenario, truth: Truth, terrain: TiledTerrain, not_before_utc_ns: int
+    scenario: Scenario, truth: Truth, terrain: Terrain, not_before_utc_ns: int
 ) -> list[tuple[int, int]]:
     window = scenario.window
     if window.search == "none":
@@ -389,9 +389,7 @@ def _windows(
     return [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable][: window.passes]
 
 
-def _crossings(
-    scenario: Scenario, truth: Truth, terrain: TiledTerrain, not_before_utc_ns: int
-) -> list[Crossing]:
+def _crossings(scenario: Scenario, truth: Truth, terrain: Terrain, not_before_utc_ns: int) -> list[Crossing]:
     window = scenario.window
     west_deg, width_deg = window.longitude_min_deg, window.longitude_max_deg - window.longitude_min_deg
 

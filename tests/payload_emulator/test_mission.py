@@ -24,7 +24,7 @@ from payload_emulator.session.mission import (
 from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 SCENARIO = """
 name = "small"
@@ -146,7 +146,7 @@ class RealTerrain:
 
     is_real, name = True, "LROC WAC GLD100"
 
-    def __init__(self, terrain: TiledTerrain) -> None:
+    def __init__(self, terrain: Terrain) -> None:
         self._terrain = terrain
 
     def __getattr__(self, name: str) -> Any:

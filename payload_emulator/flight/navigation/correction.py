@@ -64,61 +64,33 @@ def correct(
         surest = np.argsort(variance[identification.detection], kind="stable")
         identification = identification.select(np.sort(surest[: parameters.crater_limit]))
     while identification.believed or not reacquired:
-        fix = _fix(
-            prior,
-            pose,
-            found,
-            identification,
-            sighting,
+        index = sighting.index[identification.sighted]
+        uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
+        variance = detection_variance_px2(found, parameters)[identification.detection]
+        persistence = detection_persistence(found, parameters)[identification.detection]
+        lasting = variance * persistence
+        sigma_m = crater_sigma_m(landmarks.sigma_m[index], lasting, altitude_m, camera, parameters)
+        update = kalman.update(
+            prior.with_craters(index, sigma_m),
+            pose.camera_from_icrf,
+            pose.mcmf_from_icrf,
             landmarks,
+            index,
+            uv,
+            fresh_variance_px2(variance * (1.0 - persistence), parameters),
             camera,
-            parameters,
-            altitude_m,
-            reacquired,
+            parameters.errors,
         )
-        if fix is None:
+        if update is None:
             return None
+        state = kalman.widened(update.state, 0.0, curvature_m_s(prior, update.state))
+        fix = Fix(identification, index, replace(update, state=state), reacquired)
         worst = int(np.argmax(fix.update.contradiction))
         # Pairs of a search by association were tested in this way already, those of votes were not.
         if not reacquired or fix.update.contradiction[worst] < GATE:
             return fix if _is_credible(prior, fix, parameters.limits) else None
         identification = identification.select(np.delete(np.arange(len(identification)), worst))
     return None
-
-
-def _fix(
-    prior: FilterState,
-    pose: Pose,
-    found: Detections,
-    identification: Identification,
-    sighting: Sighting,
-    landmarks: LandmarkMap,
-    camera: PinholeCamera,
-    parameters: AnchoredParameters,
-    altitude_m: float,
-    reacquired: bool,
-) -> Fix | None:
-    """Return the fix of identified craters without a test; None where the numbers allow none."""
-    index = sighting.index[identification.sighted]
-    uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
-    variance = detection_variance_px2(found, parameters)[identification.detection]
-    persistence = detection_persistence(found, parameters)[identification.detection]
-    sigma_m = crater_sigma_m(landmarks.sigma_m[index], variance * persistence, altitude_m, camera, parameters)
-    update = kalman.update(
-        prior.with_craters(index, sigma_m),
-        pose.camera_from_icrf,
-        pose.mcmf_from_icrf,
-        landmarks,
-        index,
-        uv,
-        fresh_variance_px2(variance * (1.0 - persistence), parameters),
-        camera,
-        parameters.errors,
-    )
-    if update is None:
-        return None
-    state = kalman.widened(update.state, 0.0, curvature_m_s(prior, update.state))
-    return Fix(identification, index, replace(update, state=state), reacquired)
 
 
 def _is_credible(prior: FilterState, fix: Fix, limits: AnchoredLimits) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lunar.arrays import FloatArray
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 
 class Limit(NamedTuple):
@@ -26,7 +26,7 @@ class Limit(NamedTuple):
 class Surroundings:
     """What stays the same during a session."""
 
-    terrain: TiledTerrain
+    terrain: Terrain
     seed: int
 
     def rng(self, name: str, *numbers: int) -> np.random.Generator:

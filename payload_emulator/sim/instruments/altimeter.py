@@ -16,7 +16,7 @@ from lunar.arrays import FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
 from payload_emulator.sim.instruments import Limit, SimulatedInstrument, Situation, Surroundings
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 _NAN = float("nan")
 # A ray reaches the ground to a centimetre in two iterations over plains and in six on slopes of 30 degrees.
@@ -125,7 +125,7 @@ def beam(radius_rad: float) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(offsets), weight / weight.sum()
 
 
-def ground_ranges_m(terrain: TiledTerrain, position_mcmf_m: FloatArray, directions: FloatArray) -> FloatArray:
+def ground_ranges_m(terrain: Terrain, position_mcmf_m: FloatArray, directions: FloatArray) -> FloatArray:
     """Return the distance (n,) from a place to the terrain along unit directions (n, 3) in MCMF; NaN on a miss.
 
     Each iteration intersects the rays with the sphere through the ground below the points reached before.

@@ -26,7 +26,7 @@ from payload_emulator.errors import RendererError
 from payload_emulator.sim.render.cycles_scene import CyclesScene, CyclesSettings, describe_scene
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.renderer import Image, Rendering
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 MAGIC = 20_000_630
 LONG_NAMES = 0x400
@@ -68,7 +68,7 @@ class CyclesPicture:
 
 
 def render(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,

@@ -27,8 +27,8 @@ from payload_emulator.sim.terrain.tiles import (
     MEAN_ALBEDO,
     TILE_PIXELS,
     TILE_SHIFT,
+    Terrain,
     TerrainPatch,
-    TiledTerrain,
 )
 
 Image = npt.NDArray[np.float32]
@@ -140,7 +140,7 @@ class CyclesScene:
 
 
 def describe_scene(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
@@ -202,7 +202,7 @@ def describe_scene(
 
 
 def _bounds(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position: FloatArray,
     rotation: FloatArray,
@@ -232,7 +232,7 @@ def _bounds(
 
 
 def _textures(
-    terrain: TiledTerrain, south: float, north: float, west: float, east: float, level: int
+    terrain: Terrain, south: float, north: float, west: float, east: float, level: int
 ) -> tuple[FloatArray, FloatArray]:
     """Heights in metres and albedo over the cap, rows from south to north, at the pixels of the terrain's level."""
     from payload_emulator.sim.terrain import kernels

@@ -13,7 +13,7 @@ from lunar.camera import PinholeCamera, project_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 RIM_POINTS = 24
 HIDDEN_SHARE = 0.1
@@ -87,7 +87,7 @@ def view_radius_m(
 
 
 def label_frame(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,

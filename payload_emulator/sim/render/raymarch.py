@@ -21,14 +21,14 @@ from payload_emulator.sim.render._raymarch_kernel import Ground, Surface, march
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.renderer import Rendering
-from payload_emulator.sim.terrain.tiles import MEAN_ALBEDO, MEASURE_LEVEL, TerrainPatch, TiledTerrain
+from payload_emulator.sim.terrain.tiles import MEAN_ALBEDO, MEASURE_LEVEL, Terrain, TerrainPatch
 
 SHADOW_REACH_M = 90.0e3
 MARGIN_M = 6_000.0
 
 
 def render(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
@@ -69,7 +69,7 @@ def render(
     return Rendering(radiance, lit, range_m)
 
 
-def height_above_ground_m(renderer: str, terrain: TiledTerrain, position_mcmf_m: FloatArray) -> float:
+def height_above_ground_m(renderer: str, terrain: Terrain, position_mcmf_m: FloatArray) -> float:
     """Height of a camera at a position (3,) above the ground below it; TerrainError below 50 m."""
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position_mcmf_m))
     ground = float(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
@@ -82,7 +82,7 @@ def height_above_ground_m(renderer: str, terrain: TiledTerrain, position_mcmf_m:
 
 
 def cast(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,

@@ -30,8 +30,8 @@ from payload_emulator.sim.terrain.tiles import (
     MEAN_ALBEDO,
     MEASURE_LEVEL,
     TILE_SHIFT,
+    Terrain,
     TerrainPatch,
-    TiledTerrain,
 )
 
 Image = npt.NDArray[np.float32]
@@ -93,7 +93,7 @@ class View:
 
 
 def render(
-    terrain: TiledTerrain,
+    terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
@@ -158,12 +158,7 @@ def photographed(
 
 
 def _render_grid(
-    terrain: TiledTerrain,
-    camera: PinholeCamera,
-    view: View,
-    grid: TangentGrid,
-    level: int,
-    photometry: Photometry,
+    terrain: Terrain, camera: PinholeCamera, view: View, grid: TangentGrid, level: int, photometry: Photometry
 ) -> Rendering:
     from payload_emulator.sim.render._grid_kernel import Grid, Nodes, Tiles, block_peaks, sweep_shadows
     from payload_emulator.sim.render._shade_kernel import Light, Surface, shade_pixels
@@ -281,7 +276,7 @@ def _penumbra(elevation_rad: float) -> float:
 
 
 def _fit_grid(
-    terrain: TiledTerrain, camera: PinholeCamera, view: View, level: int
+    terrain: Terrain, camera: PinholeCamera, view: View, level: int
 ) -> tuple[TangentGrid, TangentGrid]:
     """The rectangle that holds the ground in the picture as far as its border shows, and one that holds it surely."""
     low, high = -500.0, 500.0

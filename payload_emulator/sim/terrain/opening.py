@@ -9,7 +9,7 @@ from payload_emulator.errors import TerrainError
 
 if TYPE_CHECKING:
     from lunar.datafolder import DataFolder
-    from payload_emulator.sim.terrain.tiles import TiledTerrain
+    from payload_emulator.sim.terrain.tiles import Terrain
 
 KINDS = ("auto", "raster", "procedural", "catalogue", "photograph")
 
@@ -26,7 +26,7 @@ def open_terrain(
     photographs: tuple[str, ...] = (),
     heights: tuple[str, ...] = (),
     **options: Any,
-) -> TiledTerrain:
+) -> Terrain:
     """The terrain of a kind.
 
     ``raster``: real heights and catalogue of the data folder; ``procedural``: a seeded Moon; ``auto``: the first where
@@ -105,7 +105,7 @@ def _open_photograph(
     photographs: tuple[str, ...],
     heights: tuple[str, ...],
     registration_north_east_m: tuple[float, ...],
-) -> TiledTerrain:
+) -> Terrain:
     from lunar.catalogue import load_catalogue
     from payload_emulator.sim.terrain.photograph import PhotographTerrain
     from payload_emulator.sim.terrain.registering import find_registration

@@ -25,7 +25,7 @@ from payload_emulator.sim.terrain.craters import (
 from payload_emulator.sim.terrain.tiles import (
     MEAN_ALBEDO,
     Heights,
-    TiledTerrain,
+    Terrain,
     coarse_nodes,
 )
 
@@ -72,7 +72,7 @@ SMALL_EXPONENT = 2.2
 """Below 2 km: meets the equilibrium density of Trask (1966), 0.079 per km2 above 1 km, near 0.7 km."""
 
 
-class ProceduralTerrain(TiledTerrain):
+class ProceduralTerrain(Terrain):
     """The whole Moon from a seed, on 256 pixels per degree (118 m)."""
 
     def __init__(

@@ -29,7 +29,7 @@ from payload_emulator.sim.terrain.procedural import (
 from payload_emulator.sim.terrain.rasters import ChunkCache, RasterLayer, open_layers
 from payload_emulator.sim.terrain.tiles import (
     Heights,
-    TiledTerrain,
+    Terrain,
     coarse_nodes,
 )
 
@@ -53,7 +53,7 @@ CATALOGUE_DENSITY_2KM = 0.0080
 """Craters above 2 km per km2 in LU1319381 (222,451 over 53 of 72 tiles); scales the smaller ones by place."""
 
 
-class RasterTerrain(TiledTerrain):
+class RasterTerrain(Terrain):
     """Terrain of georeferenced height rasters on a grid of 256 pixels per degree."""
 
     is_real = True

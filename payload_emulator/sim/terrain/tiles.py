@@ -89,7 +89,7 @@ class TerrainPatch:
         return rows, unwrapped * self.pixels_per_radian - 0.5 - self.first_column
 
 
-class TiledTerrain(ABC):
+class Terrain(ABC):
     """Cache of tiles and everything that follows from it; a source only has to make one tile.
 
     A terrain belongs to one thread, the first that asks it for ground: the tiles of a patch are overwritten by later
@@ -132,9 +132,8 @@ class TiledTerrain(ABC):
         self._albedo: Heights | None = None
         self._bounds = np.zeros((cache_tiles, 2))
         self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
-        self._rim_m = np.array(catalogue.rim_height_m, dtype=np.float64)
-        self._depth_m = np.array(catalogue.depth_m, dtype=np.float64)
-        self._rim_tilt_m = np.zeros((len(catalogue), 2))
+        flat = np.zeros(len(catalogue))
+        self._rims_m = np.column_stack([catalogue.rim_height_m, catalogue.depth_m, flat, flat])
         self._measured = np.zeros(len(catalogue), dtype=bool)
         self._owner: int | None = None
 
@@ -275,22 +274,21 @@ class TiledTerrain(ABC):
         """
         self._measure(indices[~self._measured[indices]])
         chosen = self.catalogue.select(indices)
-        return replace(chosen, rim_height_m=self._rim_m[indices], depth_m=self._depth_m[indices])
+        return replace(chosen, rim_height_m=self._rims_m[indices, 0], depth_m=self._rims_m[indices, 1])
 
-    def measurements(self, indices: IntArray) -> FloatArray:
-        """Return rim height, depth and tilts to the north and to the east as measured or else listed, (n, 4)."""
-        return np.column_stack([self._rim_m[indices], self._depth_m[indices], self._rim_tilt_m[indices]])
+    def measurements_m(self, indices: IntArray) -> FloatArray:
+        """Rim height, depth, and tilts to the north and to the east, (n, 4); as listed where not measured."""
+        return self._rims_m[indices]
 
-    def take_measurements(self, indices: IntArray, values: FloatArray) -> None:
-        """Take the `measurements` of an equal terrain after it measured these craters."""
-        self._rim_m[indices], self._depth_m[indices] = values[:, 0], values[:, 1]
-        self._rim_tilt_m[indices] = values[:, 2:]
+    def take_measurements(self, indices: IntArray, values_m: FloatArray) -> None:
+        """Take the measurements that an equal terrain made of these craters."""
+        self._rims_m[indices] = values_m
         self._measured[indices] = True
 
     def rim_tilts_m(self, indices: IntArray) -> FloatArray:
         """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""
         self._measure(indices[~self._measured[indices]])
-        return self._rim_tilt_m[indices]
+        return self._rims_m[indices, 2:]
 
     def _measure(self, indices: IntArray) -> None:
         if indices.size == 0:
@@ -318,9 +316,7 @@ class TiledTerrain(ABC):
             ]
             # Rings stand for equal-width annuli of the inner 0.4 radius: weights are their areas.
             floor = (1.0 * rings[0] + 2.2 * rings[1] + 3.4 * rings[2]) / 6.6
-            self._rim_m[part] = rim
-            self._depth_m[part] = rim - floor
-            self._rim_tilt_m[part] = tilt
+            self._rims_m[part] = np.column_stack([rim, rim - floor, tilt])
             self._measured[part] = True
 
     def _open_pool(self) -> None:

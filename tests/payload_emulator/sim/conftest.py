@@ -7,10 +7,10 @@ import pytest
 
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
-from payload_emulator.sim.terrain.tiles import TiledTerrain
+from payload_emulator.sim.terrain.tiles import Terrain
 
 
-class FormulaTerrain(TiledTerrain):
+class FormulaTerrain(Terrain):
     """Heights from a formula of latitude and longitude, one albedo."""
 
     def __init__(self, formula: Callable[..., np.ndarray], catalogue: CraterCatalogue | None = None) -> None:
