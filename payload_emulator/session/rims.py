@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -68,6 +69,6 @@ def _code() -> str:
         f"{numba.__version__} {np.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
     )
     for module in (tiles, constants):
-        for file in sorted(Path(module.__file__).parent.glob("*.py")):
+        for file in sorted(Path(inspect.getfile(module)).parent.glob("*.py")):
             key.update(file.read_bytes())
     return key.hexdigest()
