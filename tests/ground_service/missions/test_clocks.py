@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from ground_service.missions.model import parse_mission
 from ground_service.missions.service import add_mission
 from ground_service.settings import Settings
 from ground_service.worker.app import _ground_of
+from linna.commands._ground import ground_client
 from lunar.timescales import format_utc, parse_utc
 from tests.serving import TestClient, wait_for
 
@@ -57,6 +59,12 @@ def test_a_simulated_clock_runs_at_its_rate(ground: Ground) -> None:
     first = seconds_after_start()
     time.sleep(0.05)
     assert 50.0 <= seconds_after_start() - first < 60_000.0
+
+
+def test_a_command_of_this_machine_has_the_clock_of_its_descriptions(ground: Ground) -> None:
+    state(ground, simulated())
+    with ground_client(Namespace(home=ground.home, server=None, actor="ann")):
+        assert 0.0 <= seconds_after_start() < 600.0
 
 
 def test_a_stated_clock_is_behind_that_of_a_simulation_and_ends_with_the_description(ground: Ground) -> None:
