@@ -21,37 +21,40 @@ from tmtc.cuc import TICKS_PER_SECOND
 _EPOCH = datetime(2000, 1, 1)
 
 
-def _plain(value: float) -> str:
+def number_text(value: float) -> str:
+    """Return a number without needless digits."""
     return f"{value:.0f}" if value.is_integer() else f"{value:.6g}"
 
 
 def _number(unit: str = "") -> Callable[[float], str]:
-    return lambda value: f"{_plain(value)} {unit}".rstrip()
+    return lambda value: f"{number_text(value)} {unit}".rstrip()
 
 
 def _label(labels: Labels) -> Callable[[float], str]:
     names = {float(code): name.replace("_", " ") for code, name in labels}
-    return lambda value: names.get(value, _plain(value))
+    return lambda value: names.get(value, number_text(value))
 
 
 def _hash(value: float) -> str:
     return f"{int(value) & 0xFFFFFFFF:08x}"
 
 
-def _request(value: float) -> str:
-    """A telecommand by its first four octets: the last 14 bits are its sequence count."""
-    return f"telecommand {int(value) & 0x3FFF}"
+def request_text(value: float) -> str:
+    """Return a telecommand by its first four octets: the last 14 bits are its sequence count."""
+    return f"telecommand with sequence count {int(value) & 0x3FFF}"
 
 
-def _time(value: float) -> str:
-    """An on-board time in ticks; 0 is no time."""
-    if value <= 0:
-        return "open end"
+def time_text(value: float) -> str:
+    """Return an on-board time, in ticks, as TAI."""
     return (_EPOCH + timedelta(seconds=value / TICKS_PER_SECOND)).strftime("%Y-%m-%dT%H:%M:%S TAI")
 
 
+def _time(value: float, write: Callable[[float], str] = time_text) -> str:
+    return write(value) if value > 0 else "open end"
+
+
 def _interval(value: float) -> str:
-    return f"{_plain(value / TICKS_PER_SECOND)} s"
+    return f"{number_text(value / TICKS_PER_SECOND)} s"
 
 
 _MODE, _TABLE, _FAILURE = _label(MODES), _label(TABLES), _label(FAILURES)
@@ -93,12 +96,12 @@ EVENT_TEXTS: Mapping[str, EventText] = {
         "until {0}, every {1}", ("end, on-board time (0: none)", _time), ("cadence, 2^-16 s", _interval)
     ),
     "observation_stopped": _of("{0} frames since boot", ("frames since boot", _number())),
-    "activity_released": _of("{0}", ("request id", _request)),
-    "activity_expired": _of("{0}, {1} late", ("request id", _request), ("delay, s", _number("s"))),
-    "activity_failed": _of("{0}", ("request id", _request)),
+    "activity_released": _of("{0}", ("request id", request_text)),
+    "activity_expired": _of("{0}, {1} late", ("request id", request_text), ("delay, s", _number("s"))),
+    "activity_failed": _of("{0}", ("request id", request_text)),
     "table_loaded": _of("{0}, hash {1}", ("table", _TABLE), ("first 32 bits of its SHA-256", _hash)),
     "table_refused": _of("{0} ({1})", ("table", _TABLE), ("hash, or octets of an upload", _number())),
-    "telecommand_rejected": _of("{1}: {0}", ("failure code", _FAILURE), ("request id", _request)),
+    "telecommand_rejected": _of("{1}: {0}", ("failure code", _FAILURE), ("request id", request_text)),
     "parameter_changed": _of("parameter {0} = {1}", ("parameter", _number()), ("value", _number())),
     "report_definition_changed": _of(
         "structure {0} with {1} quantities", ("structure", _number()), ("quantities", _number())
@@ -161,15 +164,35 @@ EVENT_TEXTS: Mapping[str, EventText] = {
 """Texts by event name; an event that is missing has no values."""
 
 
-def event_text(name: str, value_1: float | None, value_2: float | None) -> str:
+def event_text(
+    name: str,
+    value_1: float | None,
+    value_2: float | None,
+    *,
+    time: Callable[[float], str] = time_text,
+    telecommand: Callable[[float], str] = request_text,
+) -> str:
     """Return the values of an event as a text; empty without values.
 
     Values that the text does not use, or that are not known (None, NaN), appear as plain numbers or not at all.
+
+    Parameters
+    ----------
+    time, telecommand
+        Write an on-board time in ticks, and a telecommand by its first four octets.
     """
     known = [None if value is None or math.isnan(value) else float(value) for value in (value_1, value_2)]
     text = EVENT_TEXTS.get(name)
     used = 0 if text is None else len(text.formats)
     if text is None or any(value is None for value in known[:used]):
-        return ", ".join(_plain(value) for value in known if value is not None and value != 0.0)
-    written = (write(value) for write, value in zip(text.formats, known, strict=False) if value is not None)
+        return ", ".join(number_text(value) for value in known if value is not None and value != 0.0)
+    own: dict[Callable[..., str], Callable[[float], str]] = {
+        request_text: telecommand,
+        _time: lambda value: _time(value, time),
+    }
+    written = (
+        own.get(write, write)(value)
+        for write, value in zip(text.formats, known, strict=False)
+        if value is not None
+    )
     return text.text.format(*written)

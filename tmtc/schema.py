@@ -534,13 +534,13 @@ class _Compiled:
                 raise ValueRefused(definition.name, f.name, None, "a value")
             value = values[f.name]
             if f.size == 1:
-                numbers.append(_encode(definition.name, f, value))
+                numbers.append(encode(definition.name, f, value))
                 continue
             elements = list(value) if isinstance(value, (Sequence, np.ndarray)) else [value]
             if len(elements) != f.size:
                 raise ValueRefused(definition.name, f.name, value, f"{f.size} numbers")
             one = replace(f, size=1)
-            numbers.extend(_encode(definition.name, one, element) for element in elements)
+            numbers.extend(encode(definition.name, one, element) for element in elements)
         try:
             return self.struct.pack(*numbers) + items
         except OverflowError:
@@ -692,8 +692,13 @@ def _expectation(f: Field) -> str:
     return f"{'a number' if f.is_float or f.is_calibrated else 'an integer'} from {low:.15g} to {high:.15g}"
 
 
-def _encode(packet: str, f: Field, value: object) -> int | float:
-    """The raw number of one engineering value."""
+def encode(packet: str, f: Field, value: object) -> int | float:
+    """Return the raw number of one engineering value; `packet` is for messages.
+
+    Raises
+    ------
+    ValueRefused
+    """
     if f.labels and isinstance(value, str):
         for code, name in f.labels:
             if name == value:
@@ -722,7 +727,7 @@ def _encode_column(packet: str, f: Field, value: object) -> RecordArray:
     if given.shape[1:] != (() if f.size == 1 else (f.size,)):
         raise ValueRefused(packet, f.name, f"shape {given.shape}", f"{f.size} number(s) an element")
     if f.labels and given.dtype.kind == "U":
-        return np.array([_encode(packet, f, str(v)) for v in given], dtype=f.dtype)
+        return np.array([encode(packet, f, str(v)) for v in given], dtype=f.dtype)
     if given.dtype.kind not in "iufb" or (given.dtype.kind == "f" and not f.is_float and not f.is_calibrated):
         raise ValueRefused(packet, f.name, given.flat[0], _expectation(f))
     if f.minimum is not None or f.maximum is not None:

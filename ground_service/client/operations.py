@@ -438,6 +438,10 @@ class Operations(Connection):
     def uplink_window(self, window_id: int) -> list[commanding.Telecommand]:
         """Release the time-tagged telecommands of an approved window; `POST uplink` then gives their octets."""
 
+    @operation("GET /windows/{window_id}/telecommands")
+    def get_planned_telecommands(self, window_id: int) -> list[planning.PlannedTelecommand]:
+        """Show the telecommands that an uplink of the window would release, with their times; nothing is released."""
+
     @operation("GET /plan/forecast")
     def get_forecast(
         self,

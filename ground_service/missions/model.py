@@ -658,6 +658,8 @@ class Mission(Section):
     resources: SpacecraftResources = SpacecraftResources()
     links: Annotated[tuple[StationConnection, ...], Array] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
+    procedures: dict[str, Annotated[str, Field(min_length=1, max_length=4000)]] = Field(default_factory=dict)
+    """What an operator does about an alarm, by the name of its event or parameter."""
 
     @model_validator(mode="after")
     def _links_once(self) -> Mission:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,13 @@ from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
 from ground_service.store import repository, telemetry
 from ground_service.store.codec import DETECTION_ITEM, unpack_detections
+from ground_service.store.models import TELECOMMANDS
 from lunar.arrays import IntArray
+from lunar.timescales import format_utc
 from reports.values import PassEvent
 from tmtc.cuc import onboard_ticks
 from tmtc.dictionary import DICTIONARY
-from tmtc.event_texts import event_text
+from tmtc.event_texts import event_text, request_text
 from tmtc.schema import PacketDefinition
 from tmtc.stream import cut_packets
 
@@ -174,11 +177,47 @@ def event_page(
     ]
     sorting = (column.desc() if newest_first else column for column in order)
     rows, total = repository.page(connection, query, asked, *sorting, others=["severity"])
-    return _pass_events([tuple(row.values()) for row in rows], span), total
+    found = [tuple(row.values()) for row in rows]
+    return _pass_events(found, span, _telecommands(connection, span.vehicle, found)), total
 
 
-def _pass_events(rows: Sequence[tuple[Any, ...]], span: PassSpan) -> list[PassEvent]:
+def _telecommands(
+    connection: Connection, vehicle: int, rows: Sequence[tuple[Any, ...]]
+) -> Callable[[int, float], str]:
+    """Return a function that writes a telecommand that an event of these rows names, by ticks and first four octets.
+
+    Sequence counts return after 16384 telecommands: the last one that was sent before the event counts.
+    """
+    wanted = {value for row in rows for value in row[-2:] if value is not None and 0.0 <= value < 2.0**32}
+    sent = func.coalesce(TELECOMMANDS.c.sent_after_ticks, 0)
+    query = select(TELECOMMANDS.c.request_id, sent, TELECOMMANDS.c.id).where(
+        TELECOMMANDS.c.vehicle_id == vehicle, TELECOMMANDS.c.request_id.in_([int(value) for value in wanted])
+    )
+    known = connection.execute(query.order_by(TELECOMMANDS.c.id)).all() if wanted else []
+
+    def text(ticks: int, request_id: float) -> str:
+        numbers = [number for request, after, number in known if request == request_id and after <= ticks]
+        return f"telecommand {numbers[-1]}" if numbers else request_text(request_id)
+
+    return text
+
+
+def _pass_events(
+    rows: Sequence[tuple[Any, ...]],
+    span: PassSpan,
+    telecommand: Callable[[int, float], str] = lambda _, request_id: request_text(request_id),
+) -> list[PassEvent]:
     """Return event reports of rows of `_EVENT_COLUMNS`."""
+
+    def time(ticks: float) -> str:
+        return format_utc(int(utc_ns_of_ticks(np.array([ticks], dtype=np.int64), span.correlations)[0][0]), 0)
+
+    def detail(ticks: int, event_id: int, frame: int, *values: float | None) -> str:
+        text = event_text(
+            labels.get(event_id, ""), *values, time=time, telecommand=partial(telecommand, ticks)
+        )
+        return f"frame {frame}: {text}" if text else f"frame {frame}"
+
     labels = DICTIONARY.labels("event_info", "event_id")
     utc_ns, correlation_ids = utc_ns_of_ticks(
         np.array([row[0] for row in rows], dtype=np.int64), span.correlations
@@ -188,15 +227,10 @@ def _pass_events(rows: Sequence[tuple[Any, ...]], span: PassSpan) -> list[PassEv
             utc_ns=int(utc),
             severity=_SEVERITIES.get(severity, str(severity)),
             name=labels.get(event_id, str(event_id)),
-            detail=_event_detail(labels.get(event_id, ""), *values),
+            detail=detail(ticks, event_id, *values),
             correlation_id=int(correlation),
         )
-        for (_, severity, event_id, *values), utc, correlation in zip(
+        for (ticks, severity, event_id, *values), utc, correlation in zip(
             rows, utc_ns, correlation_ids, strict=True
         )
     ]
-
-
-def _event_detail(name: str, frame_number: int, *values: float | None) -> str:
-    text = event_text(name, *values)
-    return f"frame {frame_number}: {text}" if text else f"frame {frame_number}"

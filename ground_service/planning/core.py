@@ -39,6 +39,13 @@ CONTACT_HORIZON_S = 86_400.0
 """Data that are not down a day after their window are taken to stay on board."""
 
 EDGE_TOLERANCE_S = 1.0
+OPEN_END = 1e6
+"""Limits beyond this, in km or degrees, are none."""
+
+TOO_SHORT = "too short"
+BATTERY, STORAGE, CONTACT = "battery too low", "storage too small", "no contact to downlink its data"
+"""Why a span is no candidate."""
+
 _DEGREE = 180.0 / math.pi
 
 
@@ -177,22 +184,27 @@ class Planner:
         """
         contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop_utc_ns)
         battery = self._battery(start_utc_ns, stop_utc_ns, step_s)
-        rejected = []
+        rejected: list[RejectedSpan] = []
+        refused: list[Candidate] = []
         candidates = []
         for first, last in self._pieces(constraints, start_utc_ns, stop_utc_ns, step_s):
             if last - first < constraints.minimum_duration_s * NS:
-                rejected.append(RejectedSpan(first, last, "too short"))
+                rejected.append(RejectedSpan(first, last, TOO_SHORT))
                 continue
             candidate = self._candidate(constraints, first, last, cadence_s, contacts, battery, commitments)
             reason = self._refusal(candidate, constraints)
             if reason:
                 rejected.append(RejectedSpan(first, last, reason))
+                refused.append(candidate)
             else:
                 candidates.append(candidate)
-        if any(one.reason != "too short" for one in rejected) or candidates:
-            return SearchResult(tuple(candidates), contacts, tuple(rejected))
-        reason = self.exclusion(constraints, start_utc_ns, stop_utc_ns, step_s=step_s)
-        return SearchResult((), contacts, tuple(rejected), reason)
+        if candidates:
+            reason = None
+        elif refused:
+            reason = explain_refusals([one.reason for one in rejected], refused)
+        else:
+            reason = self.exclusion(constraints, start_utc_ns, stop_utc_ns, step_s=step_s)
+        return SearchResult(tuple(candidates), contacts, tuple(rejected), reason)
 
     def spans(
         self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0
@@ -289,7 +301,10 @@ class Planner:
         ):
             if limits is not None:
                 beyond = np.maximum(limits[0] - value, value - limits[1])
-                text = f"{scale * limits[0]:g} to {scale * limits[1]:g} {unit}"
+                low, high = scale * limits[0], scale * limits[1]
+                text = f"{low:g} to {high:g} {unit}"
+                if low <= -OPEN_END or high >= OPEN_END:
+                    text = f"at most {high:g} {unit}" if low <= -OPEN_END else f"at least {low:g} {unit}"
                 found.append(Excess(f"{name} {text}", scale * np.maximum(beyond, 0.0), unit))
         flags: list[tuple[str, BoolArray]] = []
         if constraints.limit_rad is not None:
@@ -378,11 +393,11 @@ class Planner:
             constraints.minimum_battery is not None
             and candidate.battery_minimum < constraints.minimum_battery
         ):
-            return "battery too low"
+            return BATTERY
         if candidate.storage_peak_octets > self.resources.storage_octets:
-            return "storage too small"
+            return STORAGE
         if constraints.needs_contact and candidate.downlinked_by_utc_ns is None:
-            return "no contact to downlink its data"
+            return CONTACT
         return None
 
 
@@ -520,6 +535,22 @@ def explain_exclusion(excess: Sequence[Excess], needed: int, step_s: float) -> s
     if longest > 1:
         helps.append(f"a minimum duration of {(longest - 1) * step_s:g} s")
     return reason + (f"; possible: {' or '.join(helps)}" if helps else "; no single relaxation gives one")
+
+
+def explain_refusals(reasons: Sequence[str], refused: Sequence[Candidate]) -> str:
+    """Return what excludes every span in which the constraints hold, and the nearest relaxation of each reason."""
+    battery = max(one.battery_minimum for one in refused)
+    storage = min(one.storage_peak_octets for one in refused)
+    helps = {
+        BATTERY: f"a minimum battery of {math.floor(1e3 * battery) / 1e3:g}",
+        STORAGE: f"a storage of {storage / (1 << 20):.3g} MiB",
+        CONTACT: "without the need of a contact within the span",
+        TOO_SHORT: "a shorter minimum duration",
+    }
+    found = [one for one in helps if one in reasons]
+    counted = ", ".join(f"{one} ({reasons.count(one)})" for one in found)
+    possible = " or ".join(helps[one] for one in found)
+    return f"no window: {len(reasons)} spans are excluded by {counted}; possible: {possible}"
 
 
 def _range(values: FloatArray | IntArray) -> Range:

@@ -71,11 +71,11 @@ class ResourceGrid:
         """Length of a step."""
         return round(self.step_s * NS)
 
-    def energy_wh(self, option: Option) -> FloatArray:
-        """Return the energy that an observation takes from the battery in each step (n,)."""
+    def observing_s(self, option: Option) -> FloatArray:
+        """Return the time of an observation within each step (n,)."""
         edges = self.start_utc_ns + np.arange(len(self.gain_wh) + 1, dtype=np.int64) * self.step_ns
         inside = np.minimum(edges[1:], option.stop_utc_ns) - np.maximum(edges[:-1], option.start_utc_ns)
-        return np.asarray(np.maximum(inside, 0) / NS / 3600.0 * self.observing_w)
+        return np.asarray(np.maximum(inside, 0) / NS)
 
     def arrival(self, option: Option) -> int:
         """Return the step at whose end the data of an observation are on board."""
@@ -86,7 +86,7 @@ class ResourceGrid:
         """Return the change of the battery and the octets that arrive in each step (n,) with a set of windows."""
         change, arrivals = self.gain_wh.copy(), np.zeros(len(self.gain_wh))
         for option in chosen:
-            change -= self.energy_wh(option)
+            change -= self.observing_s(option) * self.observing_w / 3600.0
             arrivals[self.arrival(option)] += option.octets
         return change, arrivals
 
@@ -122,8 +122,15 @@ class ResourceCurves:
 
 
 def curves(grid: ResourceGrid, chosen: Sequence[Option]) -> ResourceCurves:
-    """Return battery, storage and downlink with a set of windows, whether or not it keeps the limits."""
-    change, arrivals = grid.flows(chosen)
+    """Return battery, storage and downlink with a set of windows, whether or not it keeps the limits.
+
+    Data come on board while a window lasts. The check of the limits takes them at its end, when they can be downlinked.
+    """
+    change, _ = grid.flows(chosen)
+    arrivals = np.zeros(len(change))
+    for option in chosen:
+        inside = grid.observing_s(option)
+        arrivals += option.octets * inside / max(inside.sum(), 1e-9)
     battery, stored, sent = np.empty(len(change)), np.empty(len(change)), np.empty(len(change))
     charge, held = grid.battery_wh, 0.0
     for i, (gain, arrived, can) in enumerate(

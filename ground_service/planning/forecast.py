@@ -82,6 +82,7 @@ def get_forecast(
         data=[],
         step_s=step_s,
         **{name: [] for name in _COLUMNS},
+        assumed=service.assumed_resources(mission),
         battery_floor=service.battery_floor(mission),
         storage_octets=service.resources_of(mission).storage_octets,
         conflicts=_overlaps(windows, {}),

@@ -216,6 +216,7 @@ class PlanForecast(Entity):
     sun_elevation_deg: list[float] = Field(description="At the sub-satellite point")
     sunlit: list[float] = Field(description="Share of the Sun's disc that the spacecraft sees")
     battery_share: list[float] = Field(description="Charge at the end of the step, share of the capacity")
+    assumed: list[str] = Field(description="Resources that the mission description does not state")
     battery_floor: float = Field(description="Minimum share of the mission description or of the planner")
     stored_octets: list[int] = Field(description="Data on board at the end of the step")
     storage_octets: int = Field(description="Capacity of the storage")
@@ -355,6 +356,14 @@ class WindowRecord(Window):
         """Return the request of the window."""
         stated = self.model_dump(include=set(WindowIn.model_fields) - {"start", "stop"})
         return WindowEntry(start_utc_ns=self.start.utc_ns, stop_utc_ns=self.stop.utc_ns, **stated)
+
+
+class PlannedTelecommand(Entity):
+    """A telecommand of a window before its release."""
+
+    time: UtcTime | None = Field(description="When it acts on board; null: on reception")
+    name: str = Field(examples=["perform_function"])
+    text: str = Field(description="Its arguments with names and units")
 
 
 class WindowFilter(Paging):

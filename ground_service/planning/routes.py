@@ -26,6 +26,7 @@ from ground_service.planning import forecast, service, store
 from ground_service.planning.model import (
     CraterDensity,
     PlanForecast,
+    PlannedTelecommand,
     SearchResult,
     Window,
     WindowChange,
@@ -119,6 +120,12 @@ def uplink_window(ground: GroundOf, caller: Operator, window_id: PassId) -> Page
     """Release the time-tagged telecommands of an approved window; `POST uplink` then gives their octets."""
     ids = service.uplink_window(ground, window_id, actor=caller.name)
     return PageOf.all_of([commanding.get_command(ground, key).telecommand for key in ids])
+
+
+@planning.get("/windows/{window_id}/telecommands", responses=problems(409))
+def get_planned_telecommands(ground: GroundOf, _: Viewer, window_id: PassId) -> PageOf[PlannedTelecommand]:
+    """Show the telecommands that an uplink of the window would release, with their times; nothing is released."""
+    return PageOf.all_of(service.preview_window(ground, window_id))
 
 
 @planning.get("/plan/forecast", responses=problems(404))

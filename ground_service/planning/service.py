@@ -44,6 +44,7 @@ from ground_service.planning.filling import Option, ResourceGrid
 from ground_service.planning.model import (
     AssessedWindow,
     Contact,
+    PlannedTelecommand,
     SearchResult,
     Window,
     WindowEntry,
@@ -68,6 +69,7 @@ from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
 from lunar.errors import EphemerisCoverageError
+from tmtc.arguments import argument_text
 
 NS = NANOSECONDS_PER_SECOND
 
@@ -80,6 +82,7 @@ BATTERY_HISTORY_S = 7200
 """The battery is taken to be full one orbit before a window that is checked by itself."""
 
 VERIFICATION_MARGIN_S = 3600
+ENABLE = "enable_schedule"
 
 DAYLIGHT_RAD = (0.0, math.pi / 2.0)
 """A camera needs the Sun above the horizon of the sub-satellite point."""
@@ -299,60 +302,92 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         conflicts = _span_conflicts(connection, window.vehicle_id, window_id, window.entry(), mission)
         if conflicts:
             raise PlanConflicts(f"window {window_id}", conflicts)
-        correlations = load_correlations(connection, window.vehicle_id)
-        start, stop = window.start.utc_ns, window.stop.utc_ns
-        # The observation ends by the second telecommand; by itself a frame later should that one be lost.
-        duration_s = (stop - start) / NS + window.cadence_s
-        timeout_s = round(max(stop - mission_now_ns(), 0) / NS) + VERIFICATION_MARGIN_S
-        activities = (
-            (start, ("start_observation", duration_s, window.cadence_s)),
-            (stop, ("stop_observation", 0.0, 0.0)),
-        )
+        ticks_of = _ticks_of(connection, window)
+        timeout_s = round(max(window.stop.utc_ns - mission_now_ns(), 0) / NS) + VERIFICATION_MARGIN_S
         approval = commanding.Approval(window.edited_by, window.decided_by)
-        further = _preparation(
-            ground, connection, window, lambda utc_ns: ticks_of_utc_ns(utc_ns, correlations)
-        )
+        activities, uploads = _activities(ground, connection, window, ticks_of)
+        if uploads is not None:
+            store.note_uploads(connection, window_id, uploads)
         ids = [
             commanding.add_released(
                 connection,
                 window.vehicle_id,
-                "enable_schedule",
+                ENABLE,
                 {},
                 actor=actor,
                 window_id=window_id,
                 approval=approval,
             )
         ]
-        named: list[Activity] = [
-            (utc_ns, "perform_function", {"function_id": function, "argument_1": first, "argument_2": second})
-            for utc_ns, (function, first, second) in activities
-        ]
-        for utc_ns, command, arguments in sorted([*further, *named], key=lambda one: one[0]):
+        for utc_ns, command, arguments in activities:
             ids.append(
                 commanding.add_scheduled(
                     connection,
                     window.vehicle_id,
                     command,
                     arguments,
-                    release_ticks=ticks_of_utc_ns(utc_ns, correlations),
+                    release_ticks=ticks_of(utc_ns),
                     actor=actor,
                     timeout_s=timeout_s,
                     window_id=window_id,
                     approval=approval,
                 )
             )
-        commands.limit_sending(connection, ids, start)
+        commands.limit_sending(connection, ids, window.start.utc_ns)
         _note(connection, actor, "uplink", window_id, window.state, {"telecommands": ids})
         return ids
 
 
+def preview_window(ground: Ground, window_id: int) -> list[PlannedTelecommand]:
+    """Return the telecommands that `uplink_window` would release now, in the order in which they act.
+
+    Raises
+    ------
+    Conflict
+        A table needs a reference ephemeris, and none covers the window.
+    """
+    with ground.database.reading() as connection:
+        window = store.get_record(connection, window_id)
+        activities, _ = _activities(ground, connection, window, _ticks_of(connection, window))
+    planned: list[tuple[int | None, str, dict[str, Any]]] = [(None, ENABLE, {}), *activities]
+    return [
+        PlannedTelecommand(
+            time=None if utc_ns is None else UtcTime(utc_ns), name=name, text=argument_text(name, arguments)
+        )
+        for utc_ns, name, arguments in planned
+    ]
+
+
+def _ticks_of(connection: Connection, window: WindowRecord) -> TicksOf:
+    correlations = load_correlations(connection, window.vehicle_id)
+    return lambda utc_ns: ticks_of_utc_ns(utc_ns, correlations)
+
+
+def _activities(
+    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: TicksOf
+) -> tuple[list[Activity], model.WindowUploads | None]:
+    """Return the activities of a window in order of time, and what they load on board."""
+    start, stop = window.start.utc_ns, window.stop.utc_ns
+    # The observation ends by the second telecommand; by itself a frame later should that one be lost.
+    duration_s = (stop - start) / NS + window.cadence_s
+    further, uploads = _preparation(ground, connection, window, ticks_of)
+    named: list[Activity] = [
+        (utc_ns, "perform_function", {"function_id": function, "argument_1": first, "argument_2": second})
+        for utc_ns, function, first, second in (
+            (start, "start_observation", duration_s, window.cadence_s),
+            (stop, "stop_observation", 0.0, 0.0),
+        )
+    ]
+    return sorted([*further, *named], key=lambda one: one[0]), uploads
+
+
 def _preparation(
     ground: Ground, connection: Connection, window: WindowRecord, ticks_of: TicksOf
-) -> list[Activity]:
-    """Return the activities that prepare a window, where its mission description asks for uploads."""
+) -> tuple[list[Activity], model.WindowUploads | None]:
+    """Return the activities that prepare a window, where its mission description asks for uploads, and the uploads."""
     mission = None if window.mission_id is None else missions.get_mission(connection, window.mission_id)
     if mission is None or mission.uploads is None:
-        return []
+        return [], None
     start, stop = window.start.utc_ns, window.stop.utc_ns
     found = ephemerides.covering_ephemerides(
         connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id
@@ -381,15 +416,14 @@ def _preparation(
         8 * window.id,
         begin,
     )
-    if state is not None:
-        uploaded = model.UploadedState(
-            utc=UtcTime(state.utc_ns),
-            position_icrf_m=tuple(state.position_icrf_m.tolist()),
-            velocity_icrf_m_s=tuple(state.velocity_icrf_m_s.tolist()),
-        )
-        noted = model.WindowUploads(start_state=uploaded, experiment=experiment)
-        store.note_uploads(connection, window.id, noted)
-    return activities
+    if state is None:
+        return activities, None
+    uploaded = model.UploadedState(
+        utc=UtcTime(state.utc_ns),
+        position_icrf_m=tuple(state.position_icrf_m.tolist()),
+        velocity_icrf_m_s=tuple(state.velocity_icrf_m_s.tolist()),
+    )
+    return activities, model.WindowUploads(start_state=uploaded, experiment=experiment)
 
 
 def _is_of_experiment(connection: Connection, window: WindowRecord, mission: Mission) -> bool:
@@ -503,6 +537,17 @@ def resources_of(mission: Mission) -> Resources:
     }
     given = stated.model_dump(include=set(default)) | given
     return Resources(**default | {name: value for name, value in given.items() if value is not None})
+
+
+def assumed_resources(mission: Mission) -> list[str]:
+    """Return which of battery, storage and downlink a mission description does not state."""
+    stated, rates = mission.resources, (mission.link.stations or {}).values()
+    known = {
+        "battery": stated.battery_wh is not None,
+        "storage": stated.storage_mib is not None,
+        "downlink": stated.downlink_kbit_s is not None or any(one.downlink_bps is not None for one in rates),
+    }
+    return [name for name, is_stated in known.items() if not is_stated]
 
 
 def battery_floor(mission: Mission) -> float:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,9 @@ from ground_service.http.common import Key
 from ground_service.missions.model import Approval
 from ground_service.passes.series import STATE_VALUES
 from ground_service.regression.service import report_of
+from tmtc.arguments import FUNCTION_ARGUMENTS
 from tmtc.dictionary import DICTIONARY, STRUCTURES
+from tmtc.onboard_parameters import PARAMETERS, Parameter
 from tmtc.schema import Field, PacketDefinition
 
 _HERE = Path(__file__).parent
@@ -266,6 +268,8 @@ def _dictionary() -> dict[str, Any]:
         "version": DICTIONARY.version,
         "hash": DICTIONARY.hash,
         "telecommands": [_telecommand(definition) for definition in DICTIONARY.telecommands],
+        "functions": {name: list(map(_field, fields)) for name, fields in FUNCTION_ARGUMENTS.items()},
+        "onboard_parameters": [_onboard_parameter(one) for one in PARAMETERS],
         "parameters": [_field(field) for packet in STRUCTURES.values() for field in packet.fields[1:]],
         "estimators": list(DICTIONARY.labels("navigation_state", "estimator").values()),
     }
@@ -298,6 +302,10 @@ def _field(field: Field) -> dict[str, Any]:
         "warning": field.warning,
         "alarm": field.alarm,
     }
+
+
+def _onboard_parameter(one: Parameter) -> dict[str, Any]:
+    return asdict(one) | {"description": one.meaning, "type": "u32" if one.whole else "f64", "labels": {}}
 
 
 @lru_cache(maxsize=2)

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from linna.commands._table import Command, Option, add_commands
+
+if TYPE_CHECKING:
+    from ground_service.access.model import AuditEntry
+
+
+def _line(one: AuditEntry) -> str:
+    text = one.detail.get("text", "")
+    return f"{one.number:>6}  {one.time[:19]}Z  {one.actor:<12} {one.action} {one.target} {text}".rstrip()
+
 
 COMMANDS = {
     "list": Command(
         "list_audit",
         "list the entries, newest first",
-        lambda one: f"{one.number:>6}  {one.time[:19]}Z  {one.actor:<12} {one.action} {one.target}",
+        _line,
         "entries",
         "no entries",
         options={

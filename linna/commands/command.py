@@ -17,7 +17,18 @@ if TYPE_CHECKING:
     from ground_service.contacts.commanding.model import Handover, Telecommand, UplinkChannel, UplinkState
     from linna.parser import LinnaParser
 
-SHOWN = {"id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by", "remark"}
+SHOWN = {
+    "id",
+    "name",
+    "arguments",
+    "text",
+    "state",
+    "critical",
+    "timed_out",
+    "requested_by",
+    "decided_by",
+    "remark",
+}
 
 
 def _enter(
@@ -76,7 +87,8 @@ def _figures(telecommand: Telecommand) -> dict[str, Any]:
 
 def _text(telecommand: Telecommand) -> str:
     remark = f", {telecommand.remark}" if telecommand.remark else ""
-    return f"telecommand {telecommand.id} ({telecommand.name}): {telecommand.state}{remark}"
+    named = f", {telecommand.text}" if telecommand.text else ""
+    return f"telecommand {telecommand.id} ({telecommand.name}{named}): {telecommand.state}{remark}"
 
 
 def _receiver(state: UplinkState) -> str:
@@ -114,7 +126,7 @@ COMMANDS: Commands = {
     "list": Command(
         "list_telecommands",
         "list telecommands and their states, newest first",
-        lambda one: f"{one.id:>6}  {one.state:<10} {one.name}  {one.requested_by}",
+        lambda one: f"{one.id:>6}  {one.state:<10} {one.name}  {one.requested_by}  {one.text}",
         "telecommands",
         "no telecommands",
         _figures,

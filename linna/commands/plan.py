@@ -267,6 +267,13 @@ COMMANDS: Commands = {
         _released,
         options={"out": "write all released telecommands as CLTUs; they count as sent"},
     ),
+    "preview": Command(
+        "get_planned_telecommands",
+        "show the telecommands that an uplink of a window would release",
+        lambda one: f"{one.time or 'on reception':<27}  {one.name}  {one.text}".rstrip(),
+        "telecommands",
+        "none",
+    ),
     "request": Group("standing requests, which the planner keeps in the plan", REQUESTS),
 }
 

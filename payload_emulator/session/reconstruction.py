@@ -23,7 +23,6 @@ from lunar.catalogue import load_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.commanding import Refusal, parse_commands
-from payload_emulator.flight.onboard.parameters import find_parameter
 from payload_emulator.flight.ports import UNLIMITED, ResetCause
 from payload_emulator.flight.telemetry.products import image_report
 from payload_emulator.session.camera import Exposure, expose
@@ -51,6 +50,7 @@ from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.errors import TmtcError
+from tmtc.onboard_parameters import find_parameter
 from tmtc.schema import Table
 from tmtc.tables import table_hash
 

@@ -207,6 +207,7 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             do("plan", "approve", number)
             do("plan", "draft", number)
             do("plan", "approve", number)
+            ask("plan", "preview", number)
             do("plan", "uplink", number)
             ask("plan", "show", number)
             ask("plan", "list")

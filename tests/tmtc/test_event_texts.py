@@ -18,7 +18,10 @@ def test_values_of_events_are_read_as_names() -> None:
     assert event_text("mode_changed", 1.0, 2.0) == "from standby to observing"
     assert event_text("table_loaded", 3.0, float(0xDF7F5779)) == "gravity, hash df7f5779"
     assert event_text("camera_fault", 82.0, 3.0) == "82 frames without image, camera switched 3 times"
-    assert event_text("telecommand_rejected", 5.0, float(0x1885C007)) == "telecommand 7: wrong mode"
+    assert (
+        event_text("telecommand_rejected", 5.0, float(0x1885C007))
+        == "telecommand with sequence count 7: wrong mode"
+    )
     seconds = (29 * 365 + 8 + 218) * 86_400 + 6 * 3600 + 37
     assert event_text("observation_started", seconds * 65_536.0, 15 * 65_536.0) == (
         "until 2029-08-07T06:00:37 TAI, every 15 s"

@@ -12,7 +12,8 @@ from ground_service.http.model import Entity, Given, InstanceName, Paging, Space
 from ground_service.http.times import UtcTime
 from ground_service.ingest.model import ControlWords
 from ground_service.text import LINE_PATTERN_JSON
-from lunar.timescales import utc_ns_from_ticks
+from lunar.timescales import format_utc, utc_ns_from_ticks
+from tmtc.arguments import argument_text
 from tmtc.codes import FAILURES
 
 _FAILURES = dict(FAILURES)
@@ -52,6 +53,9 @@ class Telecommand(Entity):
     id: int
     name: str
     arguments: dict[str, Any]
+    text: str = Field(
+        description="The arguments with names and units", examples=["duration 900 s, cadence 15 s"]
+    )
     spacecraft_id: int
     instance: str
     state: str = Field(
@@ -103,6 +107,11 @@ class CommandRecord(Entity):
     send_before_utc_ns: int | None
 
 
+def onboard_time(ticks: float) -> str:
+    """Return the UTC of an on-board clock without error."""
+    return f"{format_utc(utc_ns_from_ticks(int(ticks)), 0)}"
+
+
 @dataclass(frozen=True, slots=True)
 class CommandOctets:
     """Sequence count and octets of a released telecommand, which never change."""
@@ -151,6 +160,7 @@ class CommandView:
         ticks = self.record.arguments.get("release_ticks")
         return Telecommand.of(
             dict(self.record),
+            text=argument_text(self.record.name, self.record.arguments, onboard_time),
             spacecraft_id=self.spacecraft_id,
             instance=self.instance,
             state=self.state,

@@ -27,6 +27,7 @@ from ground_service.contacts.commanding.model import (
     Telecommand,
     TelecommandFilter,
     UplinkState,
+    onboard_time,
 )
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import CommandsSent, CommandStateChanged, HandoverChanged, publish
@@ -36,6 +37,7 @@ from ground_service.missions.store import approval_in_force, in_force
 from ground_service.store.counters import lock_spacecraft, next_telecommand
 from ground_service.store.vehicles import FLOWN, find_vehicle, get_vehicle, vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
+from tmtc.arguments import argument_text, arguments_by_number
 from tmtc.dictionary import DICTIONARY
 from tmtc.effects import CommandEffect, effect_of
 from tmtc.errors import TmtcError
@@ -346,6 +348,7 @@ def _add(
 ) -> int:
     """Add a valid telecommand; return its id."""
     _packed(name, arguments, 0)
+    arguments = arguments_by_number(name, arguments)
     if isinstance(timeout_s, bool) or not 1 <= timeout_s <= TIMEOUT_LIMIT_S:
         raise InvalidInput("telecommand", "timeout_s", f"1 to {TIMEOUT_LIMIT_S}", str(timeout_s)[:40])
     key = store.add_command(
@@ -362,7 +365,14 @@ def _add(
         mission_id=in_force(connection, vehicle),
         issued=issued,
     )
-    _note(connection, actor, "enter", key, state, {"name": name, "arguments": dict(arguments)})
+    _note(
+        connection,
+        actor,
+        "enter",
+        key,
+        state,
+        {"name": name, "text": argument_text(name, arguments, onboard_time), "arguments": dict(arguments)},
+    )
     return key
 
 
@@ -386,7 +396,7 @@ def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
         expected = f"one of the {len(COMMANDS)} telecommands of the dictionary, such as {near[0]}"
         raise InvalidInput("telecommand", "name", expected, repr(name)[:80])
     try:
-        return DICTIONARY.pack_command(name, dict(arguments), sequence_count=count)
+        return DICTIONARY.pack_command(name, arguments_by_number(name, arguments), sequence_count=count)
     except TmtcError as error:
         raise InvalidInput("telecommand", name, "arguments as the dictionary says", str(error)) from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:

@@ -52,6 +52,7 @@ class AlarmChange(Entity):
 class AlarmDetail(Alarm):
     """An alarm with its history, oldest change first."""
 
+    procedure: str | None = Field(description="What to do about it, by the mission description in force")
     history: list[AlarmChange]
 
 

@@ -20,6 +20,7 @@ from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import AlarmChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
+from ground_service.missions.store import mission_in_force
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes.alarms import core, store
@@ -237,9 +238,12 @@ def _condition(row: AlarmRow) -> Condition:
 
 
 def get_alarm(connection: Connection, alarm_id: int) -> AlarmDetail:
-    """Return an alarm with its history."""
+    """Return an alarm with its history and the procedure of the mission description."""
     alarm = _alarm(connection, store.get(connection, alarm_id), utc_now_ns())
-    return AlarmDetail(**alarm.model_dump(), history=store.history(connection, alarm_id))
+    mission = mission_in_force(connection, alarm.spacecraft_id)
+    procedure = None if mission is None else mission.procedures.get(alarm.name)
+    history = store.history(connection, alarm_id)
+    return AlarmDetail(**alarm.model_dump(), procedure=procedure, history=history)
 
 
 def _alarm(connection: Connection, row: AlarmRow, now: int) -> Alarm:

@@ -1,16 +1,45 @@
 import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, element, figure, pager, parameterName, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
+import { chart } from "./charts.js";
+import { acting, byId, dictionary, element, figure, isoText, limitText, notice, pager, parameterName, plural, seconds, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
+import { seriesOf } from "./parameters.js";
 
 const OPEN = ["raised", "acknowledged", "shelved"];
 const HOUR_MS = 3600e3;
 const nameOf = (alarm) => parameterName(alarm.name, alarm.unit);
 
-async function showHistory(id) {
+const AROUND_S = 1800;
+const parameter = (name) => dictionary.parameters.find((one) => one.name === name);
+
+// What the packets around an alarm say: the series of its parameter with the limits, or its event reports.
+async function evidence(alarm) {
+  const span = { start: isoText(seconds(alarm.first) - AROUND_S), stop: isoText(seconds(alarm.last) + AROUND_S) };
+  const craft = { spacecraft_id: alarm.spacecraft_id, instance: alarm.instance };
+  if (alarm.source === "operations") return [element("p", {}, "A condition of the ground: see the ", element("a", { href: "/status" }, "status of the service"), ".")];
+  const query = new URLSearchParams({ spacecraft: `${craft.spacecraft_id} ${craft.instance}`, ...span });
+  const [{ items }, passes] = await Promise.all([get("events", { ...craft, ...span, name: alarm.source === "event" ? alarm.name : null, limit: 5 }), get("passes", { limit: 200 })]);
+  const pass = passes.items.find((one) => one.spacecraft_id === alarm.spacecraft_id && seconds(one.start) <= seconds(alarm.last) && seconds(alarm.last) <= seconds(one.stop));
+  const place = element("div");
+  const about = alarm.source === "parameter" ? parameter(alarm.name) : null;
+  if (about) {
+    byId("detail").append(place); // a chart is as wide as its place
+    const answer = await get(`spacecraft/${alarm.spacecraft_id}/telemetry/${encodeURIComponent(alarm.name)}`, { instance: alarm.instance, ...span, max_points: 600 });
+    chart(place, nameOf(alarm), unitText(alarm.unit), [seriesOf(about, answer)]);
+  }
+  const limits = about && [about.warning && `warning ${limitText(about.warning)}`, about.alarm && `alarm ${limitText(about.alarm)}`].filter(Boolean).join(", ");
+  return [
+    element("p", {}, about ? `${about.description}: ${limits} ${unitText(alarm.unit)}. ` : `Event ${alarm.name.replaceAll("_", " ")}. `, `${plural(alarm.count, "packet")} from ${timeText(alarm.first)} to ${timeText(alarm.last)}. `, pass ? element("a", { href: `/passes/${pass.id}` }, `Pass ${pass.name}`) : "No pass has this time.", " ", element("a", { href: `/events?${query}` }, "Events around it")),
+    place,
+    table("Event reports", [["Time", (row) => timeText(row.time)], ["Event", (row) => row.name.replaceAll("_", " ")], ["Detail", (row) => row.detail]], items, "No event report around it."),
+  ];
+}
+
+async function showDetail(id) {
   const alarm = await get(`alarms/${id}`);
-  byId("history-section").hidden = false;
+  byId("detail-section").hidden = false;
   state({ alarm: id });
-  byId("history-title").textContent = `History of alarm ${id}: ${nameOf(alarm)}`;
+  byId("detail-title").textContent = `Alarm ${id}: ${nameOf(alarm)}`;
+  show("procedure", alarm.procedure ?? "The mission description states no procedure for this alarm (procedures).");
   show(
     "history",
     table(
@@ -20,16 +49,35 @@ async function showHistory(id) {
       "None.",
     ),
   );
+  show("detail", await evidence(alarm));
 }
 
+const comment = () => ({ comment: byId("comment").value.trim() });
 const change = (path, id, body) => acting(async () => {
-  await send("POST", `alarms/${id}/${path}`, body);
+  await send("POST", `alarms/${id}/${path}`, { ...comment(), ...body });
   await reload();
-  if (!byId("history-section").hidden) await showHistory(id);
+  if (!byId("detail-section").hidden) await showDetail(id);
 });
 
+const picked = new Set(); // survives a table that is drawn again
+const pick = (event) => picked[event.target.checked ? "add" : "delete"](Number(event.target.value));
+
+async function acknowledgeChosen() {
+  const ids = [...picked];
+  if (!ids.length) throw new Error("Choose raised alarms in the table.");
+  try {
+    for (const id of ids) {
+      picked.delete(id);
+      await send("POST", `alarms/${id}/acknowledge`, comment());
+    }
+    notice(`${plural(ids.length, "alarm")} acknowledged`);
+  } finally {
+    await reload();
+  }
+}
+
 function actions(alarm) {
-  const button = (label, listener) => element("button", { type: "button", onclick: listener, "data-needs": label === "History" ? null : "operator", "aria-label": `${label} alarm ${alarm.id}` }, label);
+  const button = (label, listener) => element("button", { type: "button", onclick: listener, "data-needs": label === "Detail" ? null : "operator", "aria-label": `${label} alarm ${alarm.id}` }, label);
   const until = (hours) => new Date(Date.now() + hours * HOUR_MS).toISOString();
   return element(
     "span",
@@ -37,7 +85,7 @@ function actions(alarm) {
     alarm.state === "raised" ? button("Acknowledge", change("acknowledge", alarm.id, {})) : null,
     alarm.state === "shelved" ? button("Unshelve", change("shelve", alarm.id, { until: until(-1) })) : null,
     ["raised", "acknowledged"].includes(alarm.state) ? button("Shelve 8 h", change("shelve", alarm.id, { until: until(8) })) : null,
-    button("History", acting(() => showHistory(alarm.id))),
+    button("Detail", acting(() => showDetail(alarm.id))),
   );
 }
 
@@ -49,17 +97,17 @@ const reload = pager(async (limit, offset) => {
     table(
       "Alarms",
       [
-        ["Alarm", nameOf],
+        ["", (row) => (row.state === "raised" ? element("input", { type: "checkbox", value: row.id, checked: picked.has(row.id), onchange: pick, "data-needs": "operator", "aria-label": `choose alarm ${row.id}` }) : "")],
+        ["Alarm", nameOf, "keep"],
+        ["", actions],
         ["Severity", (row) => stateMark(row.severity)],
         ["State", (row) => stateMark(row.state)],
-        ["Condition", (row) => (row.active ? "continues" : "has ended")],
+        ["Condition", (row) => `${row.active ? "continues" : "has ended"}${row.acknowledged_by ? `, acknowledged by ${row.acknowledged_by}, ${timeText(row.acknowledged)}` : ""}`],
         ["Count", (row) => figure(row.count), "num"],
         ["Last value", (row) => (row.value === null ? "" : `${figure(row.value)} ${unitText(row.unit)}, limits ${row.limits}`)],
         ["First", (row) => timeText(row.first)],
         ["Last", (row) => timeText(row.last)],
         ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
-        ["Acknowledged", (row) => (row.acknowledged_by ? `${row.acknowledged_by}, ${timeText(row.acknowledged)}` : "")],
-        ["", actions],
       ],
       page.items,
       "No alarms.",
@@ -78,4 +126,5 @@ watch((message) => message.kind === "alarm" && reload().catch(trouble), reload);
 byId("state").value = stated("state") === "any" ? "" : (stated("state") ?? "open");
 byId("severity").value = stated("severity") === "any" ? "" : (stated("severity") ?? "");
 reload().catch((error) => error.status === 401 || trouble(error));
-if (stated("alarm")) showHistory(stated("alarm")).catch((error) => error.status === 401 || trouble(error));
+byId("acknowledge").addEventListener("click", acting(acknowledgeChosen));
+if (stated("alarm")) showDetail(stated("alarm")).catch((error) => error.status === 401 || trouble(error));

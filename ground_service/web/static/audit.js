@@ -6,7 +6,9 @@ const FIELDS = ["actor", "action", "target", "since", "until"];
 let chosen = Object.fromEntries(FIELDS.map((name) => [name, stated(name)]).filter(([, value]) => value));
 
 function detail(entry) {
-  const text = Object.entries(entry.detail)
+  const { text: named, ...rest } = entry.detail;
+  if (named !== undefined) delete rest.arguments;
+  const text = Object.entries({ ...rest, ...(named && { arguments: named }) })
     .map(([key, value]) => `${key.replaceAll("_", " ")} ${value !== null && typeof value === "object" ? JSON.stringify(value) : value}`)
     .join(", ");
   return text.length > 160 ? element("span", { title: text.slice(0, 2000) }, `${text.slice(0, 159)}…`) : text;

@@ -1,5 +1,6 @@
 // Chain of a planned window: the steps that it has reached, the one that it waits for, and what continues it.
-import { lengthText, missionNow, seconds, timeText } from "./page.js";
+import { get, send } from "./api.js";
+import { confirmed, figure, lengthText, missionNow, notice, seconds, table, timeText } from "./page.js";
 
 export const STEPS = ["requested", "approved", "released", "sent", "accepted", "executed", "received", "reported"];
 const VERIFIED = ["accepted", "started", "completed"];
@@ -57,4 +58,46 @@ export function chainOf(window, telecommands, contact) {
     waiting: failed ? null : waiting,
     text: failed ? `failed: ${why}` : waiting ? [reasons[waiting], why].filter(Boolean).join("; ") : "reported",
   };
+}
+
+// The contact of a spacecraft now, otherwise the next one.
+export function contactOf(craft, contacts) {
+  const now = missionNow();
+  const ahead = contacts.filter((one) => one.spacecraft_id === craft.spacecraft_id && (one.state === "open" || (one.state === "predicted" && seconds(one.stop) > now)));
+  return ahead.find((one) => one.state === "open") ?? ahead.sort((a, b) => seconds(a.start) - seconds(b.start))[0] ?? null;
+}
+
+// The link that sends to a spacecraft: that of its contact, otherwise one that works.
+export function uplinkOf(craft, links, contact) {
+  const able = links.filter((one) => one.uplink && one.spacecraft_id === craft.spacecraft_id && one.instance === craft.instance);
+  return able.find((one) => one.name === contact?.link) ?? able.find((one) => one.state !== "failed") ?? able[0] ?? null;
+}
+
+const named = (one) => `${one.name.replaceAll("_", " ")}${one.text ? `: ${one.text}` : ""}`;
+
+// Telecommands of a window with their times, before their release.
+export const sequenceTable = (planned) =>
+  table("Telecommands of the window", [["On board", (row) => (row.time ? timeText(row.time) : "on reception")], ["Telecommand", named]], planned, "None.");
+
+// Release the telecommands of a window after a look at them; in a contact they are sent as well.
+export async function release(window, link, contact) {
+  const { items } = await get(`windows/${window.id}/telecommands`);
+  const now = link !== null && contact?.state === "open" && contact.link === link.name;
+  const then = now ? `Link ${link.name} is in contact and sends them with what else is released.` : link?.send === "automatic" ? `Link ${link.name} sends them in its next contact.` : "They wait for Send now.";
+  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, sequenceTable(items), then];
+  if (!(await confirmed(`Release the telecommands of ${window.name}?`, lines, now ? "Release and send" : "Release"))) return;
+  const released = await send("POST", `windows/${window.id}/uplink`);
+  notice(`${window.name}: ${released.items.length} telecommands released`);
+  if (now) await order(link);
+}
+
+async function order(link) {
+  await send("POST", `links/${encodeURIComponent(link.name)}/send`);
+  notice(`Link ${link.name} sends what is released.`);
+}
+
+// Send what is released, after a look at it.
+export async function transmit(link, waiting) {
+  const lines = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`);
+  if (await confirmed(`Send ${lines.length} telecommands over ${link.name} now?`, lines, "Send")) await order(link);
 }

@@ -1,65 +1,53 @@
 import { bind } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, dictionary, element, notice, pager, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, dictionary, element, figure, notice, pager, show, stateMark, table, timeText, trouble, watch } from "./page.js";
 
 const words = (name) => name.replaceAll("_", " ");
 const definition = Object.fromEntries(dictionary.telecommands.map((one) => [one.name, one]));
 const STAGES = ["accepted", "started", "completed"];
 
-function input(field, id) {
-  const labels = Object.entries(field.labels);
-  const about = [field.description, field.unit && `[${field.unit}]`].filter(Boolean).join(" ");
-  if (labels.length) {
-    return element("label", { title: about }, words(field.name), element("select", { id }, labels.map(([, label]) => element("option", { value: label }, words(label)))));
-  }
-  return element(
-    "label",
-    { title: about },
-    `${words(field.name)}${field.unit ? `, ${field.unit}` : ""}`,
-    element("input", { id, type: "number", step: field.type[0] === "f" ? "any" : "1", min: field.minimum ?? (field.type[0] === "u" ? 0 : null), max: field.maximum, value: Math.max(0, field.minimum ?? 0), required: true }),
-  );
+// A field of the dictionary as an input with its unit, range and names.
+function input(field) {
+  const id = `argument-${field.name}`;
+  const labels = Object.values(field.labels);
+  const range = field.minimum !== null && field.maximum !== null ? `${figure(field.minimum)} to ${figure(field.maximum)}` : null;
+  const about = [field.description, field.unit && `[${field.unit}]`, range].filter(Boolean).join(", ");
+  const made = labels.length
+    ? element("select", { id, name: field.name }, labels.map((label) => element("option", { value: label }, words(label))))
+    : element("input", { id, name: field.name, type: "number", step: field.type[0] === "f" ? "any" : "1", min: field.minimum ?? (field.type[0] === "u" ? 0 : null), max: field.maximum, value: field.default ?? Math.max(0, field.minimum ?? 0), required: true });
+  const unit = field.unit.replaceAll("/", "_");
+  const name = field.name.replace(/_id$/, "").replace(unit && new RegExp(`_${unit}$`), "");
+  return element("label", { title: about }, `${words(name)}${field.unit ? `, ${field.unit}` : ""}${range ? ` (${range})` : ""}`, made);
 }
 
-function showArguments() {
+// Fields to enter: a function has its own in place of numbers, and a parameter its unit and range.
+function fieldsOf(chosen, value) {
+  const parameters = dictionary.onboard_parameters;
+  const parameter = parameters.find((one) => one.name === value) ?? parameters[0];
+  const own = { parameter_id: { labels: Object.fromEntries(parameters.map((one) => [one.number, one.name])) }, ...(chosen.fields.some((one) => one.name === "parameter_id") && { value: parameter }) };
+  const functions = chosen.fields.find((one) => one.name === "function_id");
+  if (functions) return [functions, ...(dictionary.functions[value ?? functions.labels[1]] ?? [])];
+  return chosen.fields.filter((field) => field.name !== chosen.count).map((field) => ({ ...field, ...own[field.name], name: field.name }));
+}
+
+function showArguments(value = null) {
   const chosen = definition[byId("name").value];
   byId("description").textContent = `${chosen.description.replace(/\.?$/, ".")} Service ${chosen.service}, subtype ${chosen.subtype}.${chosen.critical ? " Critical: somebody else has to release it." : ""}`;
-  const fields = chosen.fields.filter((field) => field.name !== chosen.count);
-  const inputs = fields.map((field) => input(field, `argument-${field.name}`));
+  const inputs = fieldsOf(chosen, value).map(input);
   if (chosen.repeats.length) {
     inputs.push(
       element("label", { title: "One item a line, values in order, separated by spaces" }, `${words(chosen.group)}: ${chosen.repeats.map((field) => field.name).join(" ")}`, element("textarea", { id: "argument-items", rows: 3 })),
     );
   }
   show("arguments", inputs.length ? inputs : element("p", { class: "hint" }, "No arguments."));
-}
-
-// Arguments as words: octets of a packet by their number, items by their values, one after the other.
-function plain(value) {
-  if (typeof value === "number") return Number(value.toPrecision(9));
-  if (!Array.isArray(value)) return value !== null && typeof value === "object" ? Object.values(value).join(" ") : value;
-  if (value.length && value.every((item) => Object.keys(item).join() === "octet")) return `${value.length} octets`;
-  const text = value.map((item) => plain(item)).join("; ");
-  return text.length > 80 ? `${text.slice(0, 79)}…` : text;
-}
-
-// A time-tagged telecommand names its time and the telecommand that it carries, not ticks and octets.
-function argumentText(row, listed) {
-  const carried = row.release && listed.find((one) => one.carrier_id === row.id);
-  const texts = Object.entries(row.arguments).map(([key, value]) => {
-    if (key === "release_ticks" && row.release) return `release at ${timeText(row.release)} of the on-board clock`;
-    if (key === "items" && carried) return `carries telecommand ${carried.id}`;
-    return `${words(key)} ${plain(value)}`;
-  });
-  return texts.join(", ");
+  const deciding = ["function_id", "parameter_id"].map((name) => byId(`argument-${name}`)).find(Boolean);
+  if (!deciding) return;
+  if (value !== null) deciding.value = value;
+  deciding.addEventListener("change", () => showArguments(deciding.value));
 }
 
 function argumentsOf(chosen) {
-  const given = {};
-  for (const field of chosen.fields) {
-    if (field.name === chosen.count) continue;
-    const { value } = byId(`argument-${field.name}`);
-    given[field.name] = Object.keys(field.labels).length ? value : Number(value);
-  }
+  const given = Object.fromEntries([...byId("arguments").querySelectorAll("select, input")].map((one) => [one.name, one.type === "number" ? one.valueAsNumber : one.value]));
   if (chosen.repeats.length) {
     const lines = byId("argument-items").value.split("\n").filter((line) => line.trim());
     given[chosen.group] = lines.map((line) => {
@@ -163,7 +151,7 @@ const load = pager(async (limit, offset) => {
         ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
         ["State", (row) => stateMark(row.state)],
         ["Verification", lights],
-        ["Arguments", (row) => argumentText(row, page.items)],
+        ["Arguments", (row) => row.text],
         ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
         ["Decided", (row) => (row.decided_by ? `${timeText(row.decided)} by ${row.decided_by}` : "")],
         ["Sent", (row) => (row.sent ? timeText(row.sent) : "")],
@@ -180,7 +168,7 @@ show("name", dictionary.telecommands.map((one) => element("option", { value: one
 byId("name").value = "test_connection";
 bind("name", "state");
 byId("state").addEventListener("change", acting(() => load.first()));
-byId("name").addEventListener("change", showArguments);
+byId("name").addEventListener("change", () => showArguments());
 showArguments();
 byId("enter").addEventListener(
   "submit",

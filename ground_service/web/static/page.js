@@ -105,7 +105,7 @@ export function confirmed(title, lines, deed) {
   const dialog = byId("confirm");
   byId("confirm-title").textContent = title;
   byId("confirm-deed").textContent = deed;
-  show("confirm-text", lines.map((line) => element("p", {}, line)));
+  show("confirm-text", lines.map((line) => (line instanceof Node ? line : element("p", {}, line))));
   dialog.returnValue = "";
   dialog.showModal();
   return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "confirmed"), { once: true }));
@@ -154,6 +154,8 @@ export function figure(value, digits = 3) {
   if (Math.abs(value) < 1e-4) return powerOfTen(value, digits);
   return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", " ") : String(+value.toPrecision(digits));
 }
+
+export const plural = (count, noun) => `${figure(count)} ${noun}${count === 1 ? "" : "s"}`;
 
 // Options of a list of parameters, in groups by packet.
 export function parameterOptions(parameters) {

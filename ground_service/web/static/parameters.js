@@ -8,7 +8,7 @@ export const isHash = (about) => about.unit === "" && /(^|[._])hash$/.test(about
 
 const nameOf = (about) => parameterName(about.name, about.unit);
 
-function seriesOf(about, answer) {
+export function seriesOf(about, answer) {
   const coded = Object.keys(about.labels).length > 0;
   return {
     label: nameOf(about),

@@ -1,8 +1,9 @@
 import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
-import { acting, byId, element, figure, isoText, lengthText, mayOperate, missionNow, notice, seconds, session, show, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, figure, isoText, lengthText, mayOperate, missionNow, notice, plural, seconds, session, show, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
+import { contactOf, release, sequenceTable, transmit, uplinkOf } from "./chain.js";
 
 const ROW_PX = 34;
 const HEAD_PX = 24;
@@ -48,7 +49,7 @@ const spacecraftChosen = () => {
 };
 
 function tickStep(span) {
-  const most = Math.max(3, Math.min(12, Math.floor(byId("timeline").clientWidth / 70)));
+  const most = Math.max(3, Math.min(12, Math.floor(byId("timeline").clientWidth / 90)));
   return [60, 300, 600, 1800, 3600, 3 * 3600, 6 * 3600, DAY_S, 2 * DAY_S, 7 * DAY_S].find((step) => span / step <= most) ?? 30 * DAY_S;
 }
 
@@ -91,11 +92,13 @@ function drawTimeline() {
   const height = lanesTop + lanesHeight();
   const drawn = svg("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "timeline of windows" });
   const step = tickStep(view[1] - view[0]);
+  let day = null; // the first tick of a day states its date
   for (let time = Math.ceil(view[0] / step) * step; time < view[1]; time += step) {
     drawn.append(svg("line", { x1: x(time), x2: x(time), y1: HEAD_PX - 6, y2: height, class: "tick" }));
     const text = svg("text", { x: x(time) + 3, y: 13, class: "when" });
     const iso = isoText(time);
-    text.textContent = step >= DAY_S || time % DAY_S === 0 ? iso.slice(5, 10) : iso.slice(11, 16);
+    text.textContent = step >= DAY_S ? iso.slice(0, 10) : day === iso.slice(0, 10) ? iso.slice(11, 16) : `${iso.slice(5, 10)} ${iso.slice(11, 16)}`;
+    day = iso.slice(0, 10);
     drawn.append(text);
   }
   for (const { name, top } of sections) {
@@ -144,7 +147,7 @@ function readAt(time) {
 
 function bar(left, right, top, kind, label) {
   const made = svg("g", { class: `span ${kind}` });
-  made.append(svg("rect", { x: left, y: top, width: Math.max(3, right - left), height: ROW_PX - 8, rx: 3 }));
+  made.append(svg("rect", { x: left, y: top, width: Math.max(6, right - left), height: ROW_PX - 8, rx: 3 }));
   const title = svg("title");
   title.textContent = label;
   made.append(title);
@@ -255,7 +258,7 @@ function showChosen() {
   const path = `windows/${row.id}`;
   const deeds = {
     draft: [deed("Approve", () => send("PATCH", path, { state: "approved" }), "primary"), deed("Delete", () => send("DELETE", path))],
-    approved: [row.telecommands.length ? element("span", {}, "Its telecommands are released. ", element("a", { href: "/" }, "Send them")) : deed("Uplink", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
+    approved: [row.telecommands.length ? deed("Send now…", () => uplink(row), "primary") : deed("Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
   }[row.state] ?? [];
   const span = (value, unit) => (value ? `${figure(value.min)} to ${figure(value.max)} ${unit}` : "–");
   const predicted = row.predicted ?? {};
@@ -279,23 +282,44 @@ function showChosen() {
     refusal?.id === row.id ? reasonList(`Not changed to ${refusal.what}:`, refusal.reasons) : null,
     conflictsOf(row.id).length ? reasonList("Conflicts of the plan:", conflictsOf(row.id)) : null,
     row.state === "draft" ? timesForm(row) : null,
-    element("p", { class: "actions" }, deeds),
+    element("p", { class: "actions" }, deeds, element("button", { type: "button", onclick: acting(() => showSequence(row)) }, "Telecommands")),
+    element("div", { id: "sequence" }),
   );
 }
 
 const reasonList = (heading, reasons) => element("div", { class: "conflicts" }, element("strong", {}, heading), element("ul", { class: "reasons" }, reasons.map((reason) => element("li", {}, reason))));
 
+const UTC_PATTERN = "\\d{4}-\\d\\d-\\d\\dT\\d\\d:\\d\\d:\\d\\d(\\.\\d+)?Z";
+
 // Start and stop of a draft, typed.
 function timesForm(row) {
-  const field = (name, value) => element("input", { name, required: true, value: `${value.slice(0, 19)}Z`, pattern: "\\d{4}-\\d\\d-\\d\\dT\\d\\d:\\d\\d:\\d\\d(\\.\\d+)?Z", title: "UTC, such as 2029-08-07T06:00:00Z" });
+  const field = (name, value) => element("input", { name, required: true, value: `${value.slice(0, 19)}Z`, pattern: UTC_PATTERN, title: "UTC, such as 2029-08-07T06:00:00Z" });
   const [start, stop] = [field("start", row.start), field("stop", row.stop)];
   const change = acting(() => move(row, seconds(start.value), seconds(stop.value)));
   return element("form", { class: "row", "data-needs": "operator", "data-row": row.id, onsubmit: change }, element("label", {}, "Start, UTC ", start), element("label", {}, "Stop, UTC ", stop), element("button", {}, "Change"));
 }
 
+// Release the telecommands of a window, or send those that are released.
 async function uplink(row) {
-  const released = await send("POST", `windows/${row.id}/uplink`);
-  notice(`${row.name}: ${released.items.length} telecommands released`);
+  const [links, ahead, released] = await Promise.all([get("links"), get("contacts", { since: isoText(missionNow() - 3600) }), get("telecommands", { limit: 200, state: "released" })]);
+  const contact = contactOf(row, ahead.contacts);
+  const link = uplinkOf(row, links.items, contact);
+  if (!row.telecommands.length) return release(row, link, contact);
+  if (!link) throw new Error("No link can send: linna command uplink writes the octets to a file.");
+  const waiting = released.items.filter((one) => one.spacecraft_id === row.spacecraft_id && one.instance === row.instance && one.carrier_id === null);
+  return transmit(link, waiting.reverse());
+}
+
+async function showSequence(row) {
+  const { items } = await get(`windows/${row.id}/telecommands`);
+  show("sequence", sequenceTable(items));
+}
+
+async function enter() {
+  const row = await send("POST", "windows", { name: byId("enter-name").value, start: byId("enter-start").value, stop: byId("enter-stop").value, cadence_s: byId("cadence").valueAsNumber, ...spacecraftChosen() });
+  chosen = row.id;
+  await load();
+  choose(row.id);
 }
 
 async function plan(candidate) {
@@ -336,7 +360,7 @@ async function search() {
   showAll();
   show(
     "candidates",
-    element("p", { class: "hint" }, `${candidates.length} candidates, ${rejected.length} spans rejected. Data: ${found.data.join(", ") || "built in"}.`),
+    element("p", { class: "hint" }, `${plural(candidates.length, "candidate")}, ${plural(rejected.length, "span")} rejected. Data: ${found.data.join(", ") || "built in"}.`),
     table(
       "Candidates",
       [
@@ -351,7 +375,7 @@ async function search() {
         ["", (row) => element("button", { type: "button", "data-needs": "operator", onclick: acting(() => plan(row)) }, "Plan")],
       ],
       candidates,
-      "No span fulfils all constraints.",
+      `${found.reason ?? "No span fulfils all constraints"}.`,
     ),
   );
   show(
@@ -360,7 +384,7 @@ async function search() {
       ? element(
           "details",
           {},
-          element("summary", {}, `${rejected.length} rejected spans with their reasons`),
+          element("summary", {}, `${plural(rejected.length, "rejected span")} with reasons`),
           table(
             "Rejected spans",
             [
@@ -465,7 +489,14 @@ byId("later").addEventListener("click", zoom(1, 1));
 byId("nearer").addEventListener("click", zoom(0.5));
 byId("farther").addEventListener("click", zoom(2));
 byId("whole").addEventListener("click", showAll);
+byId("week").addEventListener("click", () => {
+  const from = whole()[0] + 600;
+  viewChosen = true;
+  view = [from, from + 7 * DAY_S];
+  zoom(1)();
+});
 byId("search").addEventListener("submit", acting(search));
+byId("enter").addEventListener("submit", acting(enter));
 byId("export").addEventListener(
   "click",
   acting(async () => {

@@ -1,7 +1,7 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
-import { chainOf, inTime } from "./chain.js";
-import { acting, byId, confirmed, element, figure, lengthText, missionNow, notice, parameterName, seconds, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+import { chainOf, contactOf, inTime, release, transmit, uplinkOf } from "./chain.js";
+import { acting, byId, element, lengthText, missionNow, notice, parameterName, seconds, show, stateMark, table, timeText, trouble, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "executing", "executed", "downlinked"];
 const SHOWN = 5;
@@ -20,13 +20,6 @@ const deed = (label, task, name = label) =>
 const number = (label, value, note) =>
   element("div", {}, element("dt", {}, label), element("dd", { class: "number" }, value), element("dd", { class: "note" }, note));
 
-// The contact of a spacecraft now, otherwise the next one.
-function contactOf(craft, contacts) {
-  const now = missionNow();
-  const ahead = contacts.filter((one) => one.spacecraft_id === craft.spacecraft_id && (one.state === "open" || (one.state === "predicted" && seconds(one.stop) > now)));
-  return ahead.find((one) => one.state === "open") ?? ahead.sort((a, b) => seconds(a.start) - seconds(b.start))[0] ?? null;
-}
-
 function contactFigure(craft, data) {
   const contact = contactOf(craft, data.contacts.contacts);
   const reason = Object.values(data.contacts.unpredicted)[0];
@@ -42,28 +35,13 @@ function ageFigure(newest) {
   return last ? number("Age of data", lengthText(last.age_s), `newest telemetry of ${timeText(last.time)}`) : number("Age of data", "none", "no telemetry received");
 }
 
-async function release(window) {
-  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, "Its telecommands are released; a link sends them in a contact or on request."];
-  if (!(await confirmed(`Release the telecommands of ${window.name}?`, lines, "Release"))) return;
-  const released = await send("POST", `windows/${window.id}/uplink`);
-  notice(`${window.name}: ${released.items.length} telecommands released`);
-}
-
-async function transmit(link, waiting) {
-  const lines = waiting.map((one) => `${one.id}  ${words(one.name)}${one.window_id ? `, window ${one.window_id}` : ""}`);
-  if (!(await confirmed(`Send ${lines.length} telecommands over ${link.name} now?`, lines, "Send"))) return;
-  await send("POST", `links/${encodeURIComponent(link.name)}/send`);
-  notice(`Link ${link.name} sends what is released.`);
-}
-
 function continuation(window, chain, craft, data) {
   const named = (label) => `${label} ${window.name}`;
   if (chain.waiting === "approved") return deed("Approve", () => send("PATCH", `windows/${window.id}`, { state: "approved" }), named("Approve"));
-  if (chain.waiting === "released") return deed("Release…", () => release(window), named("Release"));
+  const contact = contactOf(craft, data.contacts.contacts);
+  const link = uplinkOf(craft, data.links, contact);
+  if (chain.waiting === "released") return deed("Release…", () => release(window, link, contact), named("Release"));
   if (chain.waiting === "sent") {
-    const links = mine(data.links, craft).filter((one) => one.uplink);
-    const next = contactOf(craft, data.contacts.contacts)?.link;
-    const link = links.find((one) => one.name === next) ?? links.find((one) => one.state !== "failed") ?? links[0];
     const waiting = mine(data.released, craft).filter((one) => one.carrier_id === null).reverse();
     return link ? deed("Send now…", () => transmit(link, waiting), named("Send")) : element("a", { href: "/commands" }, "Commands");
   }

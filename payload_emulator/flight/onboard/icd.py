@@ -6,9 +6,9 @@ import inspect
 
 from payload_emulator.flight.instruments import flight_instruments
 from payload_emulator.flight.onboard.modes import ALL_MODES, ALLOWED, TRANSITIONS, PayloadMode
-from payload_emulator.flight.onboard.parameters import PARAMETERS, Parameter
 from payload_emulator.flight.ports import SENSORS, Board, Load, ResetCause, Stage
 from payload_emulator.flight.telemetry.store import SHARES, StoreClass
+from tmtc.onboard_parameters import PARAMETERS, Parameter
 
 _PORTS = {
     "EPS": (("sensors", "switch"), "power in, switched loads"),

@@ -13,19 +13,18 @@ from payload_emulator.flight.onboard.housekeeping_packets import send_large_data
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS, UNPACKERS
 from payload_emulator.flight.onboard.machine import Machine
 from payload_emulator.flight.onboard.modes import PayloadMode, allows, may_change
-from payload_emulator.flight.onboard.parameters import find_parameter
 from payload_emulator.flight.onboard.schedule import Activity
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.telemetry.products import map_octets
+from tmtc.arguments import FUNCTION_ARGUMENTS
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TableError
+from tmtc.onboard_parameters import find_parameter
+from tmtc.schema import Field
 
 Values = Mapping[str, Any]
 _FUNCTIONS = DICTIONARY.labels("perform_function", "function_id")
-_SECONDS_LIMIT = 86_400.0 * 366.0
-# No estimate is worth less than this (position in m, velocity in m/s).
-_WIDEST = 1e6
 
 
 def name_of(command: Command) -> str:
@@ -41,13 +40,9 @@ def check(machine: Machine, command: Command) -> int:
     if name not in _FUNCTION_HANDLERS and name not in _HANDLERS:
         return failure("unknown_function")
     if command.name == "perform_function":
-        first, second = float(values["argument_1"]), float(values["argument_2"])
-        return 0 if _arguments_hold(name, first, second) else failure("value_out_of_range")
+        return 0 if _arguments_hold(name, values) else failure("value_out_of_range")
     for field in DICTIONARY.packet(command.name).fields:
-        value = values[field.name]
-        low = -math.inf if field.minimum is None else field.minimum
-        high = math.inf if field.maximum is None else field.maximum
-        if not low <= value <= high or (field.labels and value not in dict(field.labels)):
+        if not _is_within(field, values[field.name]):
             return failure("value_out_of_range")
     if command.name in ("set_parameter", "request_parameter"):
         parameter = find_parameter(int(values["parameter_id"]))
@@ -76,14 +71,16 @@ def execute(machine: Machine, command: Command) -> int:
     return _HANDLERS[name](machine, command.values) or 0
 
 
-def _arguments_hold(name: str, first: float, second: float) -> bool:
-    if name == "set_mode":
-        return first in (0.0, 1.0, 2.0, 3.0)
-    if name == "start_observation":
-        return 0.0 <= first <= _SECONDS_LIMIT and 0.0 <= second <= _SECONDS_LIMIT
-    if name == "widen_estimate":
-        return 0.0 <= first <= _WIDEST and 0.0 <= second <= _WIDEST
-    return math.isfinite(first) and math.isfinite(second)
+def _arguments_hold(name: str, values: Values) -> bool:
+    numbers = (float(values["argument_1"]), float(values["argument_2"]))
+    fields = FUNCTION_ARGUMENTS.get(name, ())
+    return all(map(math.isfinite, numbers)) and all(map(_is_within, fields, numbers))
+
+
+def _is_within(field: Field, value: float) -> bool:
+    low = -math.inf if field.minimum is None else field.minimum
+    high = math.inf if field.maximum is None else field.maximum
+    return low <= value <= high and (not field.labels or value in dict(field.labels))
 
 
 def _check_activity(machine: Machine, values: Values) -> int:

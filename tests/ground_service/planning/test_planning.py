@@ -170,8 +170,14 @@ def test_terrain_is_asked_of_the_map() -> None:
 
 def test_the_battery_falls_with_the_load() -> None:
     weak = planner(circle(), battery_wh=4.0, generation_w=13.0)
-    rejected = search(weak, minimum_battery=0.5).rejected
-    assert "battery too low" in {one.reason for one in rejected}
+    none = search(weak, minimum_battery=0.5)
+    rejected = none.rejected
+    assert "battery too low" in {one.reason for one in rejected} and not none.candidates
+    (possible,) = re.findall(
+        r"excluded by battery too low \(\d+\).*; possible: a minimum battery of ([\d.]+)", none.reason
+    )
+    assert search(weak, minimum_battery=float(possible)).candidates
+    assert not search(weak, minimum_battery=float(possible) + 2e-3).candidates
     assert all(one.start_utc_ns < one.stop_utc_ns for one in rejected)
     strong = search(planner(circle(), generation_w=1000.0), maximum_duration_s=3600.0, sunlit=True)
     assert all(candidate.battery_minimum > 0.85 for candidate in strong.candidates)

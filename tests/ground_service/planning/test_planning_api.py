@@ -126,6 +126,11 @@ def test_a_change_of_what_somebody_else_changed_is_refused(client: TestClient) -
 
 def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient) -> None:
     key = approved(client, 60, 360, cadence_s=10)
+    preview = client.get(f"{V1}/windows/{key}/telecommands").json()["items"]
+    assert [one["name"] for one in preview] == ["enable_schedule", "perform_function", "perform_function"]
+    assert [one["time"] for one in preview[1:]] == [f"{at(seconds)[:-1]}.000000Z" for seconds in (60, 360)]
+    assert preview[1]["text"] == "function start observation, duration 310 s, cadence 10 s"
+    assert client.get(f"{V1}/telecommands").json()["total"] == 0
     assert client.post(f"{V1}/windows/{key}/uplink").json()["total"] == 3
     again = client.post(f"{V1}/windows/{key}/uplink").json()
     assert [one["name"] for one in again["items"]] == [

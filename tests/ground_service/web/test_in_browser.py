@@ -200,7 +200,8 @@ def test_an_alarm_is_acknowledged_on_its_page_and_keeps_its_history(page):
     expect(row).to_have_count(0)
     page.get_by_label("State").select_option("cleared")
     expect(page).to_have_url(re.compile("state=cleared"))
-    row.get_by_role("button", name="History").click()
+    row.get_by_role("button", name="Detail").click()
+    expect(page.locator("#detail")).to_contain_text("3 packets from")
     expect(page.locator("#history")).to_contain_text("acknowledged")
 
 
@@ -287,6 +288,30 @@ def test_a_telecommand_goes_from_entry_to_release(page):
     expect(row.get_by_role("img", name="no report yet")).to_be_visible()
 
 
+def test_arguments_have_names_units_and_ranges(page):
+    settled(page, "/commands")
+    page.locator("#name").select_option("perform_function")
+    page.locator("#argument-function_id").select_option("start_observation")
+    expect(page.get_by_label("duration, s (0 to 31 622 400)")).to_be_visible()
+    page.get_by_label("duration, s").fill("900")
+    page.get_by_label("cadence, s").fill("15")
+    page.get_by_role("button", name="Queue").click()
+    row = page.locator("#commands tbody tr").first
+    expect(row).to_contain_text("function start observation, duration 900 s, cadence 15 s")
+    settled(page, "/audit")
+    expect(page.locator("#entries tbody tr").first).to_contain_text(
+        "arguments function start observation, duration 900 s"
+    )
+    settled(page, "/commands")
+    page.locator("#name").select_option("set_parameter")
+    page.locator("#argument-parameter_id").select_option("temperature_high_c")
+    value = page.get_by_label("value, degC (20 to 100)")
+    expect(value).to_have_value("60")
+    value.fill("101")
+    page.get_by_role("button", name="Queue").click()
+    assert not value.evaluate("input => input.validity.valid")
+
+
 def test_a_telecommand_that_the_dictionary_refuses_is_told(page):
     settled(page, "/commands")
     page.locator("#name").select_option("insert_activity")
@@ -318,9 +343,25 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     page.get_by_role("button", name="Approve").click()
     expect(page.locator("#selected")).to_contain_text("approved")
     page.get_by_role("button", name="Uplink").click()
+    question = page.get_by_role("dialog", name=re.compile("^Release the telecommands of"))
+    expect(question).to_contain_text("on reception")
+    expect(question).to_contain_text("function start observation, duration")
+    question.get_by_role("button", name="Release").click()
     expect(page.locator("#notices")).to_contain_text("telecommands released")
-    expect(page.locator("#selected")).to_contain_text("Its telecommands are released.")
+    expect(page.get_by_role("button", name="Send now")).to_be_visible()
     expect(page.get_by_role("button", name="Uplink")).to_be_hidden()
+
+    page.locator("#altitude-max").fill("10")
+    page.get_by_role("button", name="Search").click()
+    expect(page.locator("#candidates")).to_contain_text("excluded by altitude at most 10 km")
+    page.get_by_text("Enter a window").click()
+    page.locator("#enter-name").fill("by hand")
+    page.locator("#enter-start").fill("2030-01-01T05:00:00Z")
+    page.locator("#enter-stop").fill("2030-01-01T05:10:00Z")
+    page.get_by_role("button", name="Enter", exact=True).click()
+    expect(page.locator("#selected")).to_contain_text("2030-01-01 05:10:00")
+    page.get_by_role("button", name="Telecommands").click()
+    expect(page.locator("#sequence tbody tr").last).to_contain_text("2030-01-01 05:10:00")
     settled(page, "/commands")
     expect(page.locator("#commands tbody tr", has_text="insert activity").first).to_contain_text("released")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from payload_emulator.flight.onboard.icd import format_interfaces
 from payload_emulator.flight.onboard.modes import ALLOWED
-from payload_emulator.flight.onboard.parameters import PARAMETERS
 from payload_emulator.flight.ports import Board
 from tmtc.dictionary import DICTIONARY
 from tmtc.icd import format_icd
+from tmtc.onboard_parameters import PARAMETERS
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -430,8 +430,9 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
     take_uplink(ground, spacecraft_id=SPACECRAFT, actor="cleo")
     row = get_command(ground, command).record
     assert (row.state, row.sent_utc_ns, row.sent_after_ticks) == ("sent", NOW + 2, -1)
+    text = "function start observation, duration 600 s, cadence 15 s"
     assert notes(ground, command) == [
-        ("ann", "enter telecommand", {"name": "perform_function", "arguments": START}),
+        ("ann", "enter telecommand", {"name": "perform_function", "text": text, "arguments": START}),
         ("bob", "release telecommand", {"sequence_count": 0}),
         ("cleo", "send telecommand", {}),
     ]

@@ -298,3 +298,13 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
             assert not any(one.active for one in alarms(ground))
     finally:
         set_mission_clock()
+
+
+def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path / "in", [housekeeping(0, 70.0), event(1)])
+    known = {one.name: one.id for one in alarms(ground, "raised")}
+    assert ground.read(get_alarm, known["camera_fault"]).procedure is None
+    text = '[spacecraft]\nid = 76\n[procedures]\ntemperature_c = "Check the heaters."\n'
+    add_mission(ground, f'name = "warm"\n{text}'.encode(), actor="ann")
+    assert ground.read(get_alarm, known["temperature_c"]).procedure == "Check the heaters."
+    assert ground.read(get_alarm, known["camera_fault"]).procedure is None
