@@ -47,6 +47,13 @@ def duration_text(seconds: float) -> str:
     return f"{seconds / 86_400:.1f} d"
 
 
+def rate_text(rate: float | None) -> str:
+    """Return a small share such as a bit error rate."""
+    if rate is None:
+        return NOT_A_VALUE
+    return f"{rate:.1e}" if rate else "0"
+
+
 def count_text(count: int | None) -> str:
     """A count with thin spaces between thousands."""
     return NOT_A_VALUE if count is None else f"{count:,}".replace(",", THIN_SPACE)

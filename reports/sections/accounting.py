@@ -9,7 +9,15 @@ import numpy as np
 from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
-from reports.text import NOT_A_VALUE, computed_text, count_text, duration_text, percent_text, utc_text
+from reports.text import (
+    NOT_A_VALUE,
+    computed_text,
+    count_text,
+    duration_text,
+    percent_text,
+    rate_text,
+    utc_text,
+)
 from reports.values import (
     ApidAccounting,
     CompletenessSeries,
@@ -57,7 +65,7 @@ def _link_quality(receptions: tuple[ReceptionQuality, ...]) -> Table:
                 NOT_A_VALUE if one.last_utc_ns is None else utc_text(one.last_utc_ns, date=False),
                 f"{count_text(one.frames_good)} of {count_text(one.frames)}",
                 count_text(one.symbols_corrected),
-                NOT_A_VALUE if one.bit_error_rate is None else f"{one.bit_error_rate:.1e}",
+                rate_text(one.bit_error_rate),
                 count_text(one.lock_losses),
                 count_text(one.octets),
                 count_text(one.octets_other),

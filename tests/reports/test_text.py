@@ -6,12 +6,14 @@ import pytest
 
 from reports.document import evidence_label, evidence_number, evidence_text
 from reports.text import (
+    NOT_A_VALUE,
     count_text,
     duration_text,
     headline_text,
     length_text,
     number_text,
     percent_text,
+    rate_text,
     significant_text,
     utc_text,
 )
@@ -113,3 +115,7 @@ def test_a_level_on_terrain_seen_in_training_keeps_its_mark_and_words() -> None:
 )
 def test_what_is_next_to_nothing_is_said_so_on_the_first_page(value: float, text: str) -> None:
     assert headline_text(value) == text
+
+
+def test_a_rate_of_zero_has_no_power_of_ten() -> None:
+    assert [rate_text(rate) for rate in (None, 0.0, 2.5e-5)] == [NOT_A_VALUE, "0", "2.5e-05"]

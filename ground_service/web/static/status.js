@@ -1,5 +1,5 @@
 import { get } from "./api.js";
-import { byId, element, lengthText, show, table, timeText, trouble } from "./page.js";
+import { byId, element, lengthText, plural, show, table, timeText, trouble } from "./page.js";
 
 const PERIOD_MS = 15000;
 const gibibytes = (octets) => `${(octets / 2 ** 30).toFixed(1)} GiB`;
@@ -8,12 +8,18 @@ const counts = (states) =>
     .map(([state, count]) => `${count} ${state}`)
     .join(", ") || "none";
 
-function draw(status) {
+// What needs attention: complaints of the service, alarms that nobody has acknowledged, and a backup that is not known.
+function draw(status, raised) {
+  const complaints = [
+    raised ? element("a", { href: "/alarms?state=raised" }, `${plural(raised, "alarm")} not acknowledged.`) : null,
+    ...status.complaints,
+    status.backup_age_s === null && !status.complaints.some((text) => text.includes("backup")) ? "No backup is known." : null,
+  ].filter(Boolean);
   byId("asked").textContent = `At ${timeText(status.time)}; the page asks again every ${PERIOD_MS / 1000} s.`;
   show(
     "complaints",
-    status.complaints.length
-      ? element("ul", {}, status.complaints.map((text) => element("li", {}, text)))
+    complaints.length
+      ? element("ul", {}, complaints.map((text) => element("li", {}, text)))
       : element("p", {}, "Nothing."),
   );
   const rows = [
@@ -43,7 +49,8 @@ function draw(status) {
 
 async function load() {
   try {
-    draw(await get("status"));
+    const [status, raised] = await Promise.all([get("status"), get("alarms", { state: "raised", limit: 1 })]);
+    draw(status, raised.total);
   } catch (error) {
     if (error.status !== 401) trouble(error);
   }
