@@ -122,7 +122,7 @@ def uplink_window(ground: GroundOf, caller: Operator, window_id: PassId) -> Page
     return PageOf.all_of([commanding.get_command(ground, key).telecommand for key in ids])
 
 
-@planning.get("/windows/{window_id}/telecommands", responses=problems(409))
+@planning.get("/windows/{window_id}/telecommands")
 def get_planned_telecommands(ground: GroundOf, _: Viewer, window_id: PassId) -> PageOf[PlannedTelecommand]:
     """Show the telecommands that an uplink of the window would release, with their times; nothing is released."""
     return PageOf.all_of(service.preview_window(ground, window_id))

@@ -343,12 +343,15 @@ def preview_window(ground: Ground, window_id: int) -> list[PlannedTelecommand]:
 
     Raises
     ------
-    Conflict
+    NotFound
         A table needs a reference ephemeris, and none covers the window.
     """
     with ground.database.reading() as connection:
         window = store.get_record(connection, window_id)
-        activities, _ = _activities(ground, connection, window, _ticks_of(connection, window))
+        try:
+            activities, _ = _activities(ground, connection, window, _ticks_of(connection, window))
+        except Conflict:
+            raise NotFound("ephemeris", f"that covers window {window_id}") from None
     planned: list[tuple[int | None, str, dict[str, Any]]] = [(None, ENABLE, {}), *activities]
     return [
         PlannedTelecommand(
