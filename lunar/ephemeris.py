@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
+from lunar.frames import ICRF
 from lunar.timescales import NS, format_utc, tai_ns_from_utc_ns
 
 GAP_FACTOR = 10
@@ -56,14 +57,14 @@ class EphemerisSegment:
     Raises
     ------
     EphemerisError
-        Where shapes do not agree, numbers are not finite, or epochs do not increase.
+        Where the frame is not ICRF, shapes do not agree, numbers are not finite, or epochs do not increase.
     """
 
     utc_ns: IntArray
     position_m: FloatArray
     velocity_m_s: FloatArray
     centre: str = "MOON"
-    frame: str = "ICRF"
+    frame: str = ICRF
     object_name: str = "SELENITA"
     object_id: str = "SELENITA"
     time_system: str = "UTC"
@@ -76,6 +77,10 @@ class EphemerisSegment:
 
     def __post_init__(self) -> None:
         n = len(self.utc_ns)
+        if self.frame != ICRF:
+            raise EphemerisError(
+                f"an ephemeris segment: expected states turned into ICRF, found {self.frame}"
+            )
         if n == 0:
             raise EphemerisError("an ephemeris segment: expected at least one state, found none")
         for name, values in (("positions", self.position_m), ("velocities", self.velocity_m_s)):

@@ -83,7 +83,8 @@ _PCK_EXPECTED = "a binary PCK kernel (DAF/PCK)"
 _DAF_RECORD = 1024
 
 
-ICRF_NAMES = ("ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF")
+ICRF = "ICRF"
+ICRF_NAMES = (ICRF, "ICRF1", "ICRF2", "ICRF3", "GCRF")
 J2000_NAMES = ("EME2000", "J2000")
 """Names of inertial axes in ephemeris files."""
 
@@ -184,6 +185,15 @@ def mci_from_icrf(tdb_s: float) -> FloatArray:
     """
     right_ascension, declination, _ = iau_pole_and_meridian_rad(float(tdb_s))
     return zxz_rotation(right_ascension + np.pi / 2, np.pi / 2 - declination, np.zeros(()))
+
+
+def icrf_from_onboard(mcmf_from_icrf: ArrayLike, mcmf_from_onboard: ArrayLike) -> FloatArray:
+    """Return the rotation to ICRF from the inertial axes of a payload, shape ``(..., 3, 3)``.
+
+    A payload knows where it is over the ground, and turns this with an orientation of its own. The ground beneath a
+    state is the same for all, so its axes differ from ICRF by the difference of both orientations: tens of metres.
+    """
+    return np.asarray(np.swapaxes(np.asarray(mcmf_from_icrf), -1, -2) @ np.asarray(mcmf_from_onboard))
 
 
 def load_orientation(bpc_path: Path | str, tf_path: Path | str | None = None) -> De421Orientation:

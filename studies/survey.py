@@ -26,7 +26,7 @@ from payload_emulator.session.schedule import fly_scenario, timeline
 from payload_emulator.session.scoring import JudgedSession, judge_session
 from payload_emulator.session.spacecraft import new_spacecraft
 from payload_emulator.session.starting import load_scenario_payload
-from payload_emulator.session.world import World, build_world
+from payload_emulator.session.world import World, build_world, registered_share
 from payload_emulator.sim.terrain.curation import Region
 
 Direction = Literal["ascending", "descending", "any"]
@@ -124,10 +124,6 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
             f"scenario {world.scenario.name}: expected the estimator anchored, "
             f"found {', '.join(world.scenario.navigation.estimators)}"
         )
-    latitude, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
-    registered = 0.0
-    if world.terrain.registration is not None:
-        registered = float(np.isfinite(world.terrain.registration.at(latitude, longitude)[1]).mean())
     unseen = unseen_share(world)
     level = level_text(level_of("real-terrain" if world.terrain.is_real else "procedural", unseen), unseen)
     return SurveySession(
@@ -139,7 +135,7 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
         pairs=judged.pairs.sum(),
         wrong_pairs=judged.pairs[:, 1].sum(),
         wrong_fixes=judged.wrong_fixes,
-        registered_share=registered,
+        registered_share=registered_share(world.terrain, world.truth, world.frame_utc_ns),
         level=level,
         data=world.data_names,
     )

@@ -30,8 +30,8 @@ class FilterEstimates:
     packet_ticks
         On-board time of the packet, shape (n,).
     state
-        Position (m) and velocity (m/s), Moon-centred ICRF axes; empirical acceleration (m/s^2), radial, transverse,
-        normal; shape (n, 9).
+        Position (m) and velocity (m/s), Moon-centred, in the inertial axes of the payload; empirical acceleration
+        (m/s^2), radial, transverse, normal; shape (n, 9).
     covariance
         Of the state, in its units and axes, shape (n, 9, 9).
     innovation_degrees

@@ -29,6 +29,9 @@ Dictionary hash (SHA-256): `{hash}`
   epoch: P-field `2E`, four octets of seconds, two of fraction.
 - Latitude, longitude and height are in the mean-Earth/polar-axis frame, height above the 1737.4 km sphere.
   Pixel centres lie at integer coordinates, u to the right, v downwards.
+- Positions and velocities in `_icrf` of telemetry are in the inertial axes of the payload: its mean-Earth axes
+  turned by the orientation table on board. They differ from ICRF by the error of that table, 6 to 10 arc seconds
+  (50 to 90 m) with the IAU series from 2025 to 2032. The ground turns states and covariances into ICRF.
 
 ## Telemetry packet
 

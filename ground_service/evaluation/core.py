@@ -116,8 +116,9 @@ class PassInputs:
 
     Attributes
     ----------
-    orientation, gravity, onboard_gravity
-        Lunar orientation of the pass, gravity field of its reference and that of the on-board filter, as declared.
+    orientation, onboard_orientation, gravity, onboard_gravity
+        Lunar orientation of the pass and that of the on-board tables, gravity field of the reference and that of the
+        on-board filter, as declared.
     refused
         Reasons for models that are None, by name.
     reference_sigma_rtn_m
@@ -155,6 +156,7 @@ class PassInputs:
     instruments: tuple[InstrumentReport, ...] = ()
     sun_known: bool = False
     burns: tuple[CommandedBurn, ...] = ()
+    onboard_orientation: Orientation | None = None
     gravity: GravityField | None = None
     onboard_gravity: GravityField | None = None
     refused: Mapping[str, str] = field(default_factory=dict)
@@ -521,22 +523,21 @@ def _smoothed(
     The gravity field is that of the filter and not that of the truth, so that a common error remains visible.
     """
     filtered = inputs.filter_states
-    reported = next((s for s in inputs.navigation if s.estimator == "anchored"), None)
-    if filtered is None or reported is None or not len(filtered):
+    if filtered is None or not len(filtered):
         return []
-    gravity = inputs.onboard_gravity
-    if gravity is None or inputs.orientation is None:
+    gravity, onboard = inputs.onboard_gravity, inputs.onboard_orientation
+    if gravity is None or onboard is None or inputs.orientation is None:
+        reasons = (inputs.refused.get(name) for name in ("onboard_gravity", "onboard_orientation"))
         remarks.append(
-            f"no smoothed orbit: {inputs.refused.get('onboard_gravity', 'no gravity field is given')}"
+            f"no smoothed orbit: {next(filter(None, reasons), 'no field or orientation on board is given')}"
         )
         return []
     rows = np.minimum(np.searchsorted(track.utc_ns, filtered.utc_ns), len(track.utc_ns) - 1)
     kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
-    filtered, rows = filtered.select(kept), rows[kept]
+    filtered, rows = filtered.select(kept).in_icrf(inputs.orientation, onboard), rows[kept]
     model = smoother_model(gravity, inputs.orientation, inputs.burns)
     series = smoothed_series(
         filtered,
-        reported,
         track.at_rows(rows),
         path_m[rows],
         model,

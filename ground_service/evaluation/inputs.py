@@ -20,7 +20,7 @@ from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.instruments import instrument_reports
 from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
 from ground_service.evaluation.navigation.baselines import StartState
-from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
+from ground_service.evaluation.navigation.smoother import ONBOARD, SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits, StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import read_catalogue
@@ -28,7 +28,7 @@ from ground_service.missions.ephemerides.attitudes import AttitudeTable, load_at
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
 from ground_service.missions.ephemerides.store import covering_ephemerides, get_ephemeris
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
-from ground_service.missions.model import Camera, Evidence, Mission
+from ground_service.missions.model import Camera, Catalogue, Evidence, Mission
 from ground_service.missions.service import mission_of_pass
 from ground_service.missions.timekeeping.core import largest_step_s
 from ground_service.missions.timekeeping.model import Correlation
@@ -137,6 +137,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             sun_known=manifest.get("light", "real") == "real"
             and mission.observation.needs_daylight is not False,
             burns=burns_of(manifest),
+            onboard_orientation=declared.onboard_orientation,
             gravity=declared.gravity,
             onboard_gravity=declared.onboard_gravity,
             refused=_refused(declared, mission.camera),
@@ -221,6 +222,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
         span.utc_ns(ticks),
         state,
         covariance,
+        ONBOARD,
         np.array([-1 if known is None else known for known in degrees], dtype=np.int64),
     )
 
@@ -500,6 +502,7 @@ def _provenance(
             else f"{mission.name}, revision {mission.revision[:16]}"
         ),
         "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
+        "registration of the crater list": _registration_text(mission.catalogue),
         "dictionary": _dictionary_text(span.dictionary_version),
         "time correlation": _correlation_text(correlations),
         "reference ephemeris": (
@@ -511,6 +514,19 @@ def _provenance(
         "archive": str(record.archive_digest or "")[:16],
     }
     return {name: value for name, value in entries.items() if value}
+
+
+def _registration_text(catalogue: Catalogue) -> str:
+    """Return where the crater list is registered to the terrain, and its shift; empty if it is not stated."""
+    if catalogue.registered_share is None:
+        return ""
+    if not catalogue.registered_share:
+        return "not registered to the terrain: errors of tens of metres are common to all craters"
+    return (
+        f"in {100.0 * catalogue.registered_share:.0f} % of the frames, mean {catalogue.registration_north_m} m north, "
+        f"{catalogue.registration_east_m} m east, sigma {catalogue.registration_sigma_m} m, "
+        f"{catalogue.registration_rims} rims"
+    )
 
 
 def _dictionary_text(version: int) -> str:

@@ -71,12 +71,13 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
         raise EvaluationError(
             f"states: expected {REFERENCE} or {FILTER} (downlinked with velocities), found {states!r}"
         )
-    if inputs.orientation is None:
-        reason = inputs.refused.get("orientation", "no lunar orientation is given")
-        raise EvaluationError(f"states: expected an orientation that turns {FILTER} into ICRF; {reason}")
-    found = found.in_icrf(inputs.orientation)
+    if inputs.orientation is None or inputs.onboard_orientation is None:
+        reasons = (inputs.refused.get(name) for name in ("orientation", "onboard_orientation"))
+        reason = next(filter(None, reasons), "no lunar orientation is given")
+        raise EvaluationError(f"states: expected orientations that turn {FILTER} into ICRF; {reason}")
+    found = found.in_icrf(inputs.orientation, inputs.onboard_orientation)
     covariances = tuple(
-        Covariance(int(utc), "ICRF", matrix[:6, :6])
+        Covariance(int(utc), found.frame, matrix[:6, :6])
         for utc, matrix in zip(found.utc_ns, found.covariance, strict=True)
     )
     return ephemeris_from_states(
@@ -84,6 +85,7 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
         found.state[:, :3],
         found.state[:, 3:6],
         craft.name,
+        frame=found.frame,
         interpolation="HERMITE",
         degree=3,
         comments=(

@@ -31,10 +31,11 @@ class DeclaredFrames:
     onboard_gravity
         Field of the on-board filter, cut to the declared degree.
     refused
-        Reason by name of the model: "orientation", "gravity", "onboard_gravity".
+        Reason by name of the model: "orientation", "onboard_orientation", "gravity", "onboard_gravity".
     """
 
     orientation: Orientation | None = None
+    onboard_orientation: Orientation | None = None
     gravity: GravityField | None = None
     onboard_gravity: GravityField | None = None
     refused: Mapping[str, str] = field(default_factory=dict)
@@ -46,6 +47,11 @@ def declared_frames(frames: Frames, data: DataFolder) -> DeclaredFrames:
     orientation = _orientation(frames.orientation, data)
     if orientation is None:
         refused["orientation"] = _reason("lunar orientation", frames.orientation, "frames.orientation")
+    on_board = _orientation(frames.onboard_orientation, data)
+    if on_board is None:
+        refused["onboard_orientation"] = _reason(
+            "lunar orientation on board", frames.onboard_orientation, "frames.onboard_orientation"
+        )
     gravity = _gravity(frames.gravity_field, frames.gravity_degree, data)
     if gravity is None:
         refused["gravity"] = _reason("gravity field", frames.gravity_field, "frames.gravity_field")
@@ -54,7 +60,7 @@ def declared_frames(frames: Frames, data: DataFolder) -> DeclaredFrames:
         refused["onboard_gravity"] = _reason(
             "gravity field of the filter", frames.onboard_gravity_field, "frames.onboard_gravity_field"
         )
-    return DeclaredFrames(orientation, gravity, onboard, refused)
+    return DeclaredFrames(orientation, on_board, gravity, onboard, refused)
 
 
 def camera_of(camera: Camera) -> PinholeCamera:

@@ -242,6 +242,7 @@ class Catalogue(Section):
     `sha256` names a catalogue that the ground holds; without it, `source` is the name of a public product. The
     registration is the mean shift from the listed craters to the terrain near the frames, with its standard deviation
     per axis and the number of rims that it was fitted to; it is contained in the positions of an archive's catalogue.
+    `registered_share` is the share of frames over ground where there is one: 0 if the catalogue is not registered.
     """
 
     source: str | None = None
@@ -250,6 +251,7 @@ class Catalogue(Section):
     registration_east_m: float | None = None
     registration_sigma_m: NotNegative | None = None
     registration_rims: Annotated[int, Field(ge=0)] | None = None
+    registered_share: Share | None = None
 
 
 class Detector(Section):

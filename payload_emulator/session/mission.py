@@ -37,7 +37,7 @@ from payload_emulator.session.scenario import (
 from payload_emulator.session.spacecraft import PLAYBACK_CHANNEL
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.typed_toml import toml_text
-from payload_emulator.session.world import World, build_world, open_world
+from payload_emulator.session.world import World, build_world, open_world, registered_share
 from payload_emulator.sim.board.contact_plan import parse_outage
 from payload_emulator.sim.board.link import STATIONS, LinkSection
 from payload_emulator.sim.terrain.tiles import POLE_LIMIT_RAD
@@ -205,16 +205,16 @@ def _track_utc_ns(world: World) -> IntArray:
 
 
 def _registration(world: World) -> dict[str, float | int]:
-    """Shift of the catalogue to the terrain near the frames; empty where none is known."""
+    """Where the catalogue is registered to the terrain, and its shift near the frames."""
     registration = world.terrain.registration
-    if registration is None:
-        return {}
+    share = registered_share(world.terrain, world.truth, world.frame_utc_ns)
+    if registration is None or not share:
+        return {} if registration is None and not world.terrain.is_real else {"registered_share": 0.0}
     latitude, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
     shift, sigma = registration.at(latitude, longitude)
     known = np.isfinite(sigma)
-    if not known.any():
-        return {}
     return {
+        "registered_share": round(share, 3),
         "registration_north_m": round(float(shift[known, 1].mean()), 1),
         "registration_east_m": round(float(shift[known, 0].mean()), 1),
         "registration_sigma_m": round(float(sigma[known].mean()), 1),

@@ -300,10 +300,12 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
 
 
 def _declared_world(scenario: Scenario, data: DataFolder, declared: Collection[str]) -> World:
-    """Return the world of a scenario with the declared data, apart from names of seeds; `RecordError` without them."""
-    from payload_emulator.session.world import build_world
+    """Return the world of a scenario with the declared data products; `RecordError` without them."""
+    from payload_emulator.session.world import REGISTRATION, build_world
 
-    lacking = needed = [name for name in declared if ", seed " not in name]
+    lacking = needed = [
+        name for name in declared if ", seed " not in name and not name.startswith(REGISTRATION)
+    ]
     for folder in (data, DataFolder(None)):
         try:
             world = build_world(scenario, folder)

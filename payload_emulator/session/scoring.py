@@ -15,7 +15,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
-from lunar.frames import rtn_from_inertial, spherical_from_mcmf
+from lunar.frames import icrf_from_onboard, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.dynamics import OrbitModel, flown, process_noise
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome
@@ -266,7 +266,7 @@ def turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) 
     """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
     own = [orientation.at(int(tick)) for tick in ticks]
     known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
-    return np.asarray(np.einsum("nji,njk->nik", rotation, known), dtype=np.float64)
+    return icrf_from_onboard(rotation, known)
 
 
 def halves(states: FloatArray) -> FloatArray:

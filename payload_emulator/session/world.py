@@ -48,6 +48,7 @@ from payload_emulator.sim.orbit.truth import (
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted
+from payload_emulator.sim.terrain.registration import joined
 from payload_emulator.sim.terrain.tiles import Terrain
 from tmtc.cuc import TICKS_PER_SECOND
 
@@ -66,6 +67,8 @@ _BEFORE_JUMP_NS = 10_000
 _EDGE_NS = 1_000
 _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
+REGISTRATION = "crater list "
+"""Start of the name that says where the crater list is registered to the terrain."""
 # Rims within this of the frames tell the registration where no product does: a 15 degree tile.
 _REGISTERED_DEG = 7.5
 # No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
@@ -155,7 +158,8 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     _register(terrain, truth, frame_utc_ns)
     require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
-    return World(scenario, truth, terrain, model, burns, frame_utc_ns, _names(terrain, model))
+    names = _names(terrain, model, truth, frame_utc_ns)
+    return World(scenario, truth, terrain, model, burns, frame_utc_ns, names)
 
 
 def _external_world(
@@ -171,7 +175,10 @@ def _external_world(
         )
     _register(terrain, truth, external.utc_ns)
     require_above_ground(truth, external.utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
-    names = (f"external images {external.files[0].parent.name}", *_names(terrain, model))
+    names = (
+        f"external images {external.files[0].parent.name}",
+        *_names(terrain, model, truth, external.utc_ns),
+    )
     return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
 
 
@@ -218,25 +225,46 @@ def scenario_terrain(scenario: Scenario, data: DataFolder) -> Terrain:
 
 
 def _register(terrain: Terrain, truth: Truth, frame_utc_ns: IntArray) -> None:
-    """Register the catalogue to rasters for which no product was made, from the rims near the frames."""
-    if not isinstance(terrain, RasterTerrain) or terrain.registration is not None:
-        return
+    """Register the catalogue to rasters where no product holds beneath the frames, from the rims near them."""
     latitude, longitude, _ = spherical_from_mcmf(truth.positions_mcmf(frame_utc_ns))
-    craters, reach_m = terrain.catalogue, math.radians(_REGISTERED_DEG) * MOON_RADIUS_M
+    known = terrain.registration
+    missing = slice(None) if known is None else np.isnan(known.at(latitude, longitude)[1])
+    latitude, longitude = latitude[missing], longitude[missing]
+    if not isinstance(terrain, RasterTerrain) or not latitude.size:
+        return
+    craters, reach_m = terrain.listed, math.radians(_REGISTERED_DEG) * MOON_RADIUS_M
     every = max(1, latitude.size // 200)
     near = [
         craters.near(float(north), float(east), reach_m)
         for north, east in zip(latitude[::every], longitude[::every], strict=True)
     ]
-    registration = fitted(craters.select(np.unique(np.concatenate(near))), terrain.height_files)
-    if registration is not None:
-        terrain.register(registration)
+    found = fitted(craters.select(np.unique(np.concatenate(near))), terrain.height_files)
+    if found is not None:
+        terrain.register(found if known is None else joined(known, found))
 
 
-def _names(terrain: Terrain, model: ForceModel) -> tuple[str, ...]:
+def registered_share(terrain: Terrain, truth: Truth, frame_utc_ns: IntArray) -> float:
+    """Return the share of frames beneath which the crater list is registered to the terrain."""
+    if terrain.registration is None:
+        return 0.0
+    latitude, longitude, _ = spherical_from_mcmf(truth.positions_mcmf(frame_utc_ns))
+    return float(np.isfinite(terrain.registration.at(latitude, longitude)[1]).mean())
+
+
+def _registration_name(terrain: Terrain, truth: Truth, frame_utc_ns: IntArray) -> tuple[str, ...]:
+    if not terrain.is_real:
+        return ()
+    share = registered_share(terrain, truth, frame_utc_ns)
+    if not share:
+        return (f"{REGISTRATION}not registered to the terrain",)
+    return (f"{REGISTRATION}registered to the terrain in {100.0 * share:.0f} % of the frames",)
+
+
+def _names(terrain: Terrain, model: ForceModel, truth: Truth, frame_utc_ns: IntArray) -> tuple[str, ...]:
     """Data that a world is made of."""
     return (
         *terrain.data_names,
+        *_registration_name(terrain, truth, frame_utc_ns),
         f"gravity {model.gravity.name} to degree {model.degree}",
         f"orientation {model.orientation.name}",
     )

@@ -91,6 +91,11 @@ def test_the_registration_of_the_terrain_is_stated(world) -> None:
     assert stated.registration_east_m == pytest.approx(-20.0, abs=3.0)
     assert 10.0 <= stated.registration_sigma_m < 20.0
     assert 0 < stated.registration_rims <= same.size
+    known = np.isfinite(registration.at(latitude, longitude)[1])
+    assert stated.registered_share == pytest.approx(known.mean(), abs=5e-4) and known.any()
+    shifted.registration = fit_registration(Rims(places[0], places[1] + np.pi, same, same, 60.0 * same))
+    stated = parse_mission(mission_text(replace(world, terrain=shifted), DataFolder())).catalogue
+    assert stated.registered_share == 0.0 and stated.registration_sigma_m is None
 
 
 def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> None:

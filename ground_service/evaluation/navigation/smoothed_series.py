@@ -6,15 +6,14 @@ import numpy as np
 
 from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
-    error_of_places_rtn_m,
+    error_of_positions_rtn_m,
     places_of_positions,
 )
 from ground_service.evaluation.navigation.consistency import nees
 from ground_service.evaluation.navigation.drift import drift_by_length, navigation_statistics
 from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
-from ground_service.passes.samples import NavigationSamples
 from lunar.arrays import FloatArray
-from lunar.frames import Orientation, mcmf_from_spherical
+from lunar.frames import Orientation
 from lunar.gravity import GravityField
 from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel
@@ -45,21 +44,17 @@ def smoother_model(
 
 def smoothed_series(
     filtered: FilterStates,
-    reported: NavigationSamples,
     track: ReferenceStates,
     path_m: FloatArray,
     model: SmootherModel,
     reference_covariance_m2: FloatArray,
 ) -> NavigationSeries | None:
-    """Return the errors of the smoothed orbit relative to the reference; None without complete states.
-
-    The payload uses its own rotation model of the Moon. Therefore, its reported selenographic positions are used, and
-    the smoother's correction, a difference of two inertial states, is added.
+    """Return the errors of the smoothed orbit relative to the reference; None with fewer than two states.
 
     Parameters
     ----------
-    reported
-        Positions reported by the same filter.
+    filtered
+        States in ICRF.
     track
         Reference at the times of `filtered`.
     path_m
@@ -67,20 +62,12 @@ def smoothed_series(
     reference_covariance_m2
         Covariance of the reference (3, 3), R/T/N, which the NEES adds to that of the estimate.
     """
-    rows = np.searchsorted(reported.utc_ns, filtered.utc_ns)
-    rows = np.minimum(rows, max(len(reported.utc_ns) - 1, 0))
-    if len(filtered) < 2 or not np.array_equal(reported.utc_ns[rows], filtered.utc_ns):
+    if len(filtered) < 2:
         return None
     smoothed = smooth(filtered, model)
-    correction = smoothed.state[:, :3] - filtered.state[:, :3]
-    place = mcmf_from_spherical(
-        np.radians(reported.latitude_deg[rows]),
-        np.radians(reported.longitude_deg[rows]),
-        reported.altitude_m[rows],
-    )
-    position = np.einsum("nji,nj->ni", track.mcmf_from_icrf, place) + correction
+    position = smoothed.state[:, :3]
     latitude, longitude, altitude = places_of_positions(track, position)
-    error = error_of_places_rtn_m(track, latitude, longitude, altitude)
+    error = error_of_positions_rtn_m(track, position)
     never = np.zeros(len(filtered), dtype=np.bool_)
     return NavigationSeries(
         name=SMOOTHED,

@@ -13,14 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_service.errors import EvaluationError
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
-from lunar.frames import IauOrientation, Orientation, rtn_from_inertial
+from lunar.frames import ICRF, Orientation, icrf_from_onboard, rtn_from_inertial
 from lunar.gravity_omission import FieldNoise, densities_at
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import tdb_s_from_utc_ns
 
 SIZE = 9
+ONBOARD = "inertial axes of the payload"
 _POSITION, _VELOCITY, _ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 # Limit of the squared Mahalanobis distance between a filtered state and its prediction from the preceding state (9
 # degrees of freedom: exceeded by chance with a probability of 1e-17). A larger distance indicates an event unknown to
@@ -39,10 +41,12 @@ class FilterStates:
     utc_ns
         Time tags, shape (n,).
     state
-        Position (m) and velocity (m/s), Moon-centred in the inertial axes of the payload, which follow from its own
-        lunar orientation (`in_icrf` turns them), empirical acceleration (m/s^2; R, T, N), shape (n, 9).
+        Position (m) and velocity (m/s), Moon-centred in the axes `frame`, empirical acceleration (m/s^2; R, T, N),
+        shape (n, 9).
     covariance
         Shape (n, 9, 9).
+    frame
+        `ICRF`, or `ONBOARD`: the inertial axes that follow from the lunar orientation of the payload.
     innovation_degrees
         Degrees of freedom of the normalised innovation squared of each frame, 0 without a fix, -1 if unknown, shape
         (n,); None for states that do not belong to frames.
@@ -51,6 +55,7 @@ class FilterStates:
     utc_ns: IntArray
     state: FloatArray
     covariance: FloatArray
+    frame: str
     innovation_degrees: IntArray | None = None
 
     def __len__(self) -> int:
@@ -59,24 +64,21 @@ class FilterStates:
     def select(self, which: NDArray[np.bool_]) -> FilterStates:
         """Return the states that a mask selects."""
         degrees = None if self.innovation_degrees is None else self.innovation_degrees[which]
-        return FilterStates(self.utc_ns[which], self.state[which], self.covariance[which], degrees)
+        return FilterStates(
+            self.utc_ns[which], self.state[which], self.covariance[which], self.frame, degrees
+        )
 
-    def in_icrf(self, orientation: Orientation) -> FilterStates:
-        """Return the states with position, velocity and their covariance in ICRF.
-
-        The payload knows where it is over the ground, from craters, and turns this into its inertial axes with the IAU
-        series. The ground beneath a state is the same in both, so the turn is ICRF from Moon-fixed by `orientation`
-        times Moon-fixed from inertial by the series.
-        """
+    def in_icrf(self, orientation: Orientation, onboard: Orientation) -> FilterStates:
+        """Return states of the payload, whose lunar orientation is `onboard`, turned into ICRF by that of the pass."""
+        assert self.frame == ONBOARD
         tdb_s = np.asarray(tdb_s_from_utc_ns(self.utc_ns), dtype=np.float64)
-        icrf_from_mcmf = np.swapaxes(orientation.mcmf_from_icrf(tdb_s), -1, -2)
-        turn = icrf_from_mcmf @ IauOrientation().mcmf_from_icrf(tdb_s)
+        turn = icrf_from_onboard(orientation.mcmf_from_icrf(tdb_s), onboard.mcmf_from_icrf(tdb_s))
         state, jacobian = self.state.copy(), np.tile(np.eye(SIZE), (len(self), 1, 1))
         for part in (_POSITION, _VELOCITY):
             state[:, part] = np.einsum("nij,nj->ni", turn, state[:, part])
             jacobian[:, part, part] = turn
         covariance = jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2)
-        return FilterStates(self.utc_ns, state, covariance, self.innovation_degrees)
+        return FilterStates(self.utc_ns, state, covariance, ICRF, self.innovation_degrees)
 
     @property
     def position_covariance_rtn_m2(self) -> FloatArray:
@@ -149,11 +151,18 @@ def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
     Where a state does not follow from the preceding one (clock jump, restart, uncommanded burn), the segments before
     and after it are smoothed separately.
 
+    Raises
+    ------
+    EvaluationError
+        The states are not in ICRF, the axes of the force model.
+
     References
     ----------
     Rauch, Tung, Striebel (1965), Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3, equations
     3.28 to 3.30.
     """
+    if filtered.frame != ICRF:
+        raise EvaluationError(f"smoother: expected states in {ICRF}, found {filtered.frame}")
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
     before = np.flatnonzero(np.diff(filtered.utc_ns) > 0)
     known, known_covariance = filtered.state[before], filtered.covariance[before]
@@ -170,7 +179,7 @@ def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
         state[k] = filtered.state[k] + gain[row] @ (state[k + 1] - predicted[row])
         smoothed = filtered.covariance[k] + gain[row] @ (covariance[k + 1] - prior[row]) @ gain[row].T
         covariance[k] = 0.5 * (smoothed + smoothed.T)
-    return FilterStates(filtered.utc_ns, state, covariance)
+    return FilterStates(filtered.utc_ns, state, covariance, filtered.frame)
 
 
 def _turned(matrices: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
+from lunar.frames import enu_from_mcmf
 from tmtc.tables import CatalogueTable
 
 # A crater is in sight if its centre is above the limb by this much: on the very limb a degree is many pixels.
@@ -70,17 +71,8 @@ class LandmarkMap:
 def landmark_map(table: CatalogueTable) -> LandmarkMap:
     """Return the catalogue table ready for use."""
     order = np.argsort(table.latitude_rad, kind="stable")
-    latitude, longitude = table.latitude_rad[order], table.longitude_rad[order]
-    sp, cp, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
-    zero = np.zeros_like(sp)
-    axes = np.stack(
-        [
-            np.stack([-sl, cl, zero], axis=-1),
-            np.stack([-sp * cl, -sp * sl, cp], axis=-1),
-            np.stack([cp * cl, cp * sl, sp], axis=-1),
-        ],
-        axis=-2,
-    )
+    latitude = table.latitude_rad[order]
+    axes = enu_from_mcmf(latitude, table.longitude_rad[order])
     radius = MOON_RADIUS_M + table.rim_height_m[order]
     return LandmarkMap(
         table.ids[order],

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from payload_emulator.errors import TerrainError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lunar.datafolder import DataFolder
     from payload_emulator.sim.terrain.tiles import Terrain
 
@@ -69,20 +71,19 @@ def open_terrain(
         return ProceduralTerrain(seed, **options)
     from lunar.catalogue import load_catalogue
     from payload_emulator.sim.terrain.raster import RasterTerrain
-    from payload_emulator.sim.terrain.registering import find_registration
 
     assert catalogue_path is not None
-    chosen: dict[str, Any] = {"name": data.own_heights or "LROC WAC GLD100"}
+    chosen: dict[str, Any] = {
+        "name": data.own_heights or "LROC WAC GLD100",
+        **_moved(registration_north_east_m),
+    }
     if data.dem_sldem:
         # The smoothing is GLD100's; nothing is known against SLDEM2015 as it stands.
-        chosen = {
+        chosen |= {
             "name": "SLDEM2015",
             "smoothing_pixels": 0.0,
             "effective_resolution_m": SLDEM_RESOLUTION_M,
         }
-    if registration_north_east_m:
-        north_m, east_m = registration_north_east_m
-        chosen |= {"registration_north_m": north_m, "registration_east_m": east_m}
     albedo = data.albedo_tiles or ((data.albedo,) if data.albedo else ())
     terrain = RasterTerrain(
         tiles,
@@ -93,10 +94,7 @@ def open_terrain(
         seed=seed,
         **(chosen | options),
     )
-    registration = find_registration(data, catalogue_path, tiles)
-    if registration is not None:
-        terrain.register(registration)
-    return terrain
+    return _registered(terrain, data, catalogue_path, tiles)
 
 
 def _open_photograph(
@@ -108,7 +106,6 @@ def _open_photograph(
 ) -> Terrain:
     from lunar.catalogue import load_catalogue
     from payload_emulator.sim.terrain.photograph import PhotographTerrain
-    from payload_emulator.sim.terrain.registering import find_registration
 
     pictures = [_found(name, data, "photograph") for name in photographs]
     rasters = [_found(name, data, "height raster") for name in heights] or list(data.dem_tiles)
@@ -117,10 +114,6 @@ def _open_photograph(
             f"terrain: expected photographs, height rasters and a crater catalogue, found {len(pictures)} photographs, "
             f"{len(rasters)} rasters and {'a' if catalogue_path else 'no'} catalogue"
         )
-    shift = {}
-    if registration_north_east_m:
-        north_m, east_m = registration_north_east_m
-        shift = {"registration_north_m": north_m, "registration_east_m": east_m}
     names = ", ".join(path.name for path in pictures)
     terrain = PhotographTerrain(
         rasters,
@@ -137,9 +130,19 @@ def _open_photograph(
                 if not heights or not name.startswith(("height model LROC WAC GLD100 (", "own heights"))
             ),
         ),
-        **shift,
+        **_moved(registration_north_east_m),
     )
-    registration = find_registration(data, catalogue_path, rasters)
+    return _registered(terrain, data, catalogue_path, rasters)
+
+
+def _moved(north_east_m: tuple[float, ...]) -> dict[str, float]:
+    return dict(zip(("registration_north_m", "registration_east_m"), north_east_m, strict=False))
+
+
+def _registered(terrain: Terrain, data: DataFolder, catalogue: Path, rasters: Sequence[Path]) -> Terrain:
+    from payload_emulator.sim.terrain.registering import find_registration
+
+    registration = find_registration(data, catalogue, rasters)
     if registration is not None:
         terrain.register(registration)
     return terrain

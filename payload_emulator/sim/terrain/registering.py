@@ -9,11 +9,15 @@ from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.curation import RasterHeights, Region, measured_rims
+from payload_emulator.sim.terrain.rasters import open_layers
 from payload_emulator.sim.terrain.registration import (
+    LATTICE_DEG,
     Registration,
     fit_registration,
     format_registration,
@@ -24,12 +28,15 @@ PRODUCT = "registration.json"
 """Name in the data folder."""
 
 _SHIPPED = "lu1319381-gld100.json"
+_EDGE_DEG = 1e-4
+"""Nodes up to this beyond the edge of a raster lie on it."""
 
 
 def find_registration(data: DataFolder, catalogue: Path, terrain: Sequence[Path]) -> Registration | None:
     """Return the registration of a catalogue file to height rasters; None where none was made of these files.
 
-    That of the data folder comes first and must be of these files; the shipped one applies where it is.
+    That of the data folder comes first and must be of these files; the shipped one applies where it is. It holds on
+    the rasters that it was made of, nowhere else.
 
     Raises
     ------
@@ -42,9 +49,9 @@ def find_registration(data: DataFolder, catalogue: Path, terrain: Sequence[Path]
         wrong = _other_file(registration, catalogue, terrain)
         if wrong:
             raise TerrainError(f"{path}: expected {wrong}; make it again (linna catalogue register)")
-        return registration
+        return _on_rasters(registration, terrain)
     shipped = _shipped()
-    return None if _other_file(shipped, catalogue, terrain) else shipped
+    return None if _other_file(shipped, catalogue, terrain) else _on_rasters(shipped, terrain)
 
 
 def register(catalogue: Path, terrain: Sequence[Path], made_utc: str, region: Region) -> Registration:
@@ -71,6 +78,25 @@ def fitted(catalogue: CraterCatalogue, terrain: Sequence[Path]) -> Registration 
     """Return the registration of a catalogue to height rasters without provenance; None without a clear rim."""
     rims = measured_rims(catalogue, RasterHeights(terrain), Region())
     return fit_registration(rims) if len(rims) else None
+
+
+def _on_rasters(registration: Registration, terrain: Sequence[Path]) -> Registration:
+    """Return the nodes of a registration that lie on rasters that it was made of."""
+    present = [path for path in terrain if path.name in registration.terrain]
+    if len(present) == len(registration.terrain):
+        return registration
+    latitude, longitude = registration.row * LATTICE_DEG, registration.column * LATTICE_DEG
+    edge = (-_EDGE_DEG, _EDGE_DEG)
+    held = np.any(
+        [
+            layer.holds(np.radians(latitude + north), np.radians(longitude + east))
+            for layer in open_layers(present)
+            for north in edge
+            for east in edge
+        ],
+        axis=0,
+    )
+    return registration.select(held)
 
 
 def save_registration(path: Path, registration: Registration) -> None:

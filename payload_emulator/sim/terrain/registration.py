@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
@@ -40,6 +40,7 @@ and 82 degrees. Over 10 degrees the difference changes by 21 m (1 sigma per axis
 FLOOR_SIGMA_M = 10.0
 """Least standard deviation of a node: interpolation over the lattice and what all rims share (slopes, pixels)."""
 
+_NODES = ("row", "column", "east_m", "north_m", "sigma_m", "rims")
 _CELL_DEG = 2.5
 _LEAST_SCALE = 0.3
 _LEAST_SCATTER_M = 30.0
@@ -102,7 +103,10 @@ class Registration:
     made_utc: str = ""
 
     def at(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return shifts east and north (k, 2) and their sigma (k,); zero and NaN where nothing is known."""
+        """Return shifts east and north (k, 2) and their sigma (k,); zero and NaN where nothing is known.
+
+        Sigma grows where only some of the nodes around a place are known, as the shift changes from place to place.
+        """
         row = np.degrees(latitude_rad) / LATTICE_DEG
         column = np.mod(np.degrees(longitude_rad), 360.0) / LATTICE_DEG
         low, left = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
@@ -123,8 +127,15 @@ class Registration:
         known = total > 0.25
         with np.errstate(divide="ignore", invalid="ignore"):
             shift = np.where(known[..., None], shift / total[..., None], 0.0)
-            sigma = np.where(known, np.sqrt(variance / total), np.nan)
+            beyond_deg = LATTICE_DEG * (1.0 - total)
+            grown = PROCESS_SIGMA_M**2 * -np.expm1(-2.0 * beyond_deg / PROCESS_ANGLE_DEG)
+            sigma = np.where(known, np.sqrt(variance / total + grown), np.nan)
         return shift, sigma
+
+    def select(self, which: BoolArray) -> Registration:
+        """Return the registration with some of its nodes."""
+        nodes: dict[str, Any] = {name: getattr(self, name)[which] for name in _NODES}
+        return replace(self, **nodes)
 
     def rims_near(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> int:
         """Return the number of rims at the nodes that places use."""
@@ -134,6 +145,17 @@ class Registration:
             [(np.floor(row) + i) * turn + np.mod(np.floor(column) + j, turn) for i in (0, 1) for j in (0, 1)]
         )
         return int(self.rims[np.isin(self.row * turn + np.mod(self.column, turn), used)].sum())
+
+
+def joined(first: Registration, second: Registration) -> Registration:
+    """Return the first registration with those nodes of the second that it lacks."""
+    turn = round(360.0 / LATTICE_DEG)
+    there, here = (one.row * turn + np.mod(one.column, turn) for one in (second, first))
+    new = ~np.isin(there, here)
+    nodes: dict[str, Any] = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)[new]]) for name in _NODES
+    }
+    return replace(first, **nodes)
 
 
 def registered(catalogue: CraterCatalogue, registration: Registration | None) -> CraterCatalogue:

@@ -121,7 +121,7 @@ class Terrain(ABC):
             )
         self.name = name
         self.data_names = data_names
-        self.catalogue = catalogue
+        self.listed = self.catalogue = catalogue
         self.pixels_per_degree = pixels_per_degree
         self.pixels_per_radian = math.degrees(pixels_per_degree)
         self.pixel_m = MOON_RADIUS_M / self.pixels_per_radian
@@ -138,11 +138,11 @@ class Terrain(ABC):
         self._owner: int | None = None
 
     def register(self, registration: Registration) -> None:
-        """Move the craters of the catalogue to where the heights show them; before any of them is measured."""
+        """Move the listed craters to where the heights show them; before any of them is measured."""
         from payload_emulator.sim.terrain.registration import registered
 
         assert not self._measured.any()
-        self.catalogue = registered(self.catalogue, registration)
+        self.catalogue = registered(self.listed, registration)
         self.registration = registration
 
     @abstractmethod

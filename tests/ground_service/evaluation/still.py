@@ -1,7 +1,9 @@
-"""A Moon that does not turn."""
+"""Orientations for tests: a Moon that does not turn, and one that is turned against the IAU series."""
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from lunar.frames import IauOrientation, axis_rotation
 
 
 class Still:
@@ -14,3 +16,16 @@ class Still:
 
     def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
         return self.mcmf_from_icrf(tdb_s)
+
+
+class TurnedOrientation:
+    """An orientation that turns the ground by 0.01 degrees (300 m) from the IAU series."""
+
+    def __init__(self, name: str = "DE421") -> None:
+        self.name = name
+
+    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+        return axis_rotation(3, np.radians(0.01)) @ IauOrientation().mcmf_from_icrf(tdb_s)
+
+    def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+        return IauOrientation().pa_from_icrf(tdb_s)

@@ -4,7 +4,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,28 +35,12 @@ from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import to_json
 from tests.ground_service.conftest import write_manifest
+from tests.ground_service.evaluation.still import TurnedOrientation
 
 MISSING_FILES = DataFolder(
     orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof")
 )
 """A data folder with other models; none of them may even be opened."""
-
-
-@dataclass(frozen=True)
-class TurnedOrientation:
-    """An orientation that turns the ground by 0.01 degrees (300 m) from the IAU series."""
-
-    name: str = "DE421"
-
-    def mcmf_from_icrf(self, tdb_s: Any) -> Any:
-        angle = math.radians(0.01)
-        turn = np.array(
-            [[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
-        )
-        return turn @ IauOrientation().mcmf_from_icrf(tdb_s)
-
-    def pa_from_icrf(self, tdb_s: Any) -> Any:
-        return IauOrientation().pa_from_icrf(tdb_s)
 
 
 def changed_archive(synthetic_pass: Any, folder: Path, change: Callable[[dict], None]) -> Path:
@@ -177,7 +161,7 @@ def test_declared_models_are_used_and_others_are_named_as_missing() -> None:
     )
     assert found.orientation == IauOrientation()
     assert found.gravity is not None and found.gravity.degree == 6
-    assert set(found.refused) == {"onboard_gravity"}
+    assert set(found.refused) == {"onboard_orientation", "onboard_gravity"}
     assert "does not state the gravity field of the filter" in found.refused["onboard_gravity"]
     lost = declared_frames(Frames(orientation="DE440", gravity_field="GRGM1200L"), DataFolder())
     assert (lost.orientation, lost.gravity) == (None, None)

@@ -27,7 +27,7 @@ from ground_service.evaluation.detection.fixes import IdentificationSamples
 from ground_service.evaluation.detection.landmarks import MappedCraters
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.navigation.baselines import StartState
-from ground_service.evaluation.navigation.smoother import FilterStates
+from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates
 from ground_service.evaluation.verdict import Limits
 from ground_service.passes.samples import (
     DetectionSamples,
@@ -39,6 +39,7 @@ from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.errors import LunarError
+from lunar.frames import axis_rotation
 from lunar.gravity import GravityField, builtin_gravity
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
@@ -193,7 +194,7 @@ def filter_states() -> FilterStates:
     state = np.concatenate([position, velocity, np.zeros((len(seconds), 3))], axis=1)
     covariance = np.tile(np.diag([100.0] * 3 + [1e-2] * 3 + [1e-12] * 3), (len(seconds), 1, 1))
     degrees = np.where(seconds == 15.0, 6, -1)
-    return FilterStates(EPOCH + (seconds * SECOND).astype(np.int64), state, covariance, degrees)
+    return FilterStates(EPOCH + (seconds * SECOND).astype(np.int64), state, covariance, ONBOARD, degrees)
 
 
 IMAGES = {100 + frame: np.full((512, 512), frame, dtype=np.uint8) for frame in (0, 2, 4, 5)}
@@ -210,6 +211,7 @@ def inputs(**changed: Any) -> PassInputs:
         "packets": PACKETS,
         "viewing": Viewing(CAMERA),
         "orientation": Still(),
+        "onboard_orientation": Still(),
         "reference": reference(),
         "catalogue": catalogue(),
         "detections": detections(),
@@ -335,9 +337,20 @@ def test_states_of_some_frames_make_a_nees_of_those() -> None:
     assert np.flatnonzero(np.isfinite(found.nees)).tolist() == [0, 3, 5, 7, 9, 11]
 
 
-def test_the_filter_is_smoothed_with_its_own_field() -> None:
-    """States that follow on one another need no correction: the smoothed orbit errs as the filter does."""
-    some = {"filter_states": filter_states(), "onboard_gravity": POINT}
+def test_the_filter_is_smoothed_in_icrf_with_its_own_field() -> None:
+    """States that follow on one another need no correction: the smoothed orbit errs as the filter does.
+
+    The inertial axes of the payload are turned against ICRF by a degree.
+    """
+    turn = np.kron(np.diag([1.0, 1.0, 0.0]), axis_rotation(3, -np.radians(1.0)))
+
+    class Turned(Still):
+        def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+            return turn[:3, :3].T @ super().mcmf_from_icrf(tdb_s)
+
+    own = filter_states()
+    own = replace(own, state=own.state @ turn.T)
+    some = {"filter_states": own, "onboard_orientation": Turned(), "onboard_gravity": POINT}
     report = evaluate_pass(inputs(**some))
     found = series(report, "smoothed")
     assert (found.kind, found.utc_ns.tolist()) == ("smoothed", TIMES.tolist())
@@ -353,9 +366,12 @@ def test_the_filter_is_smoothed_with_its_own_field() -> None:
 @pytest.mark.parametrize(
     ("changed", "remark"),
     [
-        ({}, "no smoothed orbit: no gravity field is given"),
+        ({}, "no smoothed orbit: no field or orientation on board is given"),
         ({"refused": {"onboard_gravity": "field X is not here"}}, "no smoothed orbit: field X is not here"),
-        ({"navigation": (paper(),), "onboard_gravity": POINT}, None),
+        (
+            {"onboard_gravity": POINT, "onboard_orientation": None},
+            "no smoothed orbit: no field or orientation on board is given",
+        ),
         ({"filter_states": filter_states().select(np.zeros(13, dtype=np.bool_))}, None),
     ],
 )

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ground_service.errors import EvaluationError
 from ground_service.evaluation.navigation.smoothed_series import smoother_model
 from ground_service.evaluation.navigation.smoother import (
+    ONBOARD,
     CommandedBurn,
     FilterStates,
     SmootherModel,
@@ -16,7 +18,7 @@ from ground_service.evaluation.navigation.smoother import (
     _legs,
     smooth,
 )
-from lunar.frames import IauOrientation, rtn_from_inertial
+from lunar.frames import ICRF, IauOrientation, rtn_from_inertial
 from lunar.gravity import GravityField, builtin_gravity
 from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel, propagate_with_stm
@@ -72,7 +74,7 @@ class Session:
             full = np.eye(9) * 1e-24
             full[:6, :6] = prior
             covariances.append(full)
-        self.filtered = FilterStates(TIMES, np.array(states), np.array(covariances))
+        self.filtered = FilterStates(TIMES, np.array(states), np.array(covariances), ICRF)
 
 
 def batch(session: Session) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +150,7 @@ def test_a_clock_that_went_backwards_parts_the_orbit_in_two() -> None:
     session = Session(6)
     times = TIMES.copy()
     times[20:] -= 3_600 * 10**9
-    torn = smooth(FilterStates(times, session.filtered.state, session.filtered.covariance), QUIET)
+    torn = smooth(FilterStates(times, session.filtered.state, session.filtered.covariance, ICRF), QUIET)
     np.testing.assert_array_equal(torn.state[19], session.filtered.state[19])
 
 
@@ -196,7 +198,7 @@ def straight(seconds: list[float], seed: int = 9) -> FilterStates:
         root = np.repeat([5.0, 0.1, 2e-3], 3)[:, None] * rng.standard_normal((9, 9))
         covariances.append(root @ root.T)
     times = EPOCH + (np.array(seconds) * 1e9).astype(np.int64)
-    return FilterStates(times, np.array(states), np.array(covariances), np.arange(len(seconds)))
+    return FilterStates(times, np.array(states), np.array(covariances), ICRF, np.arange(len(seconds)))
 
 
 def rauch_tung_striebel(
@@ -276,7 +278,7 @@ def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
     covariance = np.zeros((1, 9, 9))
     covariance[0, :3, :3] = np.diag([4.0, 9.0, 16.0])
     state = np.array([[0.0, 2e6, 0.0, -1.6e3, 0.0, 0.0, 0.0, 0.0, 0.0]])
-    one = FilterStates(TIMES[:1], state, covariance)
+    one = FilterStates(TIMES[:1], state, covariance, ICRF)
     np.testing.assert_allclose(one.sigma_rtn_m, [[3.0, 2.0, 4.0]])
     np.testing.assert_allclose(one.position_covariance_rtn_m2[0], np.diag([9.0, 4.0, 16.0]), atol=1e-12)
 
@@ -347,3 +349,8 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
     east_m, north_m, up_m = errors.catalogue_offset_m
     assert model.map_sigma_rtn_m == (up_m, north_m, east_m)
     assert model.map_correlation_rad == errors.catalogue_correlation_rad
+
+
+def test_states_in_the_axes_of_the_payload_are_not_smoothed() -> None:
+    with pytest.raises(EvaluationError, match="expected states in ICRF, found inertial axes of the payload"):
+        smooth(replace(straight([0.0, 60.0]), frame=ONBOARD), QUIET)

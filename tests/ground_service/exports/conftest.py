@@ -11,31 +11,39 @@ import pytest
 from PIL import Image
 
 from ground_service.ground import Ground, open_ground
+from ground_service.missions import frames as declared
 from ground_service.passes.archive_import import import_archive
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import load_catalogue
-from lunar.frames import IauOrientation, quaternion_from_matrix
+from lunar.datafolder import DataFolder
+from lunar.frames import IauOrientation, quaternion_from_matrix, rtn_from_inertial
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from tests.ground_service.conftest import (
+    FILTER_ERROR_RTN_M,
     PIXEL_OFFSET,
     SyntheticPass,
     circular_states,
     encode_downlink,
     write_manifest,
 )
+from tests.ground_service.evaluation.still import TurnedOrientation
 from tmtc.dictionary import DICTIONARY
 from tmtc.packets import PacketSequencer
 
 FRAMES = 12
-FILTER_OFFSET_M = np.array([10.0, -20.0, 5.0])
+COVARIANCE = np.diag([100.0, 400.0, 900.0, 1e-4, 2e-4, 3e-4, 1e-12, 1e-12, 1e-12])
 
 
 @dataclass(frozen=True)
 class RichPass:
-    """Archive of the pass, positions (n, 3) and attitudes of its frames, and the craters of its identifications."""
+    """Archive of the pass, positions (n, 3) and attitudes of its frames, and the craters of its identifications.
+
+    The inertial axes of the payload are turned against ICRF (n, 3, 3).
+    """
 
     folder: Path
     utc_ns: np.ndarray
+    onboard_from_icrf: np.ndarray
     position_mcmf_m: np.ndarray
     camera_from_icrf: np.ndarray
     craters: list[list[int]]
@@ -46,7 +54,10 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
     made = make_pass(frames=FRAMES, filter_nis=2.0)
     folder = made.folder
     position, velocity = circular_states(made.utc_ns)
-    mcmf_from_icrf = IauOrientation().mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(made.utc_ns)))
+    tdb_s = np.asarray(tdb_s_from_utc_ns(made.utc_ns))
+    mcmf_from_icrf = IauOrientation().mcmf_from_icrf(tdb_s)
+    onboard_from_icrf = np.swapaxes(TurnedOrientation().mcmf_from_icrf(tdb_s), 1, 2) @ mcmf_from_icrf
+    error = np.einsum("nji,j->ni", rtn_from_inertial(position, velocity), FILTER_ERROR_RTN_M)
     position_mcmf = np.einsum("nij,nj->ni", mcmf_from_icrf, position)
     camera_from_mcmf = nadir_camera_from_mcmf(position_mcmf)
     camera_from_icrf = camera_from_mcmf @ mcmf_from_icrf
@@ -82,18 +93,19 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
             {
                 "frame_number": k,
                 "image_ticks": tick,
-                "position_icrf_m": position[k] + FILTER_OFFSET_M,
-                "velocity_icrf_m_s": velocity[k],
+                "position_icrf_m": onboard_from_icrf[k] @ (position[k] + error[k]),
+                "velocity_icrf_m_s": onboard_from_icrf[k] @ velocity[k],
                 "acceleration_rtn_m_s2": np.zeros(3),
-                "covariance": np.diag([100.0] * 3 + [1e-4] * 3 + [1e-12] * 3)[np.tril_indices(9)],
+                "covariance": COVARIANCE[np.tril_indices(9)],
             },
             tick + 700,
         )
     (folder / "downlink.cadu").write_bytes(encode_downlink(packets))
     manifest = json.loads((folder / "manifest.json").read_text())
     del manifest["files"]
+    manifest["gravity"]["filter_orientation"] = TurnedOrientation().name
     write_manifest(folder, manifest)
-    return RichPass(folder, made.utc_ns, position_mcmf, camera_from_icrf, craters)
+    return RichPass(folder, made.utc_ns, onboard_from_icrf, position_mcmf, camera_from_icrf, craters)
 
 
 def _detections(packets: list[bytes], tick: int) -> np.ndarray:
@@ -109,7 +121,12 @@ def _detections(packets: list[bytes], tick: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def rich_ground(rich_pass: RichPass, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    """A service with the pass as pass 1; not to be altered."""
-    with open_ground(tmp_path_factory.mktemp("exports") / "home") as ground:
+    """A service with the pass as pass 1, and with the orientation of the payload; not to be altered."""
+    data = DataFolder(orientation_bpc=Path("turned.bpc"))
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        open_ground(tmp_path_factory.mktemp("exports") / "home", data) as ground,
+    ):
+        patch.setattr(declared, "_kernel", lambda data: TurnedOrientation())
         assert import_archive(ground, rich_pass.folder) == 1
         yield ground

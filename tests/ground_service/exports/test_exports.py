@@ -14,26 +14,28 @@ import pyarrow.parquet
 import pyogrio
 import pytest
 import spiceypy
+from oem import OrbitEphemerisMessage
 from PIL import Image
 
 from ground_service.errors import EvaluationError, FileDamaged, NotFound
-from ground_service.evaluation.navigation.smoother import FilterStates
 from ground_service.exports import service
 from ground_service.exports.formats import FORMATS
 from ground_service.exports.model import ExportRequest
 from ground_service.exports.service import export_pass, list_formats
 from ground_service.ground import Ground
+from ground_service.missions import frames as declared
 from lunar.camera import PinholeCamera
 from lunar.catalogue import load_catalogue
-from lunar.frames import IauOrientation, mcmf_from_spherical
+from lunar.frames import IauOrientation, mcmf_from_spherical, rtn_from_inertial
 from lunar.messages.aem import parse_aem
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import parse_oem
 from lunar.messages.oem_xml import parse_oem_xml
 from lunar.messages.spice import camera_id, et_from_utc_ns, spacecraft_id
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
-from tests.ground_service.conftest import SPACECRAFT, SPHERICAL_ERROR_RTN_M
-from tests.ground_service.exports.conftest import FILTER_OFFSET_M, FRAMES, RichPass
+from tests.ground_service.conftest import FILTER_ERROR_RTN_M, SPACECRAFT, SPHERICAL_ERROR_RTN_M
+from tests.ground_service.evaluation.still import TurnedOrientation
+from tests.ground_service.exports.conftest import COVARIANCE, FRAMES, RichPass
 from tmtc.errors import MissingLibrary
 
 CRAFT = spacecraft_id(SPACECRAFT)
@@ -65,50 +67,58 @@ def test_oem_is_the_reference_in_the_interval_of_the_pass(rich_ground: Ground, r
     np.testing.assert_array_equal(in_xml.at(between)[0], reference.at(between)[0])
 
 
-def test_oem_of_the_filter_has_its_states_and_covariances(rich_ground: Ground, rich_pass: RichPass) -> None:
+def errors_rtn_m(rich_pass: RichPass, utc_ns: Any, position_icrf_m: Any) -> np.ndarray:
+    position, velocity = load_ephemeris(rich_pass.folder / "reference.oem").at(utc_ns)
+    rtn = rtn_from_inertial(position, velocity)
+    return np.einsum("nij,nj->ni", rtn, np.asarray(position_icrf_m) - position)
+
+
+@pytest.mark.filterwarnings("ignore:ERFA function")
+def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(
+    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
+) -> None:
+    """The inertial axes of the payload are turned by 300 m against ICRF; read by oem, SPICE, json and csv."""
+    utc_ns, found = rich_pass.utc_ns, {}
+    tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
+    icrf_from_mcmf = np.swapaxes(IauOrientation().mcmf_from_icrf(tdb_s), 1, 2)
+    for kind in ("oem", "oem-xml", "spk", "czml"):
+        (tmp_path / kind).write_bytes(export(rich_ground, kind, "anchored"))
+    for kind in ("oem", "oem-xml"):
+        states = list(OrbitEphemerisMessage.open(tmp_path / kind).states)
+        found[kind] = 1e3 * np.array([one.position for one in states])
+    with spiceypy.KernelPool(str(tmp_path / "spk")):
+        ets = [float(et_from_utc_ns(int(one))) for one in utc_ns]
+        found["spk"] = 1e3 * np.array([spiceypy.spkgeo(CRAFT, et, "J2000", 301)[0][:3] for et in ets])
+    craft = next(one for one in json.loads((tmp_path / "czml").read_text()) if one["id"] == "spacecraft")
+    fixed = {"czml": np.array(craft["position"]["cartesian"]).reshape(-1, 4)[:, 1:]}
+    fixed["tum"] = np.loadtxt(io.BytesIO(unzipped(export(rich_ground, "tum"))["anchored.tum"]))[:, 1:4]
+    found |= {kind: np.einsum("nij,nj->ni", icrf_from_mcmf, one) for kind, one in fixed.items()}
+    for kind, position in found.items():
+        errors = errors_rtn_m(rich_pass, utc_ns, position)
+        np.testing.assert_allclose(errors, np.tile(FILTER_ERROR_RTN_M, (FRAMES, 1)), atol=0.01, err_msg=kind)
+    rows = csv.DictReader(io.StringIO(unzipped(export(rich_ground, "csv"))["residuals.csv"].decode()))
+    reported = [
+        [float(one[f"error_{axis}_m"]) for axis in "rtn"] for one in rows if one["solution"] == "anchored"
+    ]
+    np.testing.assert_allclose(reported, np.tile(FILTER_ERROR_RTN_M, (FRAMES, 1)), atol=0.01)
+
+
+def test_oem_of_the_filter_has_its_covariances_in_icrf(rich_ground: Ground, rich_pass: RichPass) -> None:
     segment = parse_oem(export(rich_ground, "oem", "anchored").decode()).segments[0]
     assert segment.comments[-1] == "evidence level: not stated"
-    reference = load_ephemeris(rich_pass.folder / "reference.oem")
     np.testing.assert_array_equal(segment.utc_ns, rich_pass.utc_ns)
-    np.testing.assert_allclose(
-        segment.position_m - reference.at(segment.utc_ns)[0],
-        FILTER_OFFSET_M + np.zeros((FRAMES, 1)),
-        atol=1e-3,
-    )
-    np.testing.assert_allclose(
-        segment.covariances[3].matrix, np.diag([100.0] * 3 + [1e-4] * 3), rtol=1e-6, atol=1e-12
-    )
+    for turn, one in zip(rich_pass.onboard_from_icrf, segment.covariances, strict=True):
+        both = np.kron(np.eye(2), turn)
+        assert one.frame == "ICRF"
+        np.testing.assert_allclose(one.matrix, both.T @ COVARIANCE[:6, :6] @ both, rtol=1e-6, atol=1e-4)
 
 
-def test_states_of_the_filter_are_turned_from_the_axes_of_the_payload_into_icrf() -> None:
-    """The payload has the IAU series; the declared orientation is turned from it by 20 arc seconds about one axis."""
-    utc_ns = parse_utc("2029-08-07T06:00:00Z") + np.arange(3, dtype=np.int64) * 15_000_000_000
-    angle = np.radians(20.0 / 3600.0)
-    turned = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-
-    class Declared:
-        name = "declared"
-
-        def mcmf_from_icrf(self, tdb_s: Any) -> Any:
-            return turned @ IauOrientation().mcmf_from_icrf(tdb_s)
-
-    tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
-    ground_m, ground_m_s = np.array([1.2e6, 0.9e6, 0.9e6]), np.array([-1000.0, 1300.0, 100.0])
-    place = np.concatenate([ground_m, ground_m_s])
-    both = np.kron(np.eye(2), turned.T)
-    series = IauOrientation().mcmf_from_icrf(tdb_s)
-    onboard = np.array([np.kron(np.eye(2), one.T) @ place for one in series])
-    spread = np.diag([100.0, 400.0, 900.0, 1e-4, 2e-4, 3e-4, 1e-12, 1e-12, 1e-12])
-    states = np.concatenate([onboard, np.zeros((3, 3))], axis=1)
-    found = FilterStates(utc_ns, states, np.tile(spread, (3, 1, 1))).in_icrf(Declared())
-    for k, one in enumerate(series):
-        icrf = np.kron(np.eye(2), one.T) @ both @ place
-        np.testing.assert_allclose(found.state[k, :6], icrf, atol=1e-6)
-        assert np.linalg.norm(found.state[k, :3] - states[k, :3]) > 100.0
-        turn = one.T @ turned.T @ one
-        expected = turn @ spread[:3, :3] @ turn.T
-        np.testing.assert_allclose(found.covariance[k, :3, :3], expected, atol=1e-9)
-        np.testing.assert_array_equal(found.covariance[k, 6:, 6:], spread[6:, 6:])
+def test_states_without_the_orientation_of_the_payload_are_not_exported(
+    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation("another"))
+    with pytest.raises(EvaluationError, match=r"turn anchored into ICRF; .* on board DE421, which is not"):
+        export(rich_ground, "oem", "anchored")
 
 
 def test_aem_has_the_attitude_of_each_frame(rich_ground: Ground, rich_pass: RichPass) -> None:

@@ -6,13 +6,17 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lunar.catalogue import make_catalogue, save_catalogue
 from lunar.datafolder import DataFolder, find_data
+from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import TerrainError
+from payload_emulator.session.world import _register, _registration_name
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.registering import (
     PRODUCT,
@@ -23,6 +27,7 @@ from payload_emulator.sim.terrain.registering import (
 from payload_emulator.sim.terrain.registration import (
     FLOOR_SIGMA_M,
     LATTICE_DEG,
+    PROCESS_ANGLE_DEG,
     PROCESS_SIGMA_M,
     Registration,
     Rims,
@@ -33,6 +38,7 @@ from payload_emulator.sim.terrain.registration import (
     registered,
 )
 from tests.payload_emulator.sim.rasters import write_raster
+from tests.payload_emulator.test_curation import OFFSET_M, Field
 
 RADIUS_M = 1_737_400.0
 
@@ -159,12 +165,17 @@ def test_another_product_is_refused_in_one_line(change: dict[str, object], words
         parse_registration(text[:40], "made.json")
 
 
-def folder_of(root: Path) -> DataFolder:
-    """A data folder with a raster, a list of one crater and the registration of the list to the raster."""
+def folder_of(root: Path, *others: Any) -> DataFolder:
+    """A data folder with a raster, a list of one crater and the registration of the list to the raster.
+
+    The list has other craters, of which no raster is registered: latitudes, longitudes in degrees, diameters.
+    """
     (root / "dem").mkdir()
     raster = write_raster(root / "dem/flat_128ppd_000E_+15.tif", 10.0, 20.0, 8.0, lambda lat, _: 0.0 * lat)
     catalogue = root / "craters.csv"
-    save_catalogue(make_catalogue([math.radians(15.0)], [math.radians(14.0)], [8e3], source="x"), catalogue)
+    latitude, longitude, size_m = np.concatenate([[[15.0], [14.0], [8e3]], *others], axis=1)
+    listed = make_catalogue(np.radians(latitude), np.radians(longitude), size_m, source="x")
+    save_catalogue(listed, catalogue)
     made = rims(100, (-30.0, 70.0), 60.0)
     made = replace(made, longitude_rad=made.longitude_rad - math.radians(286.0))
     save_registration(
@@ -188,6 +199,62 @@ def test_terrain_is_opened_with_its_catalogue_registered(tmp_path: Path) -> None
     plain = open_terrain("raster", data, 1)
     assert plain.registration is None
     assert plain.catalogue.latitude_rad[0] == pytest.approx(math.radians(15.0), abs=1e-12)
+
+
+def test_sigma_grows_beyond_the_nodes() -> None:
+    row, column = np.meshgrid([1, 2], [39, 40])
+    same = np.ones(4)
+    made = Registration(row.ravel(), column.ravel(), 50.0 * same, 0.0 * same, 12.0 * same, row.ravel())
+    shift, sigma = made.at(np.radians([10.0] * 3), np.radians([299.0, 303.75, 306.5]))
+    assert shift[:2, 0] == pytest.approx([50.0, 50.0])
+    # Half a spacing beyond the last node the process has moved by this; from three quarters on nothing is known.
+    moved = PROCESS_SIGMA_M * math.sqrt(1.0 - math.exp(-2.0 * 3.75 / PROCESS_ANGLE_DEG))
+    assert sigma[:2] == pytest.approx([12.0, math.hypot(12.0, moved)]) and np.isnan(sigma[2])
+
+
+def test_a_registration_holds_on_the_rasters_that_it_was_made_of(tmp_path: Path) -> None:
+    data = folder_of(tmp_path)
+    assert data.catalogue_lu is not None
+    made = parse_registration((tmp_path / PRODUCT).read_text(), "made")
+    save_registration(tmp_path / PRODUCT, replace(made, terrain={**made.terrain, "not-here.tif": "00"}))
+    found = find_registration(data, data.catalogue_lu, data.dem_tiles)
+    assert found is not None and made.row.size > 1
+    # Of the nodes at multiples of 7.5 degrees only this one lies on the raster, 10 to 18 E, 12 to 20 N.
+    assert (found.row * LATTICE_DEG).tolist() == [15.0] and (found.column * LATTICE_DEG).tolist() == [15.0]
+
+
+def test_ground_without_a_product_is_registered_from_its_rims(tmp_path: Path) -> None:
+    field = Field()
+    heights, top, left = field.window(10.0, 16.0, 300.0, 306.0)
+    listed = field.listed(40.0)
+    places = np.degrees([listed.latitude_rad, listed.longitude_rad])
+    data = folder_of(tmp_path, [*places, listed.diameter_m])
+
+    def drawn(latitude_deg: np.ndarray, longitude_deg: np.ndarray) -> np.ndarray:
+        rows, columns = np.rint((top - latitude_deg) * 128.0), np.rint((longitude_deg - left) * 128.0)
+        return heights[rows.astype(int), columns.astype(int)]
+
+    own = write_raster(tmp_path / "dem/own.tif", 300.0, 16.0, 6.0, drawn, ppd=128)
+    terrain = open_terrain("raster", replace(data, dem_tiles=(*data.dem_tiles, own)), 1)
+
+    def beneath(latitude_deg: float, longitude_deg: float) -> Any:
+        place = mcmf_from_spherical(np.radians([latitude_deg]), np.radians([longitude_deg]), 30e3)
+        return SimpleNamespace(positions_mcmf=lambda utc_ns: place)
+
+    times = np.zeros(1, dtype=np.int64)
+    stated = _registration_name(terrain, beneath(13.0, 303.0), times)
+    assert stated == ("crater list not registered to the terrain",)
+    _register(terrain, beneath(13.0, 303.0), times)
+    assert terrain.registration is not None
+    shift, sigma = terrain.registration.at(np.radians([13.0, 15.0]), np.radians([303.0, 14.0]))
+    assert shift[0] == pytest.approx(OFFSET_M, abs=20.0) and shift[1, 1] == pytest.approx(70.0, abs=15.0)
+    assert np.all(sigma < 30.0)
+    # The list is moved once, by the shift of its place.
+    north_m = (terrain.catalogue.latitude_rad - terrain.listed.latitude_rad) * RADIUS_M
+    assert north_m[0] == pytest.approx(70.0, abs=15.0) and north_m[1:] == pytest.approx(OFFSET_M[1], abs=20.0)
+    assert _registration_name(terrain, beneath(13.0, 303.0), times)[0].endswith("in 100 % of the frames")
+    _register(terrain, beneath(-40.0, 100.0), times)
+    assert "not registered" in _registration_name(terrain, beneath(-40.0, 100.0), times)[0]
 
 
 def test_a_registration_of_other_files_is_refused(tmp_path: Path) -> None:
