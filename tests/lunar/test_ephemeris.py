@@ -235,3 +235,8 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     for name in ("binary", "missing"):
         with pytest.raises(DataFileError, match=f"{name}.*expected a CCSDS OEM, STK .e or Horizons"):
             load_ephemeris(tmp_path / name)
+
+
+def test_states_in_other_axes_make_no_ephemeris():
+    with pytest.raises(EphemerisError, match="expected states turned into ICRF, found inertial axes"):
+        ephemeris_from_states([0, 1], np.ones((2, 3)), np.ones((2, 3)), frame="inertial axes of the payload")
