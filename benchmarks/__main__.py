@@ -1,7 +1,7 @@
 """`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
 
-Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (load,
-campaigns) has a command of its own and is not in this list.
+Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (gate
+error rates, campaigns) has a command of its own and is not in this list.
 """
 
 import argparse
@@ -10,7 +10,7 @@ import sys
 from benchmarks._rows import measure, report
 
 NAMES = (
-    "tmtc", "xtce", "downlink", "ground", "orbit", "ephemeris", "render", "detector", "pages",
+    "tmtc", "xtce", "downlink", "ground", "orbit", "render", "detector", "pages",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""
 

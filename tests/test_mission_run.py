@@ -32,12 +32,12 @@ from payload_emulator.session.regions import observed_boxes
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world import first_utc_ns, open_world
 from studies.mission_run.checkpoints import Checkpoints
-from studies.mission_run.comparison import compare_reports
 from studies.mission_run.disturbances import UNDISTURBED, ReferenceDisturbances, load_disturbances
 from studies.mission_run.dynamics import FlightDynamics
 from studies.mission_run.figures import Progress, missing_windows, note_plan, windows_asked
 from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _read_progress, _take_turns, run_fleet, run_mission
+from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
 from tmtc.downlink import decode
@@ -155,8 +155,8 @@ def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(
     assert list(fleet) == ["SelenITA", "Second", "Other"]
     for name, scenario in (("SelenITA", scenarios[0]), ("Other", scenarios[2])):
         single = run_mission(scenario, DataFolder(None), tmp_path / name, terms, lambda line: None)
-        values, differences = compare_reports(single, fleet[name])
-        assert values > 50 and differences == []
+        assert figures_of(fleet[name]) == pytest.approx(figures_of(single), rel=0.0, abs=0.0, nan_ok=True)
+        assert len(figures_of(single)) > 50
     assert all(one["windows"]["processed"] == 1 and one["packets_lost"] == 0 for one in fleet.values())
     assert all(one["interventions"] == 0 for one in fleet.values())
     assert fleet["Second"]["performance"] != fleet["SelenITA"]["performance"]
@@ -414,11 +414,11 @@ def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     assert any("continues from 2029-08-07T" in line for line in lines)
     assert again["starts"] == 2 and again["interventions"] == 0
     # A report uses the time correlation of that moment, which further time reports of the contact change a little.
-    values, differences = compare_reports(whole[1], again)
+    first, second = figures_of(whole[1]), figures_of(again)
     # One microsecond of the correlation is 1.6 mm along the track.
-    assert values > 50 and all(abs(one.second - one.first) < 2e-3 for one in differences)
-    drift = [one for one in differences if one.figure.endswith("drift_percent")]
-    assert all(abs(one.second - one.first) < 1e-6 for one in drift)
+    assert second == pytest.approx(first, rel=0.0, abs=2e-3, nan_ok=True) and len(first) > 50
+    drift = {name: value for name, value in first.items() if name.endswith("drift_percent")}
+    assert {name: second[name] for name in drift} == pytest.approx(drift, rel=0.0, abs=1e-6)
 
 
 def flat_terrain(listed: list[tuple[float, float, bool]], tiles: list[tuple[float, float]]) -> Any:

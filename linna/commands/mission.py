@@ -1,4 +1,4 @@
-"""`linna mission write | check | add | list | show | run | compare`: mission descriptions, and simulated missions."""
+"""`linna mission write | check | add | list | show | run`: mission descriptions, and simulated missions."""
 
 from __future__ import annotations
 
@@ -77,16 +77,6 @@ def _configure_run(running: LinnaParser) -> None:
     )
     option(running, "--kills N", number(int, least=0), "number of kills (default: 4 a day)")
     finish(running, run_mission)
-
-
-def _configure_compare(comparing: LinnaParser) -> None:
-    comparing.description = (
-        "Compare all closing figures of two mission runs except those of processes and the wall clock. "
-        "Exit status 0: identical; 1: not."
-    )
-    for name in ("first", "second"):
-        option(comparing, f"{name} {name.upper()}", Path, "folder of a run, or its report.json")
-    finish(comparing, compare)
 
 
 def write(arguments: argparse.Namespace) -> int:
@@ -239,14 +229,6 @@ def _went_well(figures: Mapping[str, Any]) -> bool:
     return explained and windows["processed"] == windows["flown"] and not figures["packets_lost"]
 
 
-def compare(arguments: argparse.Namespace) -> int:
-    from studies.mission_run.comparison import comparison, described
-
-    figures = comparison(arguments.first, arguments.second)
-    emit(arguments, figures, text=described(figures))
-    return 1 if figures["differences"] else 0
-
-
 COMMANDS: Commands = {
     "write": Hand("write the mission description of a scenario", _configure_write),
     "check": Hand("check a mission description; print one line for each fault", _configure_check),
@@ -269,7 +251,6 @@ COMMANDS: Commands = {
         options={"revision": "the hash or its first eight digits"},
     ),
     "run": Hand("run payload, stations, ground service and automation for days", _configure_run),
-    "compare": Hand("compare the closing figures of two mission runs", _configure_compare),
 }
 
 

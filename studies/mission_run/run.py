@@ -22,7 +22,6 @@ from payload_emulator.session.scenario import Scenario, format_scenario, parse_s
 from payload_emulator.session.world import open_world
 from studies.harness.kills import SPACECRAFT, Keeper, plan_kills
 from studies.mission_run.checkpoints import Checkpoints
-from studies.mission_run.comparison import REPORT
 from studies.mission_run.distributed import DistributedGround, Servers
 from studies.mission_run.disturbances import UNDISTURBED, Disturbances
 from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics
@@ -30,6 +29,7 @@ from studies.mission_run.figures import Progress, closing_figures, months, note_
 from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftKilled, SpacecraftProcess
 
+REPORT = "report.json"
 DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
 """Stations where the scenario names none: the Moon is always above the horizon of one of them."""
 
