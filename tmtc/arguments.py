@@ -121,7 +121,7 @@ def _written(key: str, value: Any, field: Field | None, time: Callable[[float], 
         return f"{name} {', '.join(_words(labels.get(one, str(one))) for one in columns['quantity'])}"
     if field.unit == "2^-16 s":
         return f"{name.removesuffix(' ticks')} {time(float(value))}"
-    label = value if isinstance(value, str) else dict(field.labels).get(int(value))
+    label = value if isinstance(value, str) else dict(field.labels).get(value)
     if label is not None:
         return f"{name} {_words(label)}"
     short = name.removesuffix(f" {_words(field.unit.replace('/', '_'))}")

@@ -36,6 +36,8 @@ def test_names_are_entered_in_place_of_numbers() -> None:
     assert (mode["argument_1"], mode["argument_2"]) == (1, 0.0)
     changed = arguments_by_number("set_parameter", {"parameter_id": "temperature_high_c", "value": 55})
     assert changed == {"parameter_id": 7, "value": 55}
+    between = {"function_id": "set_mode", "argument_1": 1.5}
+    assert argument_text("perform_function", between) == "function set mode, mode 1.5"
     assert argument_text("set_parameter", changed) == "parameter temperature high c, value 55 degC"
 
 

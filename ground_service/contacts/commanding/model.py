@@ -109,7 +109,7 @@ class CommandRecord(Entity):
 
 def onboard_time(ticks: float) -> str:
     """Return the UTC of an on-board clock without error."""
-    return f"{format_utc(utc_ns_from_ticks(int(ticks)), 0)}"
+    return format_utc(utc_ns_from_ticks(int(ticks)), 0)
 
 
 @dataclass(frozen=True, slots=True)
