@@ -55,7 +55,7 @@ class Station:
         down, up = (one.getsockname()[1] for one in (self.down, self.up))
         return (
             f'[[links]]\nname = "lab"\nkind = "tcp"\ndownlink = "127.0.0.1:{down}"\n'
-            f'uplink = "127.0.0.1:{up}"\nsilence_s = 1.0\n{extra}\n'
+            f'uplink = "127.0.0.1:{up}"\nsilence_s = 60.0\n{extra}\n'
         )
 
     def close(self) -> None:
