@@ -1,25 +1,25 @@
 """Exact state of a spacecraft process in a file, from which it goes on as if it had not ended.
 
-The file has two lines: `LINNA spacecraft state, version N, SHA-256 HEX`, and a JSON document with this checksum.
-A number, text or null stands for itself. Every other value is a list that begins with its kind; a value that occurs
-again is `["ref", n]`, the n-th of these lists. Octets are compressed with zlib and encoded in base64. Arrays keep their
-views: flight software holds views of the memory of its board, and a later fault of the memory has to reach it.
+The file has two lines, `LINNA spacecraft state, version N, SHA-256 HEX` and a JSON document, and then octets; the
+checksum is that of everything after the first line. A number, text or null stands for itself. Every other value is a
+list that begins with its kind; a value that occurs again is `["ref", n]`, the n-th of these lists. Octets are numbered:
+the last item of the document has their lengths, and equal ones are written once. Arrays keep their views: flight
+software holds views of the memory of its board, and a later fault of the memory has to reach it.
 
 Nothing in the file is executed: it names classes of this program, whose attributes are set without a call.
 """
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import importlib
 import json
 import os
 import re
-import zlib
 from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator, Mapping
 from enum import Enum
+from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType, MethodType
 from typing import Any
@@ -29,7 +29,7 @@ import numpy as np
 from lunar.propagation import Trajectory
 from payload_emulator.errors import RecordError
 
-VERSION = 5
+VERSION = 6
 _HEADER = re.compile(rb"LINNA spacecraft state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
 _EXPECTED = "the state of a spacecraft process (linna emulate --live --state)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")
@@ -54,9 +54,12 @@ def pack_state(scenario: str, values: Mapping[str, Any], known: Mapping[str, obj
     RecordError
         A value is of a kind that cannot be kept.
     """
-    document = json.dumps([scenario, _Writer(known).node(dict(values))], separators=(",", ":")).encode()
-    digest = hashlib.sha256(document).hexdigest()
-    return f"LINNA spacecraft state, version {VERSION}, SHA-256 {digest}\n".encode() + document
+    writer = _Writer(known)
+    root = writer.node(dict(values))
+    document = json.dumps([scenario, root, [*map(len, writer.octets)]], separators=(",", ":")).encode()
+    body = b"".join([document, b"\n", *writer.octets])
+    digest = hashlib.sha256(body).hexdigest()
+    return f"LINNA spacecraft state, version {VERSION}, SHA-256 {digest}\n".encode() + body
 
 
 def unpack_state(octets: bytes, scenario: str, known: Mapping[str, object]) -> dict[str, Any]:
@@ -72,13 +75,14 @@ def unpack_state(octets: bytes, scenario: str, known: Mapping[str, object]) -> d
         raise RecordError(f"expected {_EXPECTED}, found octets that begin with {octets[:24]!r}")
     if int(header[1]) != VERSION:
         raise RecordError(f"expected version {VERSION} of the state, found {int(header[1])}")
-    document = octets[header.end() :]
-    if hashlib.sha256(document).hexdigest().encode() != header[2]:
+    body = memoryview(octets)[header.end() :]
+    if hashlib.sha256(body).hexdigest().encode() != header[2]:
         raise RecordError(f"expected {_EXPECTED} with the checksum of line 1, found damage")
     try:
-        name, root = json.loads(document)
-        found = dict(_Reader(known).value(root))
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError, zlib.error) as error:
+        end = octets.index(b"\n", header.end())
+        name, root, lengths = json.loads(octets[header.end() : end])
+        found = dict(_Reader(known, memoryview(octets)[end + 1 :], lengths).value(root))
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError) as error:
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise RecordError(f"expected {_EXPECTED}, found damage ({reason})") from None
     if name != scenario:
@@ -131,6 +135,7 @@ class _Writer:
         self._numbers: dict[int, int] = {}
         # A value that is dropped while others are written would give away its id.
         self._kept: list[object] = []
+        self.octets: dict[bytes, int] = {}
 
     def node(self, value: Any) -> Any:
         if type(value) in _PLAIN:
@@ -145,7 +150,7 @@ class _Writer:
         if isinstance(value, Enum):
             return ["enum", _name(kind), self.node(value.value)]
         if kind in (bytes, bytearray):
-            return [kind.__name__, _packed(value)]
+            return [kind.__name__, self._number_of(bytes(value))]
         if isinstance(value, np.ndarray | np.generic):
             return self._numbers_of(value)
         if kind is deque:
@@ -169,21 +174,26 @@ class _Writer:
         if value.dtype.hasobject or value.dtype.fields:
             raise RecordError(f"state: expected arrays of numbers, found one of {value.dtype}")
         if isinstance(value, np.generic):
-            return ["number", value.dtype.str, _packed(value.tobytes())]
+            return ["number", value.dtype.str, self._number_of(value.tobytes())]
         owner = value.base
         if isinstance(owner, np.ndarray) and owner.flags.forc and not owner.dtype.hasobject:
             offset = value.__array_interface__["data"][0] - owner.__array_interface__["data"][0]
             return ["view", self.node(owner), offset, value.shape, value.strides, value.dtype.str]
         order = "F" if value.flags.fnc else "C"
-        return ["array", value.dtype.str, value.shape, order, _packed(value.tobytes(order))]
+        return ["array", value.dtype.str, value.shape, order, self._number_of(value.tobytes(order))]
+
+    def _number_of(self, octets: bytes) -> int:
+        return self.octets.setdefault(octets, len(self.octets))
 
 
 class _Reader:
     """JSON to values, which are made without calls of their classes."""
 
-    def __init__(self, known: Mapping[str, object]) -> None:
+    def __init__(self, known: Mapping[str, object], octets: memoryview, lengths: list[int]) -> None:
         self._known = known
         self._made: list[Any] = []
+        ends = list(accumulate(lengths))
+        self._octets = [octets[end - length : end] for end, length in zip(ends, lengths, strict=True)]
 
     def value(self, node: Any) -> Any:
         if type(node) in _PLAIN:
@@ -221,7 +231,7 @@ class _Reader:
         if kind == "enum":
             return _class(rest[0], Enum)(self.value(rest[1]))
         if kind in ("bytes", "bytearray"):
-            return {"bytes": bytes, "bytearray": bytearray}[kind](_unpacked(rest[0]))
+            return {"bytes": bytes, "bytearray": bytearray}[kind](self._octets[rest[0]])
         if kind == "mapping":
             return MappingProxyType(self.value(rest[0]))
         if kind == "trajectory":
@@ -237,10 +247,10 @@ class _Reader:
 
     def _array(self, kind: str, *rest: Any) -> Any:
         if kind == "number":
-            return np.frombuffer(_unpacked(rest[1]), _numeric(rest[0]))[0]
+            return np.frombuffer(self._octets[rest[1]], _numeric(rest[0]))[0]
         if kind == "array":
             name, shape, order, octets = rest
-            flat = np.frombuffer(_unpacked(octets), _numeric(name))
+            flat = np.frombuffer(self._octets[octets], _numeric(name))
             return np.array(flat.reshape(shape, order=order), order=order)
         if kind != "view":
             raise ValueError(f"unknown kind {kind!r}")
@@ -283,11 +293,3 @@ def _numeric(name: str) -> np.dtype[Any]:
     if dtype.hasobject:
         raise ValueError("expected an array of numbers, found one of objects")
     return dtype
-
-
-def _packed(octets: bytes | bytearray) -> str:
-    return base64.b64encode(zlib.compress(octets, 1)).decode("ascii")
-
-
-def _unpacked(text: str) -> bytes:
-    return zlib.decompress(base64.b64decode(text, validate=True))

@@ -141,12 +141,9 @@ def test_a_failure_while_writing_leaves_the_state_before(
 
 
 def sealed(root: Any) -> bytes:
-    """Return a document with the header that fits."""
-    document = json.dumps(root).encode()
-    return (
-        f"LINNA spacecraft state, version {VERSION}, SHA-256 {sha256(document).hexdigest()}\n".encode()
-        + document
-    )
+    """Return a document, and eight octets, with the header that fits."""
+    body = json.dumps(root).encode() + b"\n" + bytes(range(8))
+    return f"LINNA spacecraft state, version {VERSION}, SHA-256 {sha256(body).hexdigest()}\n".encode() + body
 
 
 @pytest.mark.parametrize(
@@ -161,14 +158,21 @@ def sealed(root: Any) -> bytes:
         ["dict", ["one", ["object", "payload_emulator.flight.onboard.modes:PayloadMode"]]],
         ["dict", ["one", ["enum", "tmtc.uplink:Farm", 1]]],
         ["dict", ["one", ["trajectory", ["dict"]]]],
-        ["dict", ["one", ["array", "O", [1], "C", "eJxjYAACAAAIAAE="]]],
-        ["dict", ["one", ["view", ["array", "|u1", [8], "C", "eJxjYAACAAAIAAE="], 0, [1], [8], "O"]]],
-        ["dict", ["one", ["view", ["array", "|u1", [8], "C", "eJxjYAACAAAIAAE="], 4, [1], [8], "<i8"]]],
-        ["dict", ["one", ["bytes", "no base64"]]],
+        ["dict", ["one", ["array", "O", [1], "C", 0]]],
+        ["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 0, [1], [8], "O"]]],
+        ["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 4, [1], [8], "<i8"]]],
+        ["dict", ["one", ["bytes", 1]]],
         ["dict", ["one", ["object", "tmtc.uplink:Farm", ["unknown", 1]]]],
     ],
     ids=json.dumps,
 )  # fmt: skip
 def test_another_document_with_a_fitting_checksum_is_refused_and_calls_nothing(node: Any) -> None:
     with pytest.raises(RecordError, match="found damage"):
-        unpack_state(sealed(["a", node]), "a", {})
+        unpack_state(sealed(["a", node, [8]]), "a", {})
+
+
+def test_a_document_names_octets_by_their_numbers_and_equal_ones_are_written_once() -> None:
+    root = ["dict", ["one", ["list", ["bytes", 0], ["bytearray", 1]]]]
+    assert unpack_state(sealed(["a", root, [3, 5]]), "a", {}) == {"one": [b"\0\1\2", b"\3\4\5\6\7"]}
+    once = len(pack_state("a", {"one": bytes(50_000)}, {}))
+    assert len(pack_state("a", {"one": bytes(50_000), "two": bytearray(50_000)}, {})) < once + 100
