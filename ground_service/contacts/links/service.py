@@ -369,10 +369,10 @@ def send_due(ground: Ground, name: str) -> SendDue:
     with ground.database.reading() as connection:
         found = store.find_link(connection, name)
         pending = bool(store.pending_transmissions(connection, name))
-        held = found is not None and commanding.is_held(connection, found.ccsds_id, found.instance)
-    if found is None or held:
-        return SendDue(requested=False, request=0, pending=pending)
-    return SendDue(found.send_requested > found.send_done, found.send_requested, pending)
+        if found is None or found.send_requested <= found.send_done:
+            return SendDue(requested=False, request=0, pending=pending)
+        held = commanding.is_held(connection, found.ccsds_id, found.instance)
+    return SendDue(not held, found.send_requested, pending)
 
 
 def note_sent_request(ground: Ground, name: str, owner: str, number: int) -> None:
