@@ -39,10 +39,13 @@ RESOLUTION_NS = 2 * 15_259.0
 MAX_ROUNDS = 10
 
 JUMP_NS = 20e6
-"""A clock that is off by so much more from one time report to the next has been set; delays on board are smaller."""
+"""A clock that is off by so much more than its drift explains has been set; delays on board are smaller."""
 
 JUMP_RATE = 200e-6
-"""As `JUMP_NS`, per time between the reports: no oscillator drifts that fast."""
+"""No oscillator drifts faster, in real time."""
+
+DRIFT_CHANGE = 2e-6
+"""No oscillator changes its drift by more between two time reports."""
 
 SIGNIFICANT = 3.0
 """A drift of fewer standard deviations than that is taken for none."""
@@ -198,9 +201,10 @@ def clock_runs(
 ) -> list[IntArray]:
     """Indices of the time reports (n,) of each run of the clock, in the order in which they were sent.
 
-    A run ends with a boot, and where the clock was set: where it is off by `JUMP_NS` and `JUMP_RATE` more than at the
-    report before, and the next report says so too. A report that stands alone with what it says stays in the run, where
-    the fit leaves it out.
+    A run ends with a boot, and where the clock was set: where it is off by more than `JUMP_NS` from where its drift
+    would have taken it, and the next report says so too. The drift is at most `JUMP_RATE`; a run that has lasted for a
+    time shows it to `JUMP_NS` over that time and `DRIFT_CHANGE`, so that a step is found after hours without reports. A
+    report that stands alone with what it says stays in the run, where the fit leaves it out.
     """
     sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
     order = np.lexsort((ticks, sent))
@@ -208,13 +212,17 @@ def clock_runs(
     for number in np.unique(boot[order]):
         mine = order[boot[order] == number]
         nominal = ticks[mine] * _NS_NUMERATOR // _NS_DENOMINATOR
-        off = (nominal - nominal[0] - (sent[mine] - sent[mine[0]])).astype(np.float64)
-        allowed = JUMP_NS + JUMP_RATE * np.abs(np.diff(sent[mine]))
+        at = (sent[mine] - sent[mine[0]]).astype(np.float64)
+        off = (nominal - nominal[0]).astype(np.float64) - at
         start, level = 0, 0
         for k in range(1, len(mine)):
-            if abs(off[k] - off[level]) <= JUMP_NS + JUMP_RATE * (sent[mine[k]] - sent[mine[level]]):
+            lasted, since = at[level] - at[start], at[k] - at[level]
+            drift, unknown = 0.0, JUMP_RATE
+            if JUMP_NS + DRIFT_CHANGE * lasted < JUMP_RATE * lasted:
+                drift, unknown = (off[level] - off[start]) / lasted, DRIFT_CHANGE + JUMP_NS / lasted
+            if abs(off[k] - off[level] - drift * since) <= JUMP_NS + unknown * since:
                 level = k
-            elif k + 1 < len(mine) and abs(off[k + 1] - off[k]) <= allowed[k]:
+            elif k + 1 < len(mine) and abs(off[k + 1] - off[k]) <= JUMP_NS + JUMP_RATE * (at[k + 1] - at[k]):
                 runs.append(mine[start:k])
                 start = level = k
         runs.append(mine[start:])

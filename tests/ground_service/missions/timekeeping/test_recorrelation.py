@@ -186,6 +186,21 @@ def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> 
     assert [len(one) for one in runs] == [8, 12]
 
 
+@pytest.mark.parametrize("drift_ppm", [0.0, 150.0, -40.0])
+def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm: float) -> None:
+    """In three hours an unknown drift of 200 ppm could be 2 s; that of this clock is known from the reports before."""
+    from ground_service.missions.timekeeping.core import clock_runs
+
+    hours = np.array([0.0, 0.1, 2.0, 2.1, 4.0, 4.1, 7.0, 7.1, 10.0])
+    sent = START + np.asarray(hours * 3600 * NS, dtype=np.int64)
+    error_s = hours * 3600.0 * drift_ppm * 1e-6
+    none = np.zeros(len(hours), dtype=np.int64)
+    for step_s, lengths in ((0.0, [9]), (1.0, [6, 3]), (-1.0, [6, 3]), (0.1, [6, 3])):
+        off = np.rint((error_s + np.where(hours > 5.0, step_s, 0.0)) * 65_536).astype(np.int64)
+        runs = clock_runs(np.asarray(ticks_from_utc_ns(sent), dtype=np.int64) + off, sent, none, none)
+        assert [len(one) for one in runs] == lengths
+
+
 def test_a_drift_within_the_resolution_of_the_clock_is_none() -> None:
     from ground_service.missions.timekeeping.core import fit_correlation
 
