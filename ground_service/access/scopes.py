@@ -34,7 +34,7 @@ LISTS = {
 }  # fmt: skip
 """Lists from which the rows of other spacecraft are left out."""
 
-CONTENT = {"add_ephemeris", "withdraw_ephemeris", "add_mission"}
+CONTENT = {"add_ephemeris", "withdraw_ephemeris", "add_mission", "check_mission"}
 """Operations whose content states the spacecraft; their use cases ask `Caller.may_use`."""
 
 SERVICE = {

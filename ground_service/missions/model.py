@@ -727,6 +727,14 @@ class MissionRevision(Entity):
     entered_by: str
 
 
+class MissionCheck(Entity):
+    """What a text would be as a mission description; it was not added."""
+
+    faults: tuple[str, ...] = Field(description="One line for each fault; empty if it can be added")
+    unknown: tuple[str, ...] = Field((), description="Keys that it does not state")
+    changes: tuple[str, ...] = Field((), description="Unified difference to the revision in force")
+
+
 class HeldCatalogue(Entity):
     """Crater catalogue that the ground holds, for mission descriptions that name its hash."""
 
@@ -755,12 +763,6 @@ def parse_mission(text: str, source: str = "mission.toml") -> Mission:
     if isinstance(result, Mission):
         return result
     raise result[0]
-
-
-def mission_faults(text: str, source: str = "mission.toml") -> list[str]:
-    """Return one line for each fault of a mission description; empty if it is valid."""
-    result = read_document(text, source)
-    return [] if isinstance(result, Mission) else [str(fault) for fault in result]
 
 
 def read_document(text: str, source: str) -> Mission | list[InvalidInput]:

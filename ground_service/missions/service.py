@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from ground_service.missions.model import (
     MISSION_LIMIT_OCTETS,
     Approval,
     Mission,
+    MissionCheck,
     MissionDetail,
     format_mission,
     parse_mission,
@@ -36,17 +38,11 @@ def read_mission(octets: bytes, source: str = "mission.toml") -> tuple[Mission, 
     InvalidInput
         The octets are not a mission description.
     """
-    if len(octets) > MISSION_LIMIT_OCTETS:
-        raise InvalidInput(source, "", f"at most {MISSION_LIMIT_OCTETS} octets", str(len(octets)))
-    try:
-        text = octets.decode("utf-8")
-    except UnicodeDecodeError as error:
-        found = f"octet {error.object[error.start]:#04x} at {error.start}"
-        raise InvalidInput(source, "", "UTF-8 text", found) from None
-    mission = parse_mission(text, source)
-    for fault in definition_faults(mission, source):
-        raise fault
-    return mission, text
+    text = _text_of(octets, source)
+    read, faults = _read(text, source)
+    if read is None or faults:
+        raise faults[0]
+    return read, text
 
 
 def check_mission_file(path: Path) -> tuple[Mission | None, list[str]]:
@@ -57,13 +53,55 @@ def check_mission_file(path: Path) -> tuple[Mission | None, list[str]]:
     InvalidInput
         The file, or an XTCE file that it names, cannot be read, or is not text.
     """
+    read, faults = _read(_text_of(read_mission_file(path), str(path)), str(path))
+    return None if faults else read, [str(fault) for fault in faults]
+
+
+def check_mission(ground: Ground, octets: bytes, *, caller: Caller = LOCAL_CALLER) -> MissionCheck:
+    """Check a mission description and compare it with the revision in force of its spacecraft; nothing is added.
+
+    Raises
+    ------
+    InvalidInput
+        It is not text.
+    Forbidden
+        It is of a mission that the caller is not limited to.
+    """
+    text = _text_of(octets, "mission.toml")
+    mission, faults = _read(text, "mission.toml")
+    if mission is None:
+        return MissionCheck(faults=tuple(map(str, faults)))
+    _require_own(mission, "mission.toml", caller)
+    with ground.database.reading() as connection:
+        key = store.newest_of_spacecraft(connection, mission.spacecraft.id or -1)
+        before = "" if key is None else store.detail(connection, key).text
+    changes = difflib.unified_diff(before.splitlines(), text.splitlines(), lineterm="", n=1)
+    return MissionCheck(faults=tuple(map(str, faults)), unknown=mission.unknown, changes=tuple(changes)[2:])
+
+
+def _text_of(octets: bytes, source: str) -> str:
+    if len(octets) > MISSION_LIMIT_OCTETS:
+        raise InvalidInput(source, "", f"at most {MISSION_LIMIT_OCTETS} octets", str(len(octets)))
     try:
-        text = read_mission_file(path).decode("utf-8")
-    except UnicodeDecodeError:
-        raise InvalidInput(str(path), "", "UTF-8 text", "other octets") from None
-    read = read_document(text, str(path))
-    faults = definition_faults(read, str(path)) if isinstance(read, Mission) else read
-    return None if faults or not isinstance(read, Mission) else read, [str(fault) for fault in faults]
+        return octets.decode("utf-8")
+    except UnicodeDecodeError as error:
+        found = f"octet {error.object[error.start]:#04x} at {error.start}"
+        raise InvalidInput(source, "", "UTF-8 text", found) from None
+
+
+def _read(text: str, source: str) -> tuple[Mission | None, list[InvalidInput]]:
+    """Return what a text describes, None if that cannot be told, and all faults."""
+    read = read_document(text, source)
+    return (read, definition_faults(read, source)) if isinstance(read, Mission) else (None, read)
+
+
+def _require_own(mission: Mission, source: str, caller: Caller) -> None:
+    named = caller.missions is None or mission.name in caller.missions
+    if not named or not caller.may_use(mission.spacecraft.id):
+        raise Forbidden(
+            f"{source}: {caller.name}: expected name and spacecraft of {', '.join(caller.missions or ())}, "
+            f"found {mission.name!r} and {mission.spacecraft.id}"
+        )
 
 
 def add_mission(
@@ -84,12 +122,7 @@ def add_mission(
         the name of a mission that the caller is not limited to.
     """
     mission, text = read_mission(octets, source)
-    named = caller.missions is None or mission.name in caller.missions
-    if not named or not caller.may_use(mission.spacecraft.id):
-        raise Forbidden(
-            f"{source}: {caller.name}: expected name and spacecraft of {', '.join(caller.missions or ())}, "
-            f"found {mission.name!r} and {mission.spacecraft.id}"
-        )
+    _require_own(mission, source, caller)
     with ground.database.writing() as connection:
         if not caller.may("admin") and mission.spacecraft.id is not None:
             in_force = store.approval_in_force(connection, mission.spacecraft.id)

@@ -17,16 +17,16 @@ from ground_service.settings import Settings
 from tests.serving import TestClient
 
 VERBS = {
-    "accept", "acknowledge", "add", "approve", "change", "define", "delete", "end", "enter", "evaluate", "export",
-    "find", "get", "hold", "import", "keep", "list", "refuse", "reject", "release", "render", "repeat", "request",
-    "resume", "revoke", "run",
+    "accept", "acknowledge", "add", "approve", "change", "check", "define", "delete", "end", "enter",
+    "evaluate", "export", "find", "get", "hold", "import", "keep", "list", "refuse", "reject", "release", "render",
+    "repeat", "request", "resume", "revoke", "run",
     "search", "send", "shelve", "start", "take", "uplink", "upload", "withdraw",
 }  # fmt: skip
 SUMMARY_VERBS = {
-    "Accept", "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable",
-    "End", "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register",
-    "Reject", "Release", "Render", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start", "Suppress",
-    "Take", "Withdraw",
+    "Accept", "Acknowledge", "Add", "Approve", "Change", "Check", "Compare", "Count", "Create", "Define", "Delete",
+    "Disable", "End", "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Pause", "Queue", "Refuse", "Register",
+    "Reject", "Release", "Render", "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Start",
+    "Suppress", "Take", "Withdraw",
 }  # fmt: skip
 TAGS = {
     "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "landmarks", "links", "missions",

@@ -16,7 +16,7 @@ const load = pager(async (limit, offset) => {
         ["Not stated", (row) => String(row.unknown.length), "num"],
       ],
       page.items,
-      "No mission description yet: write one with linna mission write, enter it with linna mission add.",
+      "No mission description yet: linna mission write makes the text of one.",
     ),
   );
   return page;

@@ -20,7 +20,7 @@ from ground_service.ingest import parameters as decoding
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import minimal_description, read_mission_file
-from ground_service.missions.model import mission_faults
+from ground_service.missions.model import read_document
 from ground_service.missions.service import add_mission, check_mission_file
 from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
@@ -512,7 +512,7 @@ def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "bus.xml").unlink()
     with pytest.raises(InvalidInput, match=r"packets.0.xtce: expected the file .*bus\.xml"):
         check_mission_file(path)
-    assert "expected texts of XTCE documents" in mission_faults(path.read_text())[0]
+    assert "expected texts of XTCE documents" in str(read_document(path.read_text(), "m.toml")[0])
 
 
 def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) -> None:

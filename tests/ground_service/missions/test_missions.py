@@ -18,12 +18,13 @@ from ground_service.missions.model import (
     Evidence,
     Mission,
     format_mission,
-    mission_faults,
     parse_mission,
+    read_document,
     weakest_evidence,
 )
 from ground_service.missions.service import (
     add_mission,
+    check_mission,
     check_mission_file,
     enter,
     mission_of_pass,
@@ -78,12 +79,12 @@ def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(
     with pytest.raises(InvalidInput) as caught:
         parse_mission(text, "m.toml")
     assert str(caught.value).startswith(message)
-    assert mission_faults(text, "m.toml") == [str(caught.value)]
+    assert list(map(str, read_document(text, "m.toml"))) == [str(caught.value)]
 
 
 def test_every_unknown_key_has_a_line_of_its_own() -> None:
-    faults = mission_faults('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
-    assert faults == [
+    faults = read_document('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
+    assert list(map(str, faults)) == [
         "m.toml, camera.widht_px: expected 'width_px', found unknown key 'widht_px'",
         "m.toml, linc: expected 'link', found unknown key 'linc'",
     ]
@@ -326,8 +327,8 @@ def test_only_an_administrator_changes_which_telecommands_need_a_second_person(g
     ],
 )
 def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line: str, message: str) -> None:
-    faults = mission_faults(approval_text(line).decode())
-    assert len(faults) == 1 and message in faults[0]
+    [fault] = read_document(approval_text(line).decode(), "m.toml")
+    assert message in str(fault)
 
 
 def test_windows_approved_automatically_with_critical_telecommands_are_refused(
@@ -343,6 +344,20 @@ def test_windows_approved_automatically_with_critical_telecommands_are_refused(
     subjects = '["perform_function/set_mode", "uplink_first", "uplink_middle", "uplink_last"]'
     released = extra.replace("[uploads]", f"one_person_for = {subjects}\n[uploads]")
     assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
+
+
+def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground) -> None:
+    add_mission(ground, TEXT.encode())
+    assert check_mission(ground, TEXT.encode()).changes == ()
+    found = check_mission(ground, TEXT.replace("fov_deg = 120", "fov_deg = 90").encode())
+    assert found.faults == () and "camera.width_px" in found.unknown
+    assert [one for one in found.changes if one[0] in "+-"] == ["-fov_deg = 120", "+fov_deg = 90"]
+    assert len(check_mission(ground, (TEXT + "[linc]\n[camara]\n").encode()).faults) == 2
+    other = Caller("eve", "operator", missions=("other",), spacecraft=frozenset({77}))
+    with pytest.raises(Forbidden):
+        check_mission(ground, TEXT.encode(), caller=other)
+    with ground.database.reading() as connection:
+        assert list_missions(connection, Paging()).total == 1
 
 
 def test_viewers_see_neither_passwords_nor_tokens_of_webhooks(tmp_path: Path) -> None:

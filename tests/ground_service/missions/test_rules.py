@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ground_service.missions.model import format_mission, mission_faults, parse_mission
+from ground_service.missions.model import Mission, format_mission, parse_mission, read_document
 from ground_service.missions.rules import ACTIONS, CAUSES, CONDITIONS, DEFAULT_RULES, FOLLOWS, TRIGGERS
 from ground_service.worker.actions import DOING
 
@@ -99,14 +99,14 @@ def rule(name: str = "a", on: str = "window ended", do: str = '["report"]', more
     ],
 )
 def test_a_rule_that_cannot_hold_is_refused_with_one_line(text: str, line: str) -> None:
-    [fault] = mission_faults(HEAD + text)
-    assert fault.startswith(f"mission.toml, {line}")
+    [fault] = read_document(HEAD + text, "mission.toml")
+    assert str(fault).startswith(f"mission.toml, {line}")
 
 
 def test_rules_that_differ_in_their_conditions_do_not_contradict_each_other() -> None:
     complete = rule(more='when = { window_state = ["downlinked"] }')
     failed = rule("b", more='when = { window_state = ["failed"] }\napproval = true')
-    assert mission_faults(HEAD + complete + failed) == []
+    assert isinstance(read_document(HEAD + complete + failed, "mission.toml"), Mission)
 
 
 def test_stated_rules_survive_the_format_and_change_the_revision() -> None:

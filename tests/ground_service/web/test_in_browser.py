@@ -237,7 +237,7 @@ second_person_for = ["perform_function/set_mode"]
 """
 
 
-def test_a_mission_description_is_shown_with_its_limits_approval_and_frames(page):
+def test_a_mission_description_is_shown_and_changed_on_its_page(page):
     entered = page.request.post("/api/v1/missions", data=MISSION, headers={"Content-Type": "text/plain"})
     assert entered.status == 201
     settled(page, "/missions")
@@ -247,16 +247,29 @@ def test_a_mission_description_is_shown_with_its_limits_approval_and_frames(page
     expect(page.locator("#range")).to_contain_text("1 to 2 of 2")
     row.get_by_role("link", name="shown").click()
     expect(page.get_by_role("heading", level=1)).to_have_text("shown")
-    expect(page.locator("#limits tr", has_text="median error, m")).to_contain_text("100")
-    expect(page.locator("#limits tr", has_text="recall")).to_contain_text("not stated")
-    expect(page.locator("#approval tr", has_text="windows")).to_contain_text("manual")
-    expect(page.locator("#approval tr", has_text="second person for")).to_contain_text(
-        "perform_function/set_mode"
-    )
-    expect(page.locator("#frames")).to_contain_text("DE421")
+    sections = page.locator("#sections")
+    expect(sections.locator("tr", has_text="median error, m")).to_contain_text("100")
+    expect(sections.locator("tr", has_text="recall")).to_contain_text("not stated")
+    sections.locator("summary", has_text="approval").click()
+    expect(sections.locator("tr", has_text="second person for")).to_contain_text("perform_function/set_mode")
+    expect(sections).to_contain_text("DE421")
     expect(page.locator("#unknown")).to_contain_text("camera.width_px")
-    page.get_by_text("mission.toml as entered").click()
-    expect(page.locator("#document")).to_contain_text("median_error_m = 100.0")
+    editor = page.get_by_label("mission.toml")
+    text = editor.input_value()
+    enter = page.get_by_role("button", name="Enter as a revision")
+    expect(enter).to_be_disabled()
+    editor.fill(text.replace("median_error_m", "medain_error_m"))
+    expect(page.locator("#faults")).to_contain_text("expected 'median_error_m', found unknown key")
+    expect(enter).to_be_disabled()
+    editor.fill(text.replace("median_error_m = 100.0", "median_error_m = 80.0"))
+    expect(page.locator("#faults")).to_contain_text("+median_error_m = 80.0")
+    enter.click()
+    expect(page.locator("#confirm-text")).to_contain_text("-median_error_m = 100.0")
+    page.get_by_role("button", name="Enter", exact=True).click()
+    expect(sections.locator("tr", has_text="median error, m")).to_contain_text("80")
+    page.goto("/missions/new")
+    editor.fill('name = "')
+    expect(page.locator("#faults")).to_contain_text("mission.toml: expected TOML")
 
 
 def test_a_mission_description_that_is_not_entered_is_told(page):
