@@ -731,8 +731,8 @@ class MissionCheck(Entity):
     """What a text would be as a mission description; it was not added."""
 
     faults: tuple[str, ...] = Field(description="One line for each fault; empty if it can be added")
-    unknown: tuple[str, ...] = Field((), description="Keys that it does not state")
-    changes: tuple[str, ...] = Field((), description="Unified difference to the revision in force")
+    unknown: tuple[str, ...] = Field(description="Keys that it does not state")
+    changes: tuple[str, ...] = Field(description="Unified difference to the revision in force")
 
 
 class HeldCatalogue(Entity):

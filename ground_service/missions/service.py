@@ -70,7 +70,7 @@ def check_mission(ground: Ground, octets: bytes, *, caller: Caller = LOCAL_CALLE
     text = _text_of(octets, "mission.toml")
     mission, faults = _read(text, "mission.toml")
     if mission is None:
-        return MissionCheck(faults=tuple(map(str, faults)))
+        return MissionCheck(faults=tuple(map(str, faults)), unknown=(), changes=())
     _require_own(mission, "mission.toml", caller)
     with ground.database.reading() as connection:
         key = store.newest_of_spacecraft(connection, mission.spacecraft.id or -1)
