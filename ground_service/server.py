@@ -11,7 +11,7 @@ import socket
 import sys
 from typing import TYPE_CHECKING
 
-from ground_service.access.service import has_users
+from ground_service.access.store import has_users
 from ground_service.app import create_app
 from ground_service.errors import ServerError
 from ground_service.ground import ground_from_settings
@@ -54,7 +54,7 @@ def serve(settings: Settings) -> None:
 
     limit_heaps()
     with ground_from_settings(settings) as ground:
-        if settings.host not in LOOPBACK and not has_users(ground):
+        if settings.host not in LOOPBACK and not ground.read(has_users):
             raise ServerError(
                 f"address {settings.host}: expected users before binding beyond this machine, found none; "
                 "run 'linna user add NAME --role admin' first"

@@ -14,7 +14,8 @@ from sqlalchemy import Connection
 from starlette.concurrency import run_in_threadpool
 
 from ground_service.access.scopes import check_scope
-from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
+from ground_service.access.service import LOCAL_CALLER, Caller, authenticate
+from ground_service.access.store import has_users
 from ground_service.errors import Forbidden, NotAuthorised
 from ground_service.http.common import GroundOf, linked
 from ground_service.http.model import PageOf
@@ -36,7 +37,7 @@ def caller_of(
     ground = request.app.state.ground
     token = given.credentials if given is not None else request.cookies.get(SESSION_COOKIE)
     if token is None:
-        if request.app.state.open_without_users and not has_users(ground):
+        if request.app.state.open_without_users and not ground.read(has_users):
             request.state.caller = LOCAL_CALLER.name
             return LOCAL_CALLER
         raise NotAuthorised("expected a bearer token in the Authorization header, found none")

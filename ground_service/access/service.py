@@ -269,12 +269,6 @@ def revoke_token(ground: Ground, token_id: int, *, actor: str = "local") -> Toke
     return token.token(now)
 
 
-def has_users(ground: Ground) -> bool:
-    """Return whether the service has users."""
-    with ground.database.reading() as connection:
-        return store.has_users(connection)
-
-
 def authenticate(ground: Ground, token: str) -> Caller:
     """Return the caller that a token belongs to.
 

@@ -75,6 +75,9 @@ class LocalDispatcher(Dispatcher):
     def resume(self) -> None:
         """Leave unfinished jobs of other processes to the server."""
 
+    def close(self) -> None:
+        """No job runs between requests."""
+
 
 class FollowUpOnDemand:
     """In-process follow-up work of events; its code is imported on the first event."""

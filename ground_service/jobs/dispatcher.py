@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ from ground_service.ground import Ground
 from ground_service.jobs.service import enter_job
 
 
-class Dispatcher:
+class Dispatcher(ABC):
     """Receives jobs and has them done, in this process or by workers."""
 
     def __init__(self, ground: Ground) -> None:
@@ -23,14 +24,15 @@ class Dispatcher:
         self.start(identity)
         return identity
 
+    @abstractmethod
     def start(self, job_id: str) -> None:
         """Have an entered job done."""
-        raise NotImplementedError
 
+    @abstractmethod
     def resume(self) -> None:
         """Start unfinished jobs of ended processes again; may be called repeatedly."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """End running jobs: interruptible jobs continue at the next start, others finish."""
 

@@ -19,7 +19,6 @@ from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.jobs import store
-from ground_service.jobs.model import Job
 from ground_service.store.counters import hold
 
 KINDS = (
@@ -121,15 +120,3 @@ def enter_jobs(
             if new
         ]
         return [*before, add_job(connection, kind, arguments, job_id=job_id)]
-
-
-def unfinished_jobs(ground: Ground) -> list[str]:
-    """Return the ids of unfinished jobs, oldest first."""
-    with ground.database.reading() as connection:
-        return store.unfinished_jobs(connection)
-
-
-def get_job(ground: Ground, job_id: str) -> Job:
-    """Return a job."""
-    with ground.database.reading() as connection:
-        return store.get_job(connection, job_id)

@@ -28,7 +28,7 @@ from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime, ns_of
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import get_job
+from ground_service.jobs.store import get_job
 from ground_service.passes import images, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.model import (
@@ -83,7 +83,7 @@ async def upload_archive(
     def enter() -> Job:
         service.keep_archive(ground, stored, name)
         job = dispatcher.submit("archive", {"sha256": stored.sha256, "name": name}, job_id=job_id)
-        return get_job(ground, job)
+        return ground.read(get_job, job)
 
     job = await upload.run(enter)
     response.headers["Location"] = f"{API_PREFIX}/jobs/{job.id}"

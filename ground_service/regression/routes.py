@@ -22,7 +22,8 @@ from ground_service.http.common import (
 from ground_service.http.requests import operations, problems
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import enter_jobs, get_job
+from ground_service.jobs.service import enter_jobs
+from ground_service.jobs.store import get_job
 from ground_service.regression import archives as archive_service
 from ground_service.regression import service, store
 from ground_service.regression.builds import (
@@ -102,7 +103,7 @@ def keep_pass_archive(ground: GroundOf, _: Operator, pass_id: PassId, pinned: bo
 def render_kept_archive(ground: GroundOf, _: Operator, dispatcher: DispatcherOf, digest: Digest) -> Job:
     """Render the missing frames of a kept archive as a job, and compare them with the recorded hashes."""
     archive_service.kept_archive(ground, digest)
-    return get_job(ground, dispatcher.submit("rendering", {"digest": digest}))
+    return ground.read(get_job, dispatcher.submit("rendering", {"digest": digest}))
 
 
 @regressions.patch("/regression-archives/{digest}")
@@ -149,7 +150,7 @@ def start_regression(
     for job in enter_jobs(ground, replays, "regression", arguments, identity):
         dispatcher.start(job)
     response.headers["Location"] = f"{API_PREFIX}/regressions/{identity}"
-    return get_job(ground, identity)
+    return ground.read(get_job, identity)
 
 
 @regressions.post("/analyses", status_code=202, responses=problems(404))
@@ -165,7 +166,7 @@ def start_analysis(
     job_id = idempotent_id("analysis", caller, idempotency_key)
     job = dispatcher.submit("analysis", compared(ground, request), job_id=job_id)
     response.headers["Location"] = f"{API_PREFIX}/jobs/{job}"
-    return get_job(ground, job)
+    return ground.read(get_job, job)
 
 
 add_list(regressions, "/regressions", store.list_regressions)

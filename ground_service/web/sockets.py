@@ -23,7 +23,8 @@ from fastapi import WebSocket, WebSocketDisconnect
 from starlette.concurrency import run_in_threadpool
 
 from ground_service.access.security import SESSION_COOKIE
-from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
+from ground_service.access.service import LOCAL_CALLER, Caller, authenticate
+from ground_service.access.store import has_users
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, NotAuthorised, NotFound
 from ground_service.events import TelemetryReceived, last_number, read_events
@@ -295,7 +296,7 @@ class Sockets:
     def _verified(self, token: str | None) -> Caller | None:
         """Return the caller of a token; the local user if there are no users."""
         if token is None:
-            return LOCAL_CALLER if self._open_without_users and not has_users(self._ground) else None
+            return LOCAL_CALLER if self._open_without_users and not self._ground.read(has_users) else None
         try:
             return authenticate(self._ground, token)
         except NotAuthorised:

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from ground_service.errors import PASSING
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.jobs.service import get_job, unfinished_jobs
+from ground_service.jobs.store import get_job, unfinished_jobs
 from ground_service.settings import Settings
 from ground_service.worker.jobs import run_job
 
@@ -28,8 +28,11 @@ class InlineDispatcher(Dispatcher):
         run_job(self._ground, job_id)
 
     def resume(self) -> None:
-        for identity in unfinished_jobs(self._ground):
+        for identity in self._ground.read(unfinished_jobs):
             run_job(self._ground, identity)
+
+    def close(self) -> None:
+        """No job runs between calls."""
 
 
 class ThreadDispatcher(Dispatcher):
@@ -51,11 +54,11 @@ class ThreadDispatcher(Dispatcher):
             if job_id in self._waiting:
                 return
             self._waiting.add(job_id)
-        kind = get_job(self._ground, job_id).kind
+        kind = self._ground.read(get_job, job_id).kind
         (self._senders if kind == "notification" else self._pool).submit(self._run, job_id)
 
     def resume(self) -> None:
-        for identity in unfinished_jobs(self._ground):
+        for identity in self._ground.read(unfinished_jobs):
             if self._held.get(identity, (0.0, 0.0))[0] <= time.monotonic():
                 self.start(identity)
 
@@ -108,7 +111,7 @@ class CeleryDispatcher(Dispatcher):
 
         from ground_service.worker.app import queued_jobs
 
-        unfinished = unfinished_jobs(self._ground)
+        unfinished = self._ground.read(unfinished_jobs)
         if not unfinished:
             return
         try:
@@ -119,6 +122,9 @@ class CeleryDispatcher(Dispatcher):
         for identity in unfinished:
             if identity not in queued:
                 self.start(identity)
+
+    def close(self) -> None:
+        """Leave the jobs to the workers."""
 
 
 def dispatcher_for(ground: Ground, settings: Settings, *, inline: bool = False) -> Dispatcher:

@@ -22,7 +22,8 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import SettingsError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.service import enter_job, get_job
+from ground_service.jobs.service import enter_job
+from ground_service.jobs.store import get_job
 from ground_service.logs import JsonFormatter
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
@@ -456,7 +457,7 @@ def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Grou
         job = enter_job(ground, "plan", {})
         inner = tracing.current()
     assert tracing.current() is None
-    stored = get_job(ground, job).traceparent
+    stored = ground.read(get_job, job).traceparent
     assert stored == inner != PARENT and tracing.trace_id_of(stored) == TRACE
 
 

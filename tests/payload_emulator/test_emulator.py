@@ -126,7 +126,7 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
 ) -> None:
     from ground_service.evaluation.inputs import load_pass_inputs
     from ground_service.ground import open_ground
-    from ground_service.missions.timekeeping.recorrelation import in_force
+    from ground_service.missions.timekeeping.store import correlations_in_force
     from ground_service.passes.archive_import import import_archive
     from ground_service.worker.follow_up import follow_in_process
 
@@ -136,7 +136,7 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
         follow_in_process(ground)
         key = import_archive(ground, out)
         found = load_pass_inputs(ground, key).detections
-        lines = in_force(ground, 1)
+        lines = ground.read(correlations_in_force, 1)
     assert [line.boot_count for line in lines] == [1, 2]
     assert lines[1].drift_ppb == pytest.approx(-3000.0, abs=200.0)
     nearest = np.abs(found.utc_ns[:, None] - true[None, :, 1]).min(axis=1)

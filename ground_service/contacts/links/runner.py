@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ground_service.clock import mission_now_ns
-from ground_service.contacts.links import core, service
+from ground_service.contacts.links import core, service, store
 from ground_service.contacts.links.service import DeclaredLink
 from ground_service.contacts.links.store import ContactRow, TransmissionRow
 from ground_service.contacts.links.stream import ACKNOWLEDGEMENT, NOT_YET, TRANSMISSION, Connector, address_of
@@ -194,7 +194,7 @@ class LinkRunner:
             return
         left = self._spool.open()
         self._progress.received = self._progress.ingested + left
-        self._contact = service.find_open_contact(self._ground, self._name)
+        self._contact = self._ground.read(store.open_contact, self._name)
         if self._contact is not None:
             # When octets in the spool were received is not known: now at the latest.
             heard = None if left else service.last_heard_ns(self._ground, self._name)
@@ -328,7 +328,7 @@ class LinkRunner:
         transmissions = (
             service.take_transmissions(self._ground, self.declared, self._owner)
             if may_take
-            else service.pending_transmissions(self._ground, self._name)
+            else self._ground.read(store.pending_transmissions, self._name)
         )
         for one in transmissions:
             if not self._is_in_turn(one):
@@ -345,7 +345,7 @@ class LinkRunner:
 
         The payload refuses telecommands that overtake others.
         """
-        others = service.links_with_earlier(self._ground, transmission)
+        others = self._ground.read(store.links_with_earlier, transmission)
         now = time.monotonic()
         if not others:
             self._waits_s = None

@@ -229,12 +229,6 @@ def owners(ground: Ground) -> dict[str, str | None]:
     }
 
 
-def find_open_contact(ground: Ground, name: str) -> ContactRow | None:
-    """Return the open contact of a link, which an earlier owner may have left."""
-    with ground.database.reading() as connection:
-        return store.open_contact(connection, name)
-
-
 def last_heard_ns(ground: Ground, name: str) -> int | None:
     """Return the mission time of the newest ingested reception of a link; None if nothing was received."""
     with ground.database.reading() as connection:
@@ -419,12 +413,6 @@ def take_transmissions(ground: Ground, declared: DeclaredLink, owner: str) -> li
         return store.pending_transmissions(connection, name)
 
 
-def pending_transmissions(ground: Ground, name: str) -> list[TransmissionRow]:
-    """Return the transmissions of a link that may not be on the wire, in order."""
-    with ground.database.reading() as connection:
-        return store.pending_transmissions(connection, name)
-
-
 def hand_over(ground: Ground, declared: DeclaredLink, transmission: TransmissionRow) -> str | None:
     """Give a transmission that the station of a link has refused to the link that has the contact; its name.
 
@@ -438,12 +426,6 @@ def hand_over(ground: Ground, declared: DeclaredLink, transmission: Transmission
         detail = {"telecommands": list(transmission.telecommands), "from": name, "to": other}
         audit(connection, ACTOR, "hand over transmission", str(transmission.id), detail)
     return other
-
-
-def links_with_earlier(ground: Ground, transmission: TransmissionRow) -> list[str]:
-    """Return the other links at which earlier transmissions of the same spacecraft may not be on the wire."""
-    with ground.database.reading() as connection:
-        return store.links_with_earlier(connection, transmission)
 
 
 def note_transmitted(ground: Ground, transmission: TransmissionRow, contact_id: int | None) -> None:

@@ -169,7 +169,7 @@ def enter_receptions(
         audit(connection, actor, "enter receptions", str(vehicle), {"reports": len(reports), "new": len(new)})
         publish(connection, ReceptionsEntered(vehicle_id=vehicle, reports=len(first)))
     recorrelate(ground, vehicle)
-    return in_force(ground, vehicle)
+    return ground.read(store.correlations_in_force, vehicle)
 
 
 def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> bool:
@@ -196,12 +196,6 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
         store.replace_correlations(connection, vehicle, fits, method=AUTOMATIC, now_utc_ns=utc_now_ns())
         publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=len(fits)))
     return True
-
-
-def in_force(ground: Ground, vehicle: int) -> list[Correlation]:
-    """The correlations of a vehicle in force, by on-board time."""
-    with ground.database.reading() as connection:
-        return store.correlations_in_force(connection, vehicle)
 
 
 def fit_runs(reports: TimeReports) -> list[tuple[int, CorrelationFit]]:

@@ -19,7 +19,7 @@ from ground_service.ground import Ground
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import CorrelationFit, fit_correlation
 from ground_service.missions.timekeeping.model import Correlation, TimeReport
-from ground_service.missions.timekeeping.recorrelation import in_force, recorrelate, residuals
+from ground_service.missions.timekeeping.recorrelation import recorrelate, residuals
 from ground_service.store.vehicles import find_vehicle, lock_vehicle
 
 MANUAL = "least squares of time reports"
@@ -64,24 +64,18 @@ def correlate(
     return list(fits.values())
 
 
-def correlations_on_record(ground: Ground, vehicle: int) -> list[Correlation]:
-    """All correlations that a vehicle ever had, the newest first."""
-    with ground.database.reading() as connection:
-        return store.correlations_on_record(connection, vehicle)
-
-
 def correlate_spacecraft(
     ground: Ground, spacecraft_id: int, instance: str, points: Sequence[TimePoint], *, actor: str
 ) -> list[Correlation]:
     """As `correlate`, of a spacecraft by its number; the correlations now in force."""
     vehicle = _vehicle(ground, spacecraft_id, instance)
     correlate(ground, vehicle, points, actor=actor)
-    return [one for one in correlations_on_record(ground, vehicle) if one.in_force]
+    return [one for one in ground.read(store.correlations_on_record, vehicle) if one.in_force]
 
 
 def spacecraft_correlations(ground: Ground, spacecraft_id: int, instance: str) -> list[Correlation]:
     """All correlations that a spacecraft ever had, the newest first."""
-    return correlations_on_record(ground, _vehicle(ground, spacecraft_id, instance))
+    return ground.read(store.correlations_on_record, _vehicle(ground, spacecraft_id, instance))
 
 
 def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> list[Correlation]:
@@ -90,7 +84,7 @@ def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor:
     if recorrelate(ground, vehicle, over_manual=True):
         with ground.database.writing() as connection:
             audit(connection, actor, "correlate time", str(vehicle), {"from": "time reports"})
-    return in_force(ground, vehicle)
+    return ground.read(store.correlations_in_force, vehicle)
 
 
 def withdraw_correlations(
@@ -117,7 +111,7 @@ def withdraw_correlations(
         audit(connection, actor, "withdraw correlations", str(vehicle), {"ids": entered})
         publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=0))
     recorrelate(ground, vehicle)
-    return in_force(ground, vehicle)
+    return ground.read(store.correlations_in_force, vehicle)
 
 
 def spacecraft_time_reports(ground: Ground, spacecraft_id: int, instance: str) -> list[TimeReport]:

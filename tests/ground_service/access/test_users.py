@@ -15,13 +15,12 @@ from ground_service.access.service import (
     change_user,
     ensure_user,
     get_user,
-    has_users,
     list_tokens,
     list_users,
     revoke_token,
     token_sha256,
 )
-from ground_service.access.store import list_audit
+from ground_service.access.store import has_users, list_audit
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
 from ground_service.ground import Ground, open_ground
 from tests.serving import token_valid
@@ -372,11 +371,11 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground: 
 
 
 def test_users_are_listed_by_name_and_tokens_newest_first(ground: Ground) -> None:
-    assert not has_users(ground) and list_users(ground) == [] and list_tokens(ground) == []
+    assert not ground.read(has_users) and list_users(ground) == [] and list_tokens(ground) == []
     for name in ("cleo", "ann", "bob"):
         add_user(ground, name, "viewer")
     add_token(ground, "ann")
-    assert has_users(ground)
+    assert ground.read(has_users)
     assert [one.name for one in list_users(ground)] == ["ann", "bob", "cleo"]
     assert [(one.id, one.user) for one in list_tokens(ground)] == [
         (4, "ann"),

@@ -23,7 +23,7 @@ from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged,
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.service import unfinished_jobs
+from ground_service.jobs.store import unfinished_jobs
 from ground_service.missions.catalogues import add_catalogue, catalogue_of
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.model import parse_mission
@@ -290,7 +290,7 @@ def test_actions_that_a_process_left_are_done_by_the_next(
         follow_in_process(ground)
         InlineDispatcher(ground).resume()
         assert ground.read(get_window, window_id).state == "processed"
-        assert {one[2] for one in recorded(ground)} == {"done"} and unfinished_jobs(ground) == []
+        assert {one[2] for one in recorded(ground)} == {"done"} and ground.read(unfinished_jobs) == []
 
 
 def test_a_failed_action_skips_those_after_it_and_states_why(
@@ -506,7 +506,7 @@ def test_a_worker_that_only_reads_events_records_no_action_twice(
         for _ in range(3):
             follow.drain()
         assert [one[1:] for one in recorded(ground)] == [("align", "queued"), ("report", "queued")]
-        assert len(set(jobs)) == len(unfinished_jobs(ground)) == 1
+        assert len(set(jobs)) == len(ground.read(unfinished_jobs)) == 1
 
 
 IMPORTED = """

@@ -28,7 +28,7 @@ from ground_service.events import (
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.service import unfinished_jobs
+from ground_service.jobs.store import unfinished_jobs
 from ground_service.passes.service import define_pass
 from ground_service.settings import Settings
 from ground_service.store import events as log
@@ -314,7 +314,7 @@ def test_a_re_evaluation_that_waits_already_is_not_added_again(
             ingest_file(ground, cut, spacecraft_id=SPACECRAFT)
             follow.drain()
             follow.drain()
-        assert len(jobs_of(ground, "re-evaluation")) == 1 == len(unfinished_jobs(ground))
+        assert len(jobs_of(ground, "re-evaluation")) == 1 == len(ground.read(unfinished_jobs))
         assert len(reports_of(ground, pass_id)) == 1
 
 

@@ -22,7 +22,8 @@ from ground_service.errors import (
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import enter_ingest
-from ground_service.jobs.service import add_job, enter_job, unfinished_jobs
+from ground_service.jobs.service import add_job, enter_job
+from ground_service.jobs.store import unfinished_jobs
 from ground_service.store import repository
 from ground_service.store.states import JOB, move
 from ground_service.worker import jobs
@@ -74,7 +75,7 @@ def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
     for _ in range(3):
         row = run_job(ground, job)
     assert (row.state, row.error, row.attempts, len(tries)) == ("failed", shown, 1, 1)
-    assert unfinished_jobs(ground) == []
+    assert ground.read(unfinished_jobs) == []
 
 
 def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(

@@ -25,8 +25,7 @@ from ground_service.errors import InvalidInput
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground, open_ground
 from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import get_job
-from ground_service.jobs.store import list_jobs
+from ground_service.jobs.store import get_job, list_jobs
 from ground_service.missions.rules import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
@@ -422,7 +421,7 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
 
         wait_for(lambda: "notification" in kinds("running"), "the notification", 30.0)
         job = dispatcher.submit("plan", {})
-        wait_for(lambda: get_job(local, job).state == "done", "another job", 30.0)
+        wait_for(lambda: local.read(get_job, job).state == "done", "another job", 30.0)
         assert kinds("running") == ["notification"]
         held.set()
         wait_for(lambda: kinds("running") == [], "the end of the notification", 30.0)

@@ -189,7 +189,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
     folder = ground.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
     (folder / "000000000000.segment").write_bytes(stream)
-    monkeypatch.setattr(service, "find_open_contact", failing(service.find_open_contact, {1, 2}))
+    monkeypatch.setattr(store, "open_contact", failing(store.open_contact, {1, 2}))
     monkeypatch.setattr(service, "acquire", failing(service.acquire, {2}))
     with operated(ground) as runner:
         wait_for(lambda: runner.octets_received == len(stream), "the segment")

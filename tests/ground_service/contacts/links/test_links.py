@@ -309,7 +309,7 @@ def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_conta
             wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
             wait_for(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
             wait_for(
-                lambda: not service.pending_transmissions(ground, "lab"), "the record of the transmission"
+                lambda: not ground.read(store.pending_transmissions, "lab"), "the record of the transmission"
             )
             mission_time.advance(0.1)
             connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
@@ -634,12 +634,12 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
             other.start()
             try:
                 first.accept().sendall(stream[: 2 * CADU])
-                wait_for(lambda: service.find_open_contact(either, "lab"), "the first contact")
+                wait_for(lambda: either.read(store.open_contact, "lab"), "the first contact")
                 keys = released(either, 2)
                 wait_for(lambda: first.transmissions, "the refused transmission")
                 # Also when its contact has ended, the station is asked.
                 wait_for(
-                    lambda: service.find_open_contact(either, "lab") is None, "the end of the first contact"
+                    lambda: either.read(store.open_contact, "lab") is None, "the end of the first contact"
                 )
                 assert not second.transmissions and runner.commands_unsent == 2
                 second.accept().sendall(stream[2 * CADU : 4 * CADU])
@@ -707,7 +707,7 @@ def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
             station.accept().sendall(stream[: 2 * CADU])
             wait_for(lambda: runner.commands_unsent == 0, "the later telecommands")
         assert [packets_of(octets) for _, octets in station.transmissions] == [octets_of(either, later)]
-        assert [one.id for one in service.pending_transmissions(either, "other")] == [transmission.id]
+        assert [one.id for one in either.read(store.pending_transmissions, "other")] == [transmission.id]
         assert log.warning.call_args.args[1:] == ("lab", later, "other")
     finally:
         station.close()
@@ -737,11 +737,11 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
     if event == "released":
         service.release(either, "other", "here")
     elif event == "ended":
-        contact = service.find_open_contact(either, "other")
+        contact = either.read(store.open_contact, "other")
         assert contact is not None
         service.end_contact(either, contact.id, "other", utc_now_ns())
     assert service.hand_over(either, lab, transmission) is None
-    assert [one.id for one in service.pending_transmissions(either, "lab")] == [transmission.id]
+    assert [one.id for one in either.read(store.pending_transmissions, "lab")] == [transmission.id]
 
 
 def test_the_next_owner_knows_when_a_contact_was_heard_last(
@@ -752,10 +752,10 @@ def test_the_next_owner_knows_when_a_contact_was_heard_last(
     with operated(either) as runner:
         station.accept().sendall(stream)
         wait_for(lambda: runner.octets_received == len(stream), "all octets")
-    assert service.find_open_contact(either, "lab") is not None
+    assert either.read(store.open_contact, "lab") is not None
     mission_time.advance(100.0)
     assert service.silent_contacts(either) == ["lab"]
     with operated(either, "next"):
         station.accept()
-        wait_for(lambda: service.find_open_contact(either, "lab") is None, "the end of the contact")
+        wait_for(lambda: either.read(store.open_contact, "lab") is None, "the end of the contact")
     assert service.silent_contacts(either) == []

@@ -22,7 +22,6 @@ from ground_service.missions.timekeeping.model import Correlation
 from ground_service.missions.timekeeping.recorrelation import (
     ReceivedReport,
     enter_receptions,
-    in_force,
     read_receptions,
     recorrelate,
     residuals,
@@ -31,9 +30,9 @@ from ground_service.missions.timekeeping.service import (
     TimePoint,
     correlate,
     correlate_again,
-    correlations_on_record,
     withdraw_correlations,
 )
+from ground_service.missions.timekeeping.store import correlations_in_force, correlations_on_record
 from ground_service.passes.service import define_pass, list_events
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
@@ -163,10 +162,10 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(
                     vehicle = ingest(ground, tmp_path, what, f"{number}-{k}.cadu")
                 else:
                     receive(ground, what)
-            found.append(content(in_force(ground, vehicle)))
-            on_record = len(correlations_on_record(ground, vehicle))
+            found.append(content(ground.read(correlations_in_force, vehicle)))
+            on_record = len(ground.read(correlations_on_record, vehicle))
             assert not recorrelate(ground, vehicle)
-            assert len(correlations_on_record(ground, vehicle)) == on_record
+            assert len(ground.read(correlations_on_record, vehicle)) == on_record
     assert all(one == found[0] for one in found)
     assert len(found[0]) == 2
 
@@ -227,10 +226,10 @@ def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
     with pytest.raises(Conflict, match="expected correlations in force that a person entered, found none"):
         withdraw_correlations(ground, SPACECRAFT, "flight", actor="ann")
     correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
-    (entered,) = in_force(ground, vehicle)
+    (entered,) = ground.read(correlations_in_force, vehicle)
     left = withdraw_correlations(ground, SPACECRAFT, "flight", actor="ann")
     assert [row.points for row in left] == [15, 15]
-    record = {row.id: row.in_force for row in correlations_on_record(ground, vehicle)}
+    record = {row.id: row.in_force for row in ground.read(correlations_on_record, vehicle)}
     assert record == dict.fromkeys((*fitted, entered.id), False) | {one.id: True for one in left}
     with ground.database.reading() as connection:
         trace = list_audit(connection, AuditFilter(action="withdraw correlations")).items
@@ -269,8 +268,8 @@ def test_a_new_reference_ephemeris_gives_new_light_times(
     after = [one.light_time_s for one in residuals(ground, vehicle)]
     # From the Moon's centre to three radii behind it, as seen from the Earth.
     np.testing.assert_allclose(np.array(after) - before, 3.0 * MOON_RADIUS_M / SPEED_OF_LIGHT_M_S, atol=1e-5)
-    assert len(in_force(ground, vehicle)) == 2
-    assert len(correlations_on_record(ground, vehicle)) == 4
+    assert len(ground.read(correlations_in_force, vehicle)) == 2
+    assert len(ground.read(correlations_on_record, vehicle)) == 4
 
 
 def test_an_operator_correlates_from_a_file(
@@ -316,7 +315,7 @@ def test_telemetry_without_receptions_leaves_the_clock_ideal(
     ground: Ground, spacecraft: Spacecraft, tmp_path: Path
 ) -> None:
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
-    assert in_force(ground, vehicle) == []
+    assert ground.read(correlations_in_force, vehicle) == []
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import pytest
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
-from ground_service.missions.timekeeping.service import TimePoint, correlate, correlations_on_record
+from ground_service.missions.timekeeping.service import TimePoint, correlate
+from ground_service.missions.timekeeping.store import correlations_on_record
 from ground_service.passes.service import define_pass, parameter_series
 from lunar.timescales import ticks_from_utc_ns
 
@@ -34,7 +35,7 @@ def test_times_of_samples_follow_the_correlation_in_force(ground: Ground, synthe
     np.testing.assert_allclose(shift, 5 * NS, atol=20_000)
     assert (ideal.correlation_id, moved.correlation_id) == (0, 1)
     correlate(ground, vehicle, points)
-    record = correlations_on_record(ground, vehicle)
+    record = ground.read(correlations_on_record, vehicle)
     assert [(row.id, row.in_force) for row in record] == [(2, True), (1, False)]
 
 
