@@ -27,7 +27,6 @@ UNIT_TOLERANCE = 1e-3
 CAMERA_FRAME = "INSTRUMENT_1"
 """Name of the camera axes in messages; SANA registers INSTRUMENT_n for instruments."""
 
-_HEADER_KEYS = ("CCSDS_AEM_VERS", "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 _MANDATORY = (
     "OBJECT_NAME",
     "OBJECT_ID",
@@ -89,7 +88,7 @@ def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...
         Where the time scale is none that can be converted.
     """
     reader = Lines(numbered_lines(text.splitlines()), source)
-    _read_header(reader)
+    reader.header("AEM", VERSIONS)
     segments: list[AttitudeSegment] = []
     while reader.peek() is not None:
         segments.append(_read_segment(reader))
@@ -134,27 +133,6 @@ def format_aem(segments: tuple[AttitudeSegment, ...]) -> str:
         lines += [row % (text, *values) for text, values in zip(texts, vector_last, strict=True)]
         lines += ["DATA_STOP", ""]
     return "\n".join(lines)
-
-
-def _read_header(reader: Lines) -> None:
-    first = reader.peek()
-    if first is None or not first.startswith("CCSDS_AEM_VERS"):
-        raise reader.next_error(
-            "CCSDS_AEM_VERS = 1.0 or 2.0", "nothing" if first is None else repr(first[:40])
-        )
-    seen: set[str] = set()
-    while True:
-        for _ in reader.comments():
-            pass
-        line = reader.peek()
-        if line is None or line == "META_START":
-            break
-        key, value = reader.keyword(_HEADER_KEYS)
-        if key in seen:
-            raise reader.error(f"{key} once", "it again")
-        if key == "CCSDS_AEM_VERS" and value not in VERSIONS:
-            raise reader.error(f"an AEM version out of {', '.join(VERSIONS)}", repr(value))
-        seen.add(key)
 
 
 def _read_segment(reader: Lines) -> AttitudeSegment:

@@ -10,6 +10,8 @@ from lunar.arrays import IntArray
 from lunar.errors import DataFileError, TimeFormatError
 from lunar.timescales import NS, parse_utc, to_utc_ns
 
+_HEADER_KEYS = ("CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
+
 
 def numbered_lines(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
     """Yield the lines that are not blank, stripped, with their line numbers."""
@@ -61,6 +63,36 @@ class Lines:
         if not value:
             raise self.error(f"a value of {key}", "nothing")
         return key, value
+
+    def rows(self, most: int) -> tuple[list[str], list[int]]:
+        """Return the next lines that begin with a digit, at most ``most``, and their numbers; pass them."""
+        rows: list[str] = []
+        numbers: list[int] = []
+        while len(rows) < most and self._next is not None and self._next[1][0].isdigit():
+            self.at, line = self._next
+            rows.append(line)
+            numbers.append(self.at)
+            self._next = next(self._lines, None)
+        return rows, numbers
+
+    def header(self, kind: str, versions: tuple[str, ...]) -> tuple[list[str], dict[str, str]]:
+        """Return comments and values of the header of an OEM or AEM."""
+        version = f"CCSDS_{kind}_VERS"
+        if not (self.peek() or "").startswith(version):
+            found = "nothing" if self._next is None else repr(self._next[1][:40])
+            raise self.next_error(f"{version} = {', '.join(versions[:-1])} or {versions[-1]}", found)
+        comments: list[str] = []
+        header: dict[str, str] = {}
+        while True:
+            comments += self.comments()
+            if self.peek() in (None, "META_START"):
+                return comments, header
+            key, value = self.keyword((version, *_HEADER_KEYS))
+            if key in header:
+                raise self.error(f"{key} once", "it again")
+            if key == version and value not in versions:
+                raise self.error(f"an {kind} version out of {', '.join(versions)}", repr(value))
+            header[key] = value
 
     def metadata(
         self, allowed: Iterable[str], mandatory: Iterable[str]

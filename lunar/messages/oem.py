@@ -39,7 +39,6 @@ STATES_LIMIT = 1_000_000
 
 BLOCK_ROWS = 10_000
 
-_HEADER_KEYS = ("CCSDS_OEM_VERS", "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 _MANDATORY = (
     "OBJECT_NAME",
     "OBJECT_ID",
@@ -85,7 +84,12 @@ def parse_oem(text: str, source: str = "OEM text") -> Ephemeris:
 
 def parse_oem_lines(reader: Lines) -> Ephemeris:
     """Return the ephemeris in the lines of an OEM in keyword notation; raises as `parse_oem`."""
-    header, comments = _read_header(reader)
+    comments, header = reader.header("OEM", VERSIONS)
+    for key in ("CREATION_DATE", "ORIGINATOR"):
+        if key not in header:
+            raise reader.error(
+                f"{key} in the header", "the end of the file" if reader.peek() is None else "none"
+            )
     segments: list[EphemerisSegment] = []
     while reader.peek() is not None:
         segments.append(_read_segment(reader, STATES_LIMIT - sum(len(one.utc_ns) for one in segments)))
@@ -95,7 +99,7 @@ def parse_oem_lines(reader: Lines) -> Ephemeris:
         if later.start_utc_ns < earlier.stop_utc_ns:
             expected = f"a start at or after {format_utc(earlier.stop_utc_ns)}, the end of the segment before"
             raise DataFileError(reader.source, f"segment {k}", expected, format_utc(later.start_utc_ns))
-    return Ephemeris(tuple(segments), header["ORIGINATOR"], comments)
+    return Ephemeris(tuple(segments), header["ORIGINATOR"], tuple(comments))
 
 
 def format_oem(
@@ -117,30 +121,6 @@ def format_oem(
     for segment in ephemeris.segments:
         lines += _segment_lines(segment, time_system or segment.time_system)
     return "\n".join(lines) + "\n"
-
-
-def _read_header(reader: Lines) -> tuple[dict[str, str], tuple[str, ...]]:
-    comments: list[str] = []
-    header: dict[str, str] = {}
-    first = reader.peek()
-    if first is None or not first.startswith("CCSDS_OEM_VERS"):
-        found = "nothing" if first is None else repr(first[:40])
-        raise reader.next_error("CCSDS_OEM_VERS = 1.0, 2.0 or 3.0", found)
-    while True:
-        comments += reader.comments()
-        line = reader.peek()
-        if line is None or line == "META_START":
-            break
-        key, value = reader.keyword(_HEADER_KEYS)
-        if key in header:
-            raise reader.error(f"{key} once", "it again")
-        if key == "CCSDS_OEM_VERS" and value not in VERSIONS:
-            raise reader.error(f"an OEM version out of {', '.join(VERSIONS)}", repr(value))
-        header[key] = value
-    for key in ("CREATION_DATE", "ORIGINATOR"):
-        if key not in header:
-            raise reader.error(f"{key} in the header", "none" if line else "the end of the file")
-    return header, tuple(comments)
 
 
 def _read_segment(reader: Lines, left: int) -> EphemerisSegment:
@@ -212,12 +192,8 @@ def _read_states(reader: Lines, system: str, left: int) -> tuple[IntArray, Float
         raise reader.next_error(expected, "the end of the file" if found is None else repr(found[:60]))
     blocks = []
     width = len((reader.peek() or "").split())
-    while (reader.peek() or " ")[0].isdigit():
-        rows: list[str] = []
-        at: list[int] = []
-        while len(rows) < BLOCK_ROWS and (reader.peek() or " ")[0].isdigit():
-            rows.append(reader.take())
-            at.append(reader.at)
+    while (taken := reader.rows(BLOCK_ROWS))[0]:
+        rows, at = taken
         left -= len(rows)
         if left < 0:
             raise reader.error(f"at most {STATES_LIMIT} states", "more")
