@@ -587,13 +587,14 @@ class LiveSession:
                     self.keeps,
                     taken=self._sent_up.union(one.number for one in self._to_repeat),
                 )
-            words, ended = self._take_words, self._end_console
-            self.console = Server("console", self.console_port, self.host, words, ended)
             used = {name: (one.telemetry.port, one.telecommand.port) for name, one in self.stations.items()}
             text = self.mission(self.world, used).encode()
             self.mission_server = Server(
                 "mission", self.mission_port, self.host, lambda number, octets: None, document=text
             )
+            # Last: who reaches the console reaches everything.
+            words, ended = self._take_words, self._end_console
+            self.console = Server("console", self.console_port, self.host, words, ended)
         except LinkError:
             self.close()
             raise

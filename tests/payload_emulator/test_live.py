@@ -36,6 +36,7 @@ from payload_emulator.session.viewing import turn_message
 from payload_emulator.session.world import World, build_world
 from payload_emulator.sim.board.faults import FAULT_KINDS
 from payload_emulator.sim.board.link import Receiver
+from studies.harness.parts import free_port, listens
 from tests.scenarios import live_scenario
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
@@ -237,6 +238,18 @@ def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, Loade
         port = taken.getsockname()[1]
         with pytest.raises(LinkError, match=f"telecommand of earth port {port}: expected a free port"):
             LiveSession(world, loaded, has_operator=True, station_ports={"earth": (0, port)})
+
+
+def test_who_reaches_the_console_reaches_the_mission_description(flown: tuple[World, LoadedPayload]) -> None:
+    port = free_port()
+    answers = []
+
+    def text(world: World, used: dict[str, tuple[int, int]]) -> str:
+        answers.append(listens(port))
+        return "text"
+
+    LiveSession(*flown, console_port=port, mission=text).close()
+    assert answers == [False]
 
 
 def reset(connection: socket.socket) -> None:
