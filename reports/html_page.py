@@ -147,11 +147,8 @@ def _table(block: Table, number: int) -> str:
         cells_of_groups = []
         for group, members in groupby(block.columns, key=lambda c: c.group):
             span = len(list(members))
-            kind = ' class="group" scope="colgroup"' if group else ""
-            words = f"<span>{escape(group)}</span>" if group else ""
-            cells_of_groups.append(
-                f'<th colspan="{span}"{kind}>{words}</th>' if group else f'<td colspan="{span}"></td>'
-            )
+            head = f'<th colspan="{span}" class="group" scope="colgroup"><span>{escape(group)}</span></th>'
+            cells_of_groups.append(head if group else f'<td colspan="{span}"></td>')
         heads.append(f"<tr>{''.join(cells_of_groups)}</tr>")
     heads.append(f"<tr>{''.join(_head(c) for c in block.columns)}</tr>")
     rows = []

@@ -4,17 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reports.document import (
-    VERDICT_ROLES,
-    Block,
-    Cell,
-    Column,
-    Document,
-    Heading,
-    Paragraph,
-    Picture,
-    Table,
-)
+from reports.document import VERDICT_ROLES, Block, Cell, Column, Document, Heading, Paragraph, Picture, Table
 from reports.figures import monthly
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, number_text, percent_text, significant_text, utc_text

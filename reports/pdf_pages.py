@@ -26,6 +26,7 @@ from reports.document import (
     Heading,
     Headline,
     Listing,
+    Paragraph,
     Picture,
     Table,
     Verdict,
@@ -37,10 +38,11 @@ from reports.figures.canvas import WIDTH_IN
 from reports.figures.theme import LIGHT, color
 from reports.text import NOT_A_VALUE, headline_text
 
-_MOST_LISTING_LINES = 400
 _PAGE_IN = (8.27 - 2 * 0.66, 11.69 - 0.62 - 0.78)
-_CAPTION_IN = 0.8
-"""Height kept free for the caption of a figure that fills the page."""
+_BESIDE_IN = 1.2
+"""Height kept free for the heading and the caption of a figure."""
+_LEAST_SHRINKING = 0.7
+"""A figure shrinks by no more than this to leave room for others: its text must remain legible."""
 
 _TYPESET = """
 import sys, typst
@@ -146,11 +148,10 @@ def _plain(block: Block) -> dict[str, Any]:
             return {"kind": "verdict", "word": verdict.word, "text": text, "color": color(role)}
         case Headline():
             return _headline(block)
-        case Listing(title, text):
-            lines = text.split("\n")
-            rest = len(lines) - _MOST_LISTING_LINES
-            shown = lines[:_MOST_LISTING_LINES] + ([f"… {rest} further lines"] if rest > 0 else [])
-            return {"kind": "listing", "title": title, "lines": shown}
+        case Listing(title):
+            return _plain(
+                Paragraph(f"{title}: in full in the HTML and JSON forms of this report.", small=True)
+            )
         case _:
             return {"kind": type(block).__name__.lower(), **asdict(block)}
 
@@ -186,7 +187,11 @@ def _picture(block: Picture, number: int, drawings: Drawings, root: Path) -> dic
     (root / name).write_text(svg.replace("<svg", _SVG, 1), encoding="utf-8")
     width_in, height_in = _PAGE_IN
     # One scale for all figures, unless a page is too small.
-    scale = min(width_in / max(block.width_in, WIDTH_IN), (height_in - _CAPTION_IN) / block.height_in)
+    scale = min(width_in / max(block.width_in, WIDTH_IN), (height_in - _BESIDE_IN) / block.height_in)
+    # A page that a figure of up to half a page does not fit is itself half full.
+    half = (height_in / 2.0 - _BESIDE_IN) / block.height_in
+    if half >= _LEAST_SHRINKING * scale:
+        scale = min(scale, half)
     return {
         "kind": "picture",
         "number": str(number),

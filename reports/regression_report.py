@@ -28,10 +28,7 @@ def regression_document(report: RegressionReport) -> Document:
         report,
         ("Candidate", report.candidate),
         ("baseline", report.baseline),
-        (
-            "gates",
-            f"{counts['fail']} failed, {counts['inconclusive']} inconclusive, {counts['pass']} passed",
-        ),
+        ("gates", f"{counts['fail']} failed, {counts['inconclusive']} inconclusive, {counts['pass']} passed"),
         ("passes", count_text(len(report.passes))),
     )
     return Document("Regression report", report.title, report.regression_id, facts, tuple(blocks))

@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING, Any
 from reports.errors import UnknownReportKind
 from reports.json_form import to_json
 from reports.paper_values import PaperReport
-from reports.values import (
-    DetectorReport,
-    MonthlyReportValue,
-    PassReport,
-    RegressionReport,
-)
+from reports.values import DetectorReport, MonthlyReportValue, PassReport, RegressionReport
 
 if TYPE_CHECKING:
     from reports.document import Document

@@ -87,11 +87,7 @@ def reference_at(track: TrackSeries, utc_ns: IntArray) -> tuple[FloatArray, Floa
         track.altitude_m,
     )
     x, y, z, altitude = (np.interp(asked, known, part, left=np.nan, right=np.nan) for part in parts)
-    return (
-        np.degrees(np.arctan2(z, np.hypot(x, y))),
-        np.degrees(np.arctan2(y, x)) % 360.0,
-        altitude,
-    )
+    return (np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x)) % 360.0, altitude)
 
 
 def north_east_error_m(series: NavigationSeries, track: TrackSeries) -> tuple[FloatArray, FloatArray]:

@@ -490,6 +490,14 @@ class PassEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class SettingsComparison:
+    """Settings that differ from those of the previous pass: dotted name, value before and now (None: not stated)."""
+
+    previous_pass: str
+    changes: tuple[tuple[str, Any, Any], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class AnchorRead:
     """One use of the anchor ephemeris (truth, or what the ground uploaded as truth) by an on-board
     estimator."""
@@ -554,6 +562,7 @@ class PassReport(ReportCommon):
     events: tuple[PassEvent, ...] = ()
     truth_ledger: tuple[AnchorRead, ...] = ()
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    comparison: SettingsComparison | None = None
     scenario_text: str = ""
 
 

@@ -81,6 +81,7 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
     PassReport,
+    SettingsComparison,
     TerrainMap,
     TimeSpan,
     TrackSeries,
@@ -98,9 +99,6 @@ NO_BASELINE = "no propagate-only baseline"
 WORST_FRAMES = 6
 WORST_MINIMUM_EXPECTED = 3
 """A frame with fewer expected craters says nothing about the detector and is no candidate for the worst ones."""
-
-_NO_IMAGE_GRAY = 72
-"""Gray level of the background of a frame whose image was not received."""
 
 RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 
@@ -176,6 +174,7 @@ class PassInputs:
     data_sources: tuple[str, ...] = ()
     evidence_level: str = ""
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    comparison: SettingsComparison | None = None
     scenario_text: str = ""
     generated_for: str = ""
     created_utc: str = ""
@@ -258,6 +257,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         events=inputs.events,
         truth_ledger=_anchor_reads(inputs.outcomes),
         configuration=inputs.configuration,
+        comparison=inputs.comparison,
         scenario_text=inputs.scenario_text,
         remarks=tuple(remarks),
         not_available=missing,
@@ -679,11 +679,16 @@ def _detector(
             else "the crater catalogue has no complete crater of 5 to 30 km in view"
         )
     chosen, worst = _choose_frames(inputs, expected, matches)
-    frames = {frame: _frame_shown(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
+    unseen = [str(number) for number in detections.frame_number[worst] if int(number) not in inputs.images]
+    if unseen:
+        missing["worst_frames"] = (
+            f"{len(unseen)} of the {len(worst)} frames with the lowest recall came down without their images: "
+            f"{', '.join(unseen)}"
+        )
     return (
         score,
-        tuple(frames[frame] for frame in chosen),
-        tuple(frames[frame] for frame in worst),
+        _frames_shown(inputs, expected, matches, chosen),
+        _frames_shown(inputs, expected, matches, worst),
         _crater_map(inputs.catalogue, expected, matches),
     )
 
@@ -737,11 +742,16 @@ def _choose_frames(
     return [int(row) for row in spread], sorted(int(row) for row in worst)
 
 
-def _frame_shown(inputs: PassInputs, expected: ExpectedCraters, matches: Matches, row: int) -> GalleryFrame:
-    camera = inputs.viewing.camera
-    gray = np.full((camera.height_px, camera.width_px), _NO_IMAGE_GRAY, dtype=np.uint8)
-    image = inputs.images.get(int(inputs.detections.frame_number[row]), gray)
-    return gallery_frame(inputs.detections, expected, matches, row, image)
+def _frames_shown(
+    inputs: PassInputs, expected: ExpectedCraters, matches: Matches, rows: Sequence[int]
+) -> tuple[GalleryFrame, ...]:
+    """Return those of these frames whose images were received."""
+    numbers = inputs.detections.frame_number
+    return tuple(
+        gallery_frame(inputs.detections, expected, matches, row, inputs.images[int(numbers[row])])
+        for row in rows
+        if int(numbers[row]) in inputs.images
+    )
 
 
 def gallery_frame(

@@ -18,6 +18,7 @@ from ground_service.evaluation.detection.fixes import IdentificationSamples
 from ground_service.evaluation.detection.landmarks import MappedCraters, mapped_craters
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.instruments import instrument_reports
+from ground_service.evaluation.model import changed_figures
 from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
 from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import ONBOARD, SIZE, CommandedBurn, FilterStates
@@ -46,6 +47,7 @@ from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.toml import read_table
 from lunar.boxes import share_outside
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
@@ -53,16 +55,20 @@ from lunar.datafolder import DataFolder
 from lunar.frames import Orientation
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import format_utc, parse_utc
-from reports.values import (
-    HousekeepingParameter,
-    InstrumentReport,
-)
+from reports.values import HousekeepingParameter, InstrumentReport, SettingsComparison
 from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
 from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
 from tmtc.stream import cut_packets
 
 _UNITS = {"degC": "°C", "1/1000": "‰", "": "packets"}
 """Units of the dictionary as reports write them; a count without a unit is of packets."""
+
+
+_COMPARED_SECTIONS = {
+    "camera", "catalogue", "detector", "dictionary", "experiment", "frames", "link", "observation", "reference",
+    "requirements", "time",
+}  # fmt: skip
+"""Sections of the mission description that a report compares with those of the previous pass: none with addresses."""
 
 
 class ArchivedImages(Mapping[int, NDArray[np.uint8]]):
@@ -165,8 +171,9 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             ),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
             evidence_level=evidence_of_frames(mission.evidence, viewing.camera, imaged).text,
-            configuration=_configuration(manifest, record),
-            scenario_text=str(manifest.get("scenario_toml", "")),
+            configuration=_configuration(record, mission),
+            comparison=_comparison(connection, record, mission, vehicle),
+            scenario_text=_scenario_text(record, mission),
             generated_for="",
             created_utc=created_utc,
         )
@@ -535,13 +542,39 @@ def _dictionary_text(version: int) -> str:
     return f"version {version}, {DICTIONARY.hash[:16]}"
 
 
-def _configuration(manifest: Mapping[str, Any], record: PassRecord) -> dict[str, dict[str, Any]]:
-    groups: dict[str, dict[str, Any]] = {}
-    if manifest.get("camera"):
-        groups["camera"] = dict(manifest["camera"])
-    groups["observation"] = {
-        "start_utc": format_utc(record.start_utc_ns),
-        "stop_utc": format_utc(record.stop_utc_ns),
-        **{key: manifest[key] for key in ("cadence_s", "frames_expected", "light") if key in manifest},
-    }
-    return {name: group for name, group in groups.items() if group}
+def _configuration(record: PassRecord, mission: Mission) -> dict[str, dict[str, Any]]:
+    camera = record.manifest.get("camera") or mission.camera.model_dump(mode="json", exclude_none=True)
+    times = {"start_utc": format_utc(record.start_utc_ns), "stop_utc": format_utc(record.stop_utc_ns)}
+    return {**({"camera": camera} if camera else {}), "observation": {**times, **_observation(record)}}
+
+
+def _observation(record: PassRecord) -> dict[str, Any]:
+    keys = ("cadence_s", "frames_expected", "light")
+    return {key: record.manifest[key] for key in keys if key in record.manifest}
+
+
+def _scenario_text(record: PassRecord, mission: Mission) -> str:
+    """Return the scenario of an emulated pass: that of its archive, or of the mission description of a live pass."""
+    return str(record.manifest.get("scenario_toml") or mission.world.scenario or "")
+
+
+def _comparison(
+    connection: Connection, record: PassRecord, mission: Mission, vehicle: Vehicle
+) -> SettingsComparison | None:
+    """Return the settings that differ from those of the previous pass of the spacecraft; None for its first pass."""
+    previous = passes.previous_pass(connection, record, vehicle.ccsds_id)
+    if previous is None:
+        return None
+    before = _settings(previous, mission_of_pass(connection, previous.mission_id, previous.manifest))
+    changes = changed_figures(before, _settings(record, mission))
+    return SettingsComparison(previous.name, tuple((one.figure, one.before, one.after) for one in changes))
+
+
+def _settings(record: PassRecord, mission: Mission) -> dict[str, Any]:
+    text = _scenario_text(record, mission)
+    try:
+        scenario: Any = read_table(text, "scenario", "TOML")
+    except InvalidInput:
+        scenario = text
+    declared = mission.model_dump(mode="json", include=_COMPARED_SECTIONS)
+    return {"observation": _observation(record), "mission": declared, "scenario": scenario}

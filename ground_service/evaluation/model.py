@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import ConfigDict, Field
@@ -42,6 +43,17 @@ class ChangedFigure(Entity):
     figure: str = Field(examples=["navigation.anchored.median_3d_m"])
     before: Any
     after: Any
+
+
+def changed_figures(before: Any, after: Any, name: str = "") -> list[ChangedFigure]:
+    """Return the figures that differ between two nested tables: name, value before and value after."""
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        return [
+            change
+            for key in sorted({*before, *after})
+            for change in changed_figures(before.get(key), after.get(key), f"{name}.{key}" if name else key)
+        ]
+    return [] if before == after else [ChangedFigure(figure=name, before=before, after=after)]
 
 
 class Report(Entity):

@@ -16,7 +16,7 @@ from ground_service.evaluation import store
 from ground_service.evaluation.conditions import conditions_of
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.model import ChangedFigure, StoredReport
+from ground_service.evaluation.model import StoredReport, changed_figures
 from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.surface import surface_map
 from ground_service.events import PassEvaluated, publish
@@ -162,17 +162,6 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
         pdf=previous.pdf_sha256 is not None,
         again=Reevaluation(event, previous),
     )
-
-
-def changed_figures(before: Any, after: Any, name: str = "") -> list[ChangedFigure]:
-    """Return the figures that differ between two summaries: name, value before and value after."""
-    if isinstance(before, Mapping) and isinstance(after, Mapping):
-        return [
-            change
-            for key in sorted({*before, *after})
-            for change in changed_figures(before.get(key), after.get(key), f"{name}.{key}" if name else key)
-        ]
-    return [] if before == after else [ChangedFigure(figure=name, before=before, after=after)]
 
 
 def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:

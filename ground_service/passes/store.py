@@ -89,6 +89,18 @@ def passes_of_vehicle(connection: Connection, vehicle: int, *, reported: bool) -
     return [PassRecord.of(row) for row in connection.execute(query).mappings()]
 
 
+def previous_pass(connection: Connection, record: PassRecord, spacecraft_id: int) -> PassRecord | None:
+    """Return the last pass of a spacecraft, live or from any archive, that started before a pass; None if none did."""
+    query = (
+        select(_PASSES)
+        .join(repository.VEHICLES, repository.VEHICLES.c.id == _PASSES.c.vehicle_id)
+        .where(repository.VEHICLES.c.ccsds_id == spacecraft_id, _PASSES.c.start_utc_ns < record.start_utc_ns)
+        .order_by(_PASSES.c.start_utc_ns.desc(), _PASSES.c.id.desc())
+    )
+    found = connection.execute(query.limit(1)).mappings().first()
+    return None if found is None else PassRecord.of(found)
+
+
 def reported_without_ephemeris(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[int]:
     """Return the passes with a report but no ephemeris of their own that overlap an interval."""
     query = select(_PASSES.c.id).where(

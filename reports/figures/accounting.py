@@ -66,6 +66,4 @@ def draw_completeness(
             )
     for gap in gaps:
         left, right = float(time.x(gap.start_utc_ns)), float(time.x(gap.stop_utc_ns))
-        axes.plot(
-            [left, right], [1.02, 1.02], color=color("vermillion"), linewidth=canvas.pt(3.0), clip_on=False
-        )
+        axes.plot([left, right], [1.02, 1.02], color=color("vermillion"), linewidth=3.0, clip_on=False)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 WIDTH_IN = 9.0
+_NAME_OF_X_IN, _NAME_OF_Y_IN = 0.28, 0.52
+"""Distances of the names of axes from their axes."""
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1_800, 3_600, 7_200, 10_800, 21_600, 43_200, 86_400)
 _DAY_S = 86_400
 
@@ -35,36 +37,30 @@ class Photo:
 class Canvas:
     """What a drawing function draws on: a (sub)figure of ``width_in`` by ``height_in`` design inches.
 
-    ``scale`` is the size of a design inch on the page; `pt` gives line widths and marker sizes that follow it. Where
-    ``photos`` is a list, images are collected there in the order of drawing and only a place is kept in the drawing.
+    Where ``photos`` is a list, images are collected there in the order of drawing and only a place is kept in the
+    drawing.
     """
 
     figure: Figure | SubFigure
     width_in: float
     height_in: float
-    scale: float = 1.0
     photos: list[Photo] | None = None
 
     def axes(self, left: float, bottom: float, width: float, height: float, **kwargs: Any) -> Axes:
         """Axes with their frame at a place in design inches from the lower left corner."""
-        box = (
-            left / self.width_in,
-            bottom / self.height_in,
-            width / self.width_in,
-            height / self.height_in,
-        )
-        return self.figure.add_axes(box, **kwargs)
+        box = (left / self.width_in, bottom / self.height_in, width / self.width_in, height / self.height_in)
+        axes = self.figure.add_axes(box, **kwargs)
+        # At fixed distances panels line up, and matplotlib does not measure the tick labels a second time.
+        axes.xaxis.set_label_coords(0.5, -_NAME_OF_X_IN / height)
+        axes.yaxis.set_label_coords(-_NAME_OF_Y_IN / width, 0.5)
+        return axes
 
     def text(self, x: float, y: float, text: str, **kwargs: Any) -> None:
         """Text at a place in design inches."""
         self.figure.text(x / self.width_in, y / self.height_in, text, **kwargs)
 
     def photo(
-        self,
-        axes: Axes,
-        image: ByteArray,
-        extent: tuple[float, float, float, float],
-        opacity: float = 1.0,
+        self, axes: Axes, image: ByteArray, extent: tuple[float, float, float, float], opacity: float = 1.0
     ) -> None:
         """A gray or RGB image into the box left, right, bottom, top of data coordinates; row 0 at ``top``."""
         shown = image
@@ -85,14 +81,6 @@ class Canvas:
         )
         axes.set_xlim(limits[0])
         axes.set_ylim(limits[1])
-
-    def pt(self, points: float) -> float:
-        """Points at the scale of this canvas."""
-        return points * self.scale
-
-    def dashes(self, pattern: tuple[float, ...] | None) -> Any:
-        """A matplotlib line style (dash lengths follow the line width by themselves)."""
-        return "-" if pattern is None else (0, pattern)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,12 +187,6 @@ def thinned(x: FloatArray, y: FloatArray, buckets: int = 600) -> tuple[FloatArra
     keep = np.unique(np.concatenate([low, high, hole]))
     keep = keep[keep < len(x)]
     return x[keep], y[keep]
-
-
-def name_axis(axes: Axes, canvas: Canvas, text: str, *, away_in: float = 0.52) -> None:
-    """Name of an ordinate at a fixed distance, so that panels one above the other line up."""
-    axes.set_ylabel(text)
-    axes.yaxis.set_label_coords(-away_in / (axes.get_position().width * canvas.width_in), 0.5)
 
 
 def length_label(metres: float) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, TimeScale, log_length_axis, shade_arcs, thinned, time_axis
-from reports.figures.theme import color
+from reports.figures.theme import Styles, color
 from reports.statistics import (
     Binned,
     binned,
@@ -26,7 +26,6 @@ from reports.values import NavigationSeries, TimeSpan, TrackSeries
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 
 _LEFT, _RIGHT, _BOTTOM = 0.72, 1.85, 0.50
 
@@ -74,12 +73,12 @@ def draw_consistency(
         low = float(chi2_quantile(0.025, typical)) / typical
         high = float(chi2_quantile(0.975, typical)) / typical
         axes.axhspan(max(low, 1e-3), high, color=color("silver"), alpha=0.45, linewidth=0)
-        axes.axhline(1.0, color=color("muted"), linewidth=canvas.pt(0.8), linestyle=(0, (4.0, 3.0)))
+        axes.axhline(1.0, color=color("muted"), linewidth=0.8, linestyle=(0, (4.0, 3.0)))
         tint = styles[one.name][0]
         shown = np.flatnonzero(finite)[:: max(1, int(finite.sum()) // 700)]
-        axes.plot(x[shown], scaled[shown], ".", color=tint, markersize=canvas.pt(3.0), alpha=0.55)
+        axes.plot(x[shown], scaled[shown], ".", color=tint, markersize=3.0, alpha=0.55)
         window = max(5, int(finite.sum() // 40))
-        axes.plot(*thinned(x, running_mean(scaled, window), 400), color=tint, linewidth=canvas.pt(1.6))
+        axes.plot(*thinned(x, running_mean(scaled, window), 400), color=tint, linewidth=1.6)
         bottom, top = quantiles(scaled, (0.005, 0.995))
         axes.set_ylim(min(max(bottom, 1e-3), 0.1) * 0.8, max(top * 1.3, 10.0))
         ticks = [
@@ -166,8 +165,8 @@ def draw_dependence(
                 step = float(np.diff(bins.centre).min()) if len(bins.centre) > 1 else 1.0
                 x = bins.centre + (k - (len(series) - 1) / 2) * 0.16 * step
                 tint = styles[one.name][0]
-                axes.vlines(x, bins.median, bins.p95, color=tint, linewidth=canvas.pt(1.2))
-                axes.plot(x, bins.median, "o", color=tint, markersize=canvas.pt(4.0))
+                axes.vlines(x, bins.median, bins.p95, color=tint, linewidth=1.2)
+                axes.plot(x, bins.median, "o", color=tint, markersize=4.0)
                 axes.set_xlabel(label)
     if terrain:
         axes = panel(len(names))
@@ -182,8 +181,8 @@ def draw_dependence(
                 p50, p95 = quantiles(chosen, (0.5, 0.95))
                 if np.isfinite(p50):
                     place = j + (k - (len(series) - 1) / 2) * 0.16
-                    axes.vlines([place], [p50], [p95], color=styles[one.name][0], linewidth=canvas.pt(1.2))
-                    axes.plot([place], [p50], "o", color=styles[one.name][0], markersize=canvas.pt(4.0))
+                    axes.vlines([place], [p50], [p95], color=styles[one.name][0], linewidth=1.2)
+                    axes.plot([place], [p50], "o", color=styles[one.name][0], markersize=4.0)
         axes.set_xlim(-0.6, len(terrain) - 0.4)
         axes.set_xticks(range(len(terrain)), terrain)
         axes.set_xlabel("terrain")

@@ -40,14 +40,12 @@ def draw_class_scores(canvas: Canvas, scores: Sequence[ClassScore]) -> None:
         axes.grid(True, axis="x")
         axes.grid(False, axis="y")
         for place, mine, paper in zip(places, ours, theirs, strict=True):
-            axes.plot(
-                [mine, paper], [place, place], color=color("silver"), linewidth=canvas.pt(2.0), zorder=1
-            )
+            axes.plot([mine, paper], [place, place], color=color("silver"), linewidth=2.0, zorder=1)
         axes.plot(
             theirs, places, "o", markerfacecolor=color("paper"), markeredgecolor=color("gray1"),
-            markeredgewidth=canvas.pt(1.3), markersize=canvas.pt(7.0), linestyle="none",
+            markeredgewidth=1.3, markersize=7.0, linestyle="none",
         )  # fmt: skip
-        axes.plot(ours, places, "o", color=color("blue"), markersize=canvas.pt(7.5), linestyle="none")
+        axes.plot(ours, places, "o", color=color("blue"), markersize=7.5, linestyle="none")
         axes.set_ylim(-0.6, len(scores) - 0.4)
         axes.set_yticks(places, [s.label for s in scores] if i == 0 else [""] * len(scores))
         axes.spines["left"].set_visible(False)
@@ -62,10 +60,10 @@ def draw_class_scores(canvas: Canvas, scores: Sequence[ClassScore]) -> None:
     sheet.set_axis_off()
     sheet.set_xlim(0, canvas.width_in - left - 0.25)
     sheet.set_ylim(0, 0.36)
-    sheet.plot([0.08], [0.18], "o", color=color("blue"), markersize=canvas.pt(7.5))
+    sheet.plot([0.08], [0.18], "o", color=color("blue"), markersize=7.5)
     sheet.plot(
         [1.38], [0.18], "o", markerfacecolor=color("paper"), markeredgecolor=color("gray1"),
-        markeredgewidth=canvas.pt(1.3), markersize=canvas.pt(7.0),
+        markeredgewidth=1.3, markersize=7.0,
     )  # fmt: skip
     canvas.text(left + 0.22, y, "this report", va="center_baseline", fontsize="small")
     canvas.text(left + 1.52, y, "LINNA paper, Table II", va="center_baseline", fontsize="small")
@@ -101,7 +99,7 @@ def draw_bins(canvas: Canvas, parts: Sequence[tuple[str, Sequence[BinScore]]]) -
         )
         ends: list[tuple[float, str, str]] = []
         for name, value, role, marker in lines:
-            axes.plot(centre, value, color=color(role), marker=marker, markersize=canvas.pt(4.5))
+            axes.plot(centre, value, color=color(role), marker=marker, markersize=4.5)
             finite = value[np.isfinite(value)]
             if i == len(parts) - 1 and len(finite):
                 ends.append((float(finite[-1]), name, role))
@@ -128,9 +126,9 @@ def draw_residuals(canvas: Canvas, residuals: ResidualSeries) -> None:
     size = height
     left = 0.75
     if has_sun:
-        _octants(canvas, canvas.axes(left, 0.5, size, size), residuals)
+        _octants(canvas.axes(left, 0.5, size, size), residuals)
         left += size + 1.6
-    _image_map(canvas, canvas.axes(left, 0.5, size, size), residuals)
+    _image_map(canvas.axes(left, 0.5, size, size), residuals)
 
 
 def octant_bias(residuals: ResidualSeries) -> tuple[FloatArray, FloatArray]:
@@ -152,7 +150,7 @@ def octant_bias(residuals: ResidualSeries) -> tuple[FloatArray, FloatArray]:
     return mean, count
 
 
-def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
+def _octants(axes: Axes, residuals: ResidualSeries) -> None:
     mean, _ = octant_bias(residuals)
     finite = np.isfinite(mean[:, 0])
     reach = float(np.nanmax(np.hypot(mean[:, 0], mean[:, 1]))) if finite.any() else 1.0
@@ -161,14 +159,14 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
     axes.set_xlim(-limit, limit)
     axes.set_ylim(limit, -limit)
     axes.grid(True, axis="both")
-    axes.axhline(0, color=color("faint"), linewidth=canvas.pt(0.8))
-    axes.axvline(0, color=color("faint"), linewidth=canvas.pt(0.8))
+    axes.axhline(0, color=color("faint"), linewidth=0.8)
+    axes.axvline(0, color=color("faint"), linewidth=0.8)
     for k in np.flatnonzero(finite):
         u, v = mean[k]
         axes.annotate(
             "", (u, v), (0, 0),
-            arrowprops={"arrowstyle": "-|>", "color": color("blue"), "linewidth": canvas.pt(1.3),
-                        "shrinkA": 0, "shrinkB": 0, "mutation_scale": canvas.pt(8)},
+            arrowprops={"arrowstyle": "-|>", "color": color("blue"), "linewidth": 1.3,
+                        "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8},
         )  # fmt: skip
     ends = mean[finite]
     out = np.maximum(np.hypot(ends[:, 0], ends[:, 1]), 1e-9)
@@ -185,7 +183,7 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
     axes.set_ylabel("dv, px (down)")
 
 
-def _image_map(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
+def _image_map(axes: Axes, residuals: ResidualSeries) -> None:
     cells, size = 6, 512.0
     edges = np.linspace(0.0, size, cells + 1)
     good = np.isfinite(residuals.du_px) & np.isfinite(residuals.dv_px)
@@ -227,7 +225,7 @@ def _image_map(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
         [size * 1.05, size * 1.05 + key * factor],
         [size * 0.06, size * 0.06],
         color=color("blue"),
-        linewidth=canvas.pt(2.0),
+        linewidth=2.0,
         clip_on=False,
     )
     axes.text(size * 1.05, size * 0.09, f"{key:g} px", va="top", fontsize="small", color=color("muted"))
@@ -259,7 +257,7 @@ def draw_curves(
         for row in TABLE_II.values():
             axes.plot(
                 [row.recall], [row.precision], "o", markerfacecolor=color("paper"), markeredgecolor=color("gray1"),
-                markeredgewidth=canvas.pt(1.2), markersize=canvas.pt(6.0),
+                markeredgewidth=1.2, markersize=6.0,
             )  # fmt: skip
         axes.set_xlabel("recall")
         axes.set_ylabel("precision")
@@ -270,15 +268,15 @@ def draw_curves(
         axes.set_xlim(0, 1)
         axes.set_ylim(0, 1.01)
         axes.grid(True, axis="both")
-        axes.plot([0, 1], [0, 1], color=color("muted"), linestyle=(0, (4, 3)), linewidth=canvas.pt(0.9))
+        axes.plot([0, 1], [0, 1], color=color("muted"), linestyle=(0, (4, 3)), linewidth=0.9)
         score = [b.mean_score for b in calibration]
         true = [b.fraction_true for b in calibration]
         most = max(b.count for b in calibration)
-        axes.plot(score, true, color=color("blue"), linewidth=canvas.pt(1.2))
+        axes.plot(score, true, color=color("blue"), linewidth=1.2)
         axes.scatter(
             score,
             true,
-            s=[canvas.pt(3 + 6 * (b.count / max(most, 1)) ** 0.5) ** 2 for b in calibration],
+            s=[(3 + 6 * (b.count / max(most, 1)) ** 0.5) ** 2 for b in calibration],
             color=color("blue"),
             linewidth=0,
             zorder=3,

@@ -97,7 +97,7 @@ def draw_frame(
                     frame.catalogue_diameter_px[chosen] / 2 * inches,
                 )
                 (line,) = sheet.plot(
-                    *circles, color=tint_of(int(size_class)), linestyle=dashes[lost], linewidth=canvas.pt(1.3)
+                    *circles, color=tint_of(int(size_class)), linestyle=dashes[lost], linewidth=1.3
                 )
                 line.set_clip_path(border)
     scored = np.isin(frame.detection_class, SCORED_CLASSES)
@@ -108,15 +108,11 @@ def draw_frame(
     crosses = _crosses(u, v, 0.045)
 
     def strokes(chosen: BoolArray, tint: str, wide: float) -> None:
-        (line,) = sheet.plot(
-            *_joined(crosses[chosen]), color=tint, linewidth=canvas.pt(wide), solid_capstyle="butt"
-        )
+        (line,) = sheet.plot(*_joined(crosses[chosen]), color=tint, linewidth=wide, solid_capstyle="butt")
         line.set_clip_path(border)
 
     if (~found).any():
-        (dots,) = sheet.plot(
-            u[~found], v[~found], ".", color=SMALL_TINT, markersize=canvas.pt(2.6), markeredgewidth=0
-        )
+        (dots,) = sheet.plot(u[~found], v[~found], ".", color=SMALL_TINT, markersize=2.6, markeredgewidth=0)
         dots.set_clip_path(border)
     if found.any():
         strokes(found, "#0b0e12", 2.7)

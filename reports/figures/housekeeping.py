@@ -51,8 +51,8 @@ def draw_housekeeping(
             parameter.values,
             "o" if alone else "-",
             color=color("blue"),
-            linewidth=canvas.pt(1.2),
-            markersize=canvas.pt(3.5),
+            linewidth=1.2,
+            markersize=3.5,
         )
         axes.locator_params(axis="y", nbins=4)
         if finite.any():

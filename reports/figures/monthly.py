@@ -37,13 +37,9 @@ def draw_trend(
         time_axis(axes, time, labelled=row == 2)
         axes.set_ylabel(f"{label}\n{unit}")
         known = np.isfinite(values)
-        axes.plot(
-            time.x(starts[known]), scale * values[known], "o", color=color("blue"), markersize=canvas.pt(3.5)
-        )
+        axes.plot(time.x(starts[known]), scale * values[known], "o", color=color("blue"), markersize=3.5)
         if known.any():
             axes.set_ylim(bottom=0.0, top=max(1.1 * scale * float(values[known].max()), 1e-6))
         for change in report.changes:
             if change.metric == name:
-                axes.axvline(
-                    float(time.x(change.utc_ns)), color=color("vermillion"), linewidth=canvas.pt(1.1)
-                )
+                axes.axvline(float(time.x(change.utc_ns)), color=color("vermillion"), linewidth=1.1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,27 +13,18 @@ from reports.figures.canvas import (
     TimeScale,
     end_labels,
     log_length_axis,
-    name_axis,
     shade_arcs,
     thinned,
     time_axis,
 )
-from reports.figures.theme import REFERENCE, TRIGGERS, color
-from reports.statistics import (
-    containment,
-    cumulative,
-    error_3d_m,
-    inside,
-    north_east_error_m,
-    reference_at,
-)
+from reports.figures.theme import REFERENCE, TRIGGERS, LineStyle, Styles, color
+from reports.statistics import containment, cumulative, error_3d_m, inside, north_east_error_m, reference_at
 from reports.text import length_text
 from reports.values import NavigationSeries, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.72, 2.0, 0.50, 0.28
 _MOST_NAMED_RESETS = 9
@@ -52,23 +43,21 @@ def resets_of(series: Sequence[NavigationSeries], time: TimeScale) -> list[tuple
     return sorted(found.items())
 
 
-def mark_resets(
-    canvas: Canvas, axes: Axes, time: TimeScale, resets: Sequence[tuple[int, str]], named: bool
-) -> None:
+def mark_resets(axes: Axes, time: TimeScale, resets: Sequence[tuple[int, str]], named: bool) -> None:
     """Dashed gray lines at resets; their triggers beside them where there is room, ticks at the top otherwise."""
     few = len(resets) <= _MOST_NAMED_RESETS
     for utc_ns, trigger in resets:
         x = float(time.x(utc_ns))
         if not few:
-            axes.axvline(x, ymin=0.965, color=color("muted"), linewidth=canvas.pt(0.8))
+            axes.axvline(x, ymin=0.965, color=color("muted"), linewidth=0.8)
             continue
-        axes.axvline(x, color=color("gray2"), linewidth=canvas.pt(0.8), linestyle=(0, (4.0, 3.0)))
+        axes.axvline(x, color=color("gray2"), linewidth=0.8, linestyle=(0, (4.0, 3.0)))
         if named:
             axes.annotate(
                 trigger,
                 (x, 0.985),
                 xycoords=("data", "axes fraction"),
-                xytext=(canvas.pt(3.0), 0.0),
+                xytext=(3.0, 0.0),
                 textcoords="offset points",
                 rotation=90,
                 ha="left",
@@ -78,25 +67,18 @@ def mark_resets(
             )
 
 
-def draw_lines(
-    canvas: Canvas,
-    axes: Axes,
-    x: FloatArray,
-    y: FloatArray,
-    style: tuple[str, tuple[float, ...] | None],
-    name: str = "",
-) -> None:
+def draw_lines(axes: Axes, x: FloatArray, y: FloatArray, style: LineStyle, name: str = "") -> None:
     """One series; samples without a finite neighbour are drawn as dots."""
     tint, dashes = style
     x, y = thinned(x, y)
-    width = (1.4 if dashes is None else 1.2) * (0.75 if len(y) > _DENSE else 1.0)
-    axes.plot(x, y, color=tint, linestyle=canvas.dashes(dashes), linewidth=canvas.pt(width), label=name)
+    width = (1.4 if dashes == "-" else 1.2) * (0.75 if len(y) > _DENSE else 1.0)
+    axes.plot(x, y, color=tint, linestyle=dashes, linewidth=width, label=name)
     finite = np.isfinite(y)
     known = np.zeros(len(y) + 2, dtype=np.bool_)
     known[1:-1] = finite
     alone = finite & ~known[:-2] & ~known[2:]
     if alone.any():
-        axes.plot(x[alone], y[alone], ".", color=tint, markersize=canvas.pt(4.0))
+        axes.plot(x[alone], y[alone], ".", color=tint, markersize=4.0)
 
 
 def broken(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -127,8 +109,8 @@ def _name_lines(
         axes,
         for_labels,
         line_height=0.165 / height_in,
-        samples={name: canvas.dashes(styles[name][1]) for name, _ in entries},
-        line_width=canvas.pt(1.4),
+        samples={name: styles[name][1] for name, _ in entries},
+        line_width=1.4,
         axes_width_in=width_in,
     )
 
@@ -150,18 +132,14 @@ def draw_error_over_time(
     axes.set_title("3-D position error")
     entries = []
     for one, error, keep in sorted(lines, key=lambda item: item[0].kind != "baseline"):
-        draw_lines(canvas, axes, time.x(one.utc_ns[keep]), error[keep], styles[one.name], one.name)
+        draw_lines(axes, time.x(one.utc_ns[keep]), error[keep], styles[one.name], one.name)
         entries.append((one.name, _last_finite(error[keep])))
-    mark_resets(canvas, axes, time, resets_of(series, time), named=True)
+    mark_resets(axes, time, resets_of(series, time), named=True)
     _name_lines(canvas, axes, height, entries, styles)
 
 
 def draw_rtn(
-    canvas: Canvas,
-    one: NavigationSeries,
-    styles: Styles,
-    time: TimeScale,
-    arcs: Sequence[TimeSpan],
+    canvas: Canvas, one: NavigationSeries, styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]
 ) -> None:
     """Radial, along-track and cross-track error of one solution, with its own three-sigma bounds where it has them."""
     gap = 0.16
@@ -183,11 +161,11 @@ def draw_rtn(
             bound = 3 * sigma[::step] / factor
             axes.fill_between(x[::step], -bound, bound, color=color("silver"), alpha=0.45, linewidth=0)
             for edge in (-bound, bound):
-                axes.plot(x[::step], edge, color=color("gray2"), linewidth=canvas.pt(0.9))
-        axes.axhline(0.0, color=color("faint"), linewidth=canvas.pt(0.7))
-        draw_lines(canvas, axes, x, error / factor, (tint, None))
+                axes.plot(x[::step], edge, color=color("gray2"), linewidth=0.9)
+        axes.axhline(0.0, color=color("faint"), linewidth=0.7)
+        draw_lines(axes, x, error / factor, (tint, "-"))
         axes.set_ylim(-limit / factor, limit / factor)
-        name_axis(axes, canvas, unit)
+        axes.set_ylabel(unit)
         lines = (
             [f"rms {length_text(float(np.sqrt(np.nanmean(error**2))))}"] if np.isfinite(error).any() else []
         )
@@ -249,16 +227,14 @@ def draw_ground_error(
         shown = [e[i][keep] for _, e, keep in errors]
         limit, factor, unit = _symmetric_limit(np.abs(np.concatenate(shown)) if shown else np.zeros(0))
         axes.set_ylim(-limit / factor, limit / factor)
-        axes.axhline(0.0, color=color("faint"), linewidth=canvas.pt(0.7))
-        name_axis(axes, canvas, unit)
+        axes.axhline(0.0, color=color("faint"), linewidth=0.7)
+        axes.set_ylabel(unit)
         axes.set_title(f"{name} error, {'north' if i == 0 else 'east'} positive")
         entries = []
         for (one, _, keep), error in zip(errors, shown, strict=True):
-            draw_lines(
-                canvas, axes, *broken(time.x(one.utc_ns[keep]), error / factor), styles[one.name], one.name
-            )
+            draw_lines(axes, *broken(time.x(one.utc_ns[keep]), error / factor), styles[one.name], one.name)
             entries.append((one.name, _last_finite(error / factor)))
-        mark_resets(canvas, axes, time, resets, named=i == 0)
+        mark_resets(axes, time, resets, named=i == 0)
         _name_lines(canvas, axes, height, entries, styles)
 
 
@@ -282,14 +258,14 @@ def draw_altitude(
             continue
         time_axis(panel, time, labelled=panel is below or below is None)
         shade_arcs(panel, time, arcs)
-        mark_resets(canvas, panel, time, resets, named=panel is axes)
+        mark_resets(panel, time, resets, named=panel is axes)
     axes.set_title("altitude over the 1737.4 km sphere")
-    name_axis(axes, canvas, "km")
+    axes.set_ylabel("km")
     keep = time.inside(track.utc_ns)
     axes.plot(
         *broken(time.x(track.utc_ns[keep]), track.altitude_m[keep] / 1e3),
         color=color(REFERENCE),
-        linewidth=canvas.pt(5.0),
+        linewidth=5.0,
         alpha=0.3,
         label="reference",
     )
@@ -297,11 +273,11 @@ def draw_altitude(
     for one in series:
         kept = time.inside(one.utc_ns)
         x = time.x(one.utc_ns[kept])
-        draw_lines(canvas, axes, *broken(x, one.altitude_m[kept] / 1e3), styles[one.name], one.name)
+        draw_lines(axes, *broken(x, one.altitude_m[kept] / 1e3), styles[one.name], one.name)
         error = np.abs(one.altitude_m[kept] - reference_at(track, one.utc_ns[kept])[2])
         errors.append((one, x, _positive(error)))
         entries.append((one.name, _last_finite(one.altitude_m[kept] / 1e3)))
-    with_reference = {**styles, "reference": (color(REFERENCE), None)}
+    with_reference = {**styles, "reference": (color(REFERENCE), "-")}
     low, top = axes.get_ylim()
     axes.set_ylim(max(0.0, low) if low > -1e6 else 0.0, top)
     _name_lines(canvas, axes, high, entries, with_reference)
@@ -310,7 +286,7 @@ def draw_altitude(
     log_length_axis(below, "y", [error for _, _, error in errors])
     below.set_title("altitude error, magnitude")
     for one, x, error in errors:
-        draw_lines(canvas, below, *broken(x, error), styles[one.name], one.name)
+        draw_lines(below, *broken(x, error), styles[one.name], one.name)
 
 
 def draw_distribution(
@@ -337,7 +313,7 @@ def draw_distribution(
         for one, error, mask in zip(series, errors, masks, strict=True):
             value, share = cumulative(error[mask == lit])
             if len(value):
-                draw_lines(canvas, axes, value, share, styles[one.name], one.name)
+                draw_lines(axes, value, share, styles[one.name], one.name)
         if i == len(panels) - 1:
             _legend(canvas, axes, height, [one.name for one in series], styles)
 
@@ -378,14 +354,7 @@ def draw_drift(canvas: Canvas, series: Sequence[NavigationSeries], styles: Style
             median = np.array([d.median_percent for d in one.drift_by_length])
             p95 = np.array([d.p95_percent for d in one.drift_by_length])
             axes.fill_between(x, median, p95, color=tint, alpha=0.14, linewidth=0)
-            axes.plot(
-                x,
-                median,
-                color=tint,
-                marker="o",
-                markersize=canvas.pt(3.5),
-                linestyle=canvas.dashes(dashes),
-            )
+            axes.plot(x, median, color=tint, marker="o", markersize=3.5, linestyle=dashes)
         left += width + gap
     last = None
     if reset:
@@ -398,8 +367,8 @@ def draw_drift(canvas: Canvas, series: Sequence[NavigationSeries], styles: Style
                 np.arange(1, len(shown) + 1),
                 shown,
                 marker="o",
-                markersize=canvas.pt(3.5),
-                linewidth=canvas.pt(0.7),
+                markersize=3.5,
+                linewidth=0.7,
                 color=styles[one.name][0],
             )
         most = max(int(np.isfinite(value).sum()) for value in values)

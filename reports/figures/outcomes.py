@@ -53,7 +53,7 @@ def draw_outcome_shares(canvas: Canvas, series: Sequence[NavigationSeries]) -> N
                 startangle=90,
                 counterclock=False,
                 colors=[outcome_color(o) for o in counts],
-                wedgeprops={"width": 0.34, "edgecolor": color("paper"), "linewidth": canvas.pt(1.2)},
+                wedgeprops={"width": 0.34, "edgecolor": color("paper"), "linewidth": 1.2},
             )
             for wedge, outcome in zip(axes.patches, counts, strict=True):
                 wedge.set_label(f"{one.name}, {outcome}")

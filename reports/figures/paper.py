@@ -51,12 +51,12 @@ def draw_fov_curves(canvas: Canvas, curves: FovCurves, threshold: float) -> None
     axes = canvas.axes(0.85, 0.5, canvas.width_in - 1.1, canvas.height_in - 0.8)
     for (n, values), (role, marker) in zip(curves.probability_at_least.items(), _FOV_STYLES, strict=False):
         axes.plot(
-            curves.fov_deg, values, "-", color=color(role), marker=marker, markersize=canvas.pt(4.0),
+            curves.fov_deg, values, "-", color=color(role), marker=marker, markersize=4.0,
             label=f"at least {n} crater{'s' if n > 1 else ''}",
         )  # fmt: skip
-    axes.axhline(threshold, color=color("muted"), linestyle=(0, (4, 2)), linewidth=canvas.pt(0.9))
+    axes.axhline(threshold, color=color("muted"), linestyle=(0, (4, 2)), linewidth=0.9)
     if np.isfinite(curves.selected_fov_deg):
-        axes.axvline(curves.selected_fov_deg, color=color("ink"), linewidth=canvas.pt(0.9))
+        axes.axvline(curves.selected_fov_deg, color=color("ink"), linewidth=0.9)
     axes.set_ylim(0.0, 1.03)
     axes.set_yticks(np.arange(0.0, 1.01, 0.2), [f"{v:g} %" for v in range(0, 101, 20)])
     axes.set_xlabel("full field of view, degrees")
@@ -83,11 +83,11 @@ def draw_simulator(canvas: Canvas, session: PaperSession, frame: GalleryFrame) -
     draw_frame(canvas, sheet, 0.0, 0.0, size, frame)
     left, map_height = size + 0.65, 1.75
     axes = canvas.axes(left, canvas.height_in - map_height - 0.25, canvas.width_in - left - 0.15, map_height)
-    _ground_track(canvas, axes, session, frame)
+    _ground_track(axes, session, frame)
     _state_lines(canvas, size + 0.2, canvas.height_in - map_height - 0.85, session, frame)
 
 
-def _ground_track(canvas: Canvas, axes: Axes, session: PaperSession, frame: GalleryFrame) -> None:
+def _ground_track(axes: Axes, session: PaperSession, frame: GalleryFrame) -> None:
     track = session.track
     axes.set_xlim(0, 360)
     axes.set_ylim(-90, 90)
@@ -97,13 +97,13 @@ def _ground_track(canvas: Canvas, axes: Axes, session: PaperSession, frame: Gall
     lit = inside(track.utc_ns, session.arcs) if session.arcs else np.ones(len(track.utc_ns), dtype=np.bool_)
     axes.plot(
         track.longitude_deg[lit] % 360.0, track.latitude_deg[lit], ".", color=color("vermillion"),
-        markersize=canvas.pt(1.2), label="ground track",
+        markersize=1.2, label="ground track",
     )  # fmt: skip
     if frame.utc_ns is not None:
         latitude, longitude, _ = reference_at(track, np.array([frame.utc_ns]))
         axes.plot(
             longitude % 360.0, latitude, "o", markerfacecolor="none", markeredgecolor=color("ink"),
-            markersize=canvas.pt(9.0),
+            markersize=9.0,
         )  # fmt: skip
 
 

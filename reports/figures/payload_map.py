@@ -31,16 +31,13 @@ def draw_payload_map(canvas: Canvas, mapped: PayloadMap) -> None:
         mapped.offset_m[shown, 1],
         "o",
         color=color("blue"),
-        markersize=canvas.pt(3.0),
+        markersize=3.0,
         alpha=0.6,
         linestyle="none",
     )
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     axes.plot(
-        2.0 * claimed * np.cos(angle),
-        2.0 * claimed * np.sin(angle),
-        color=color("vermillion"),
-        linewidth=canvas.pt(1.6),
+        2.0 * claimed * np.cos(angle), 2.0 * claimed * np.sin(angle), color=color("vermillion"), linewidth=1.6
     )
     axes.set_xlabel("east, m")
     axes.set_ylabel("north, m")
@@ -53,7 +50,7 @@ def draw_payload_map(canvas: Canvas, mapped: PayloadMap) -> None:
     panel.bar(edges[:-1], share, np.diff(edges) * 0.92, align="edge", color=color("blue"), linewidth=0)
     middle = (edges[:-1] + edges[1:]) / 2
     normal = 2.0 * np.exp(-0.5 * middle**2) / np.sqrt(2.0 * np.pi) * np.diff(edges)
-    panel.plot(middle, normal, color=color("vermillion"), linewidth=canvas.pt(1.6))
+    panel.plot(middle, normal, color=color("vermillion"), linewidth=1.6)
     panel.set_xlim(0.0, 5.0)
     panel.set_xlabel("offset over claimed sigma, east and north")
     panel.set_title("share of the landmarks")

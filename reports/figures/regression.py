@@ -16,9 +16,9 @@ def draw_changed_craters(canvas: Canvas, craters: ChangedCraters) -> None:
         (craters.change < 0, "vermillion", 5.0),
     ):
         x, y = craters.longitude_deg[chosen], craters.latitude_deg[chosen]
-        axes.plot(x, y, "o", color=color(role), markersize=canvas.pt(size), alpha=0.8)
+        axes.plot(x, y, "o", color=color(role), markersize=size, alpha=0.8)
     x, y = craters.false_longitude_deg, craters.false_latitude_deg
-    axes.plot(x, y, "x", color=color("orange"), markersize=canvas.pt(4.0))
+    axes.plot(x, y, "x", color=color("orange"), markersize=4.0)
     axes.grid(True, axis="both")
     axes.set_xlabel("longitude, degrees east")
     axes.set_ylabel("latitude, degrees")

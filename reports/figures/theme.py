@@ -84,25 +84,29 @@ _BASELINE_STYLES: tuple[tuple[str, tuple[float, ...]], ...] = (
 )
 _LOCK = RLock()
 
+LineStyle = tuple[str, str | tuple[int, tuple[float, ...]]]
+"""Colour of a line, and its dashes as matplotlib takes them."""
+Styles = Mapping[str, LineStyle]
+
 
 def color(role: str) -> str:
     """Light colour of a role."""
     return LIGHT[role]
 
 
-def series_styles(names_and_kinds: list[tuple[str, str]]) -> dict[str, tuple[str, tuple[float, ...] | None]]:
-    """Colour and dashes (None for a full line) of every estimate and baseline, the same in every figure."""
-    styles: dict[str, tuple[str, tuple[float, ...] | None]] = {}
+def series_styles(names_and_kinds: list[tuple[str, str]]) -> dict[str, LineStyle]:
+    """Return the style of the line of every estimate and baseline, the same in every figure."""
+    styles: dict[str, LineStyle] = {}
     others = baselines = 0
     for name, kind in names_and_kinds:
         if kind == "baseline":
             role, dashes = _BASELINE_STYLES[baselines % len(_BASELINE_STYLES)]
-            styles[name] = (color(role), dashes)
+            styles[name] = (color(role), (0, dashes))
             baselines += 1
         elif name in _KNOWN_SERIES:
-            styles[name] = (color(_KNOWN_SERIES[name]), None)
+            styles[name] = (color(_KNOWN_SERIES[name]), "-")
         else:
-            styles[name] = (color(_OTHER_SERIES[others % len(_OTHER_SERIES)]), None)
+            styles[name] = (color(_OTHER_SERIES[others % len(_OTHER_SERIES)]), "-")
             others += 1
     return styles
 
@@ -130,6 +134,7 @@ def _settings() -> dict[str, Any]:
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
         "axes.titlepad": 6.0,
+        "axes.titley": 1.0,
         "axes.labelpad": 4.0,
         "axes.linewidth": 0.7,
         "axes.edgecolor": LIGHT["faint"],

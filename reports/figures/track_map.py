@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reports.arrays import BoolArray, FloatArray
 from reports.figures.canvas import Canvas
-from reports.figures.theme import color
+from reports.figures.theme import Styles, color
 from reports.statistics import inside
 from reports.values import CraterMap, NavigationSeries, TerrainMap, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 
 _STRIPS = 4
 _MOST_CRATERS = 220
@@ -44,11 +43,11 @@ def draw_globe(
     for side in ("top", "right"):
         axes.spines[side].set_visible(True)
     lit = inside(track.utc_ns, arcs) if arcs else np.ones(len(track.utc_ns), dtype=np.bool_)
-    _line(canvas, axes, track, np.ones(len(lit), dtype=np.bool_), color("gray1"), 0.5)
-    _line(canvas, axes, track, lit, color("vermillion"), 1.8 if len(arcs) < 4 else 0.9)
+    _line(axes, track, np.ones(len(lit), dtype=np.bool_), color("gray1"), 0.5)
+    _line(axes, track, lit, color("vermillion"), 1.8 if len(arcs) < 4 else 0.9)
     if span is not None:
         one = lit & inside(track.utc_ns, (span,))
-        _line(canvas, axes, track, one, color("blue"), 2.6)
+        _line(axes, track, one, color("blue"), 2.6)
 
 
 def draw_strips(
@@ -65,7 +64,7 @@ def draw_strips(
     latitude, longitude, utc_ns = track.latitude_deg[keep], track.longitude_deg[keep], track.utc_ns[keep]
     if not len(latitude):
         return
-    gap, left, bottom = 0.52, 0.55, 0.50
+    gap, left, bottom = 0.52, 0.68, 0.50
     width = (canvas.width_in - left - 0.12 - gap * (_STRIPS - 1)) / _STRIPS
     height = canvas.height_in - bottom - 0.14
     parts = np.array_split(np.arange(len(latitude)), min(_STRIPS, len(latitude)))
@@ -89,7 +88,7 @@ def draw_strips(
         )
         axes.set_yticks(list(ticks), [latitude_label(t) for t in ticks])
         if craters is not None:
-            _craters(canvas, axes, craters, middle, width)
+            _craters(axes, craters, middle)
         for one in series:
             inside_time = (one.utc_ns >= utc_ns[part[0]]) & (one.utc_ns <= utc_ns[part[-1]])
             tint, dashes = styles[one.name]
@@ -97,14 +96,14 @@ def draw_strips(
                 _unwrapped(one.longitude_deg[inside_time], middle),
                 one.latitude_deg[inside_time],
                 color=tint,
-                linestyle=canvas.dashes(dashes),
-                linewidth=canvas.pt(1.3),
+                linestyle=dashes,
+                linewidth=1.3,
             )
         axes.plot(
             _unwrapped(longitude[part], middle),
             latitude[part],
             color=color("ink"),
-            linewidth=canvas.pt(1.0),
+            linewidth=1.0,
             linestyle=(0, (5, 2)),
         )
         for side in ("top", "right"):
@@ -114,8 +113,9 @@ def draw_strips(
             axes.set_xlabel("longitude, degrees east", loc="left")
 
 
-def _craters(canvas: Canvas, axes: Axes, craters: CraterMap, middle: float, width_in: float) -> None:
-    from matplotlib.collections import PolyCollection
+def _craters(axes: Axes, craters: CraterMap, middle: float) -> None:
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
 
     west, east = axes.get_xlim()
     south, north = axes.get_ylim()
@@ -127,17 +127,16 @@ def _craters(canvas: Canvas, axes: Axes, craters: CraterMap, middle: float, widt
         & (craters.latitude_deg < north)
     )
     found = _found(craters)
-    angle = np.append(np.linspace(0.0, 2.0 * np.pi, 21), np.nan)
+    angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
     for mask, role in ((near & ~found, "orange"), (near & found, "blue")):
         index = np.flatnonzero(mask)[np.argsort(-craters.diameter_m[mask])][:_MOST_CRATERS]
         radius = np.degrees(craters.diameter_m[index] / 2 / 1_737_400.0)[:, None]
         wide = radius / np.maximum(np.cos(np.radians(craters.latitude_deg[index])), 0.1)[:, None]
         x = longitude[index][:, None] + wide * np.cos(angle)
         y = craters.latitude_deg[index][:, None] + radius * np.sin(angle)
-        if role == "blue" and len(index):
-            disks = np.stack([x, y], axis=-1)[:, :-1]
-            axes.add_collection(PolyCollection(list(disks), facecolors=color(role), alpha=0.25, linewidths=0))
-        axes.plot(x.ravel(), y.ravel(), color=color(role), linewidth=canvas.pt(0.9))
+        disks = Path.make_compound_path_from_polys(np.stack([x, y], axis=-1))
+        inside = (color(role), 0.25) if role == "blue" else "none"
+        axes.add_patch(PathPatch(disks, facecolor=inside, edgecolor=color(role), linewidth=0.9))
 
 
 def _found(craters: CraterMap) -> BoolArray:
@@ -146,7 +145,7 @@ def _found(craters: CraterMap) -> BoolArray:
     return np.asarray(craters.detected > 0)
 
 
-def _line(canvas: Canvas, axes: Axes, track: TrackSeries, keep: BoolArray, tint: str, width: float) -> None:
+def _line(axes: Axes, track: TrackSeries, keep: BoolArray, tint: str, width: float) -> None:
     longitude = np.where(keep, track.longitude_deg % 360.0, np.nan)
     latitude = np.where(keep, track.latitude_deg, np.nan)
     step = np.diff(track.utc_ns, prepend=track.utc_ns[:1])
@@ -159,7 +158,7 @@ def _line(canvas: Canvas, axes: Axes, track: TrackSeries, keep: BoolArray, tint:
         np.insert(longitude, np.flatnonzero(jump), np.nan),
         np.insert(latitude, np.flatnonzero(jump), np.nan),
         color=tint,
-        linewidth=canvas.pt(width),
+        linewidth=width,
         solid_capstyle="butt",
     )
 

@@ -25,7 +25,7 @@ def draw_training(canvas: Canvas, curves: Sequence[TrainingCurve]) -> None:
         axes = canvas.axes(
             left + column * (width + gap), 0.5 + (rows - 1 - row) * (height + 0.75), width, height
         )
-        axes.plot(curve.epoch, curve.values, color=color("blue"), linewidth=canvas.pt(1.3))
+        axes.plot(curve.epoch, curve.values, color=color("blue"), linewidth=1.3)
         axes.set_title(curve.name, fontsize="small")
         axes.set_xlabel(curve.axis)
         axes.locator_params(axis="both", nbins=4)
@@ -37,11 +37,9 @@ def draw_named_scores(canvas: Canvas, scores: Sequence[NamedScore]) -> None:
     axes = canvas.axes(1.9, 0.50, canvas.width_in - 3.1, canvas.height_in - 0.62)
     places = np.arange(len(scores))[::-1]
     for place, one in zip(places, scores, strict=True):
-        axes.plot(
-            [one.recall, one.precision], [place, place], color=color("silver"), linewidth=canvas.pt(2.0)
-        )
-    axes.plot([s.precision for s in scores], places, "s", color=color("gray1"), markersize=canvas.pt(6.0))
-    axes.plot([s.recall for s in scores], places, "o", color=color("blue"), markersize=canvas.pt(7.0))
+        axes.plot([one.recall, one.precision], [place, place], color=color("silver"), linewidth=2.0)
+    axes.plot([s.precision for s in scores], places, "s", color=color("gray1"), markersize=6.0)
+    axes.plot([s.recall for s in scores], places, "o", color=color("blue"), markersize=7.0)
     axes.set_xlim(0, 1)
     axes.set_ylim(-0.6, len(scores) - 0.4)
     axes.set_yticks(places, [s.label for s in scores])

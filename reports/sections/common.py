@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from reports.document import Absent
 from reports.figures.canvas import TimeScale, arcs_differ
+from reports.figures.theme import Styles
 from reports.text import hash_text
 from reports.values import ODOMETRY_OUTCOMES, NavigationSeries, PassReport, TimeSpan
 
@@ -23,7 +23,6 @@ _USUAL_REASON = {
     "outcomes": "no estimator reported matching outcomes",
     "detector": "detections, catalogue or reference orbit are not available",
     "gallery": "the pass has no images on the ground",
-    "worst_frames": "the pass has no images on the ground",
     "craters": "no catalogue was given for the map",
     "housekeeping": "no housekeeping packet was received",
     "instruments": "no packet of an optional instrument was received",
@@ -41,7 +40,7 @@ class PassView:
 
     report: PassReport
     time: TimeScale
-    styles: Mapping[str, tuple[str, tuple[float, ...] | None]]
+    styles: Styles
 
     @property
     def estimates(self) -> tuple[NavigationSeries, ...]:
@@ -97,6 +96,8 @@ def is_hash(text: str) -> bool:
 
 def setting_text(value: object) -> str:
     """A setting as it is printed."""
+    if value is None:
+        return "not stated"
     if isinstance(value, str) and is_hash(value):
         return hash_text(value)
     if isinstance(value, bool):

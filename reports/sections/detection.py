@@ -211,12 +211,8 @@ def galleries(view: PassView) -> list[Block]:
     if report.worst_frames:
         worst = report.worst_frames[:9]
         blocks.append(
-            gallery_picture(
-                "worst",
-                worst,
-                3,
-                f"The {len(worst)} frames with the lowest recall, of all frames of the pass. A uniform background "
-                "replaces an image that was not received.",
-            )
+            gallery_picture("worst", worst, 3, "Frames with the lowest recall, of all frames of the pass.")
         )
+    if report.gallery and "worst_frames" in report.not_available:
+        blocks.append(view.absent("worst_frames", "Frames with the lowest recall"))
     return blocks

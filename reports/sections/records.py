@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from reports.document import (
-    Block,
-    Cell,
-    Column,
-    Heading,
-    Listing,
-    Paragraph,
-    Table,
-)
+from reports.document import Block, Cell, Column, Heading, Listing, Paragraph, Table
 from reports.figures.theme import TRIGGERS
-from reports.sections.common import PassView, role_of
+from reports.sections.common import PassView, role_of, setting_text
 from reports.sections.opening import settings
 from reports.text import count_text, utc_text
+from reports.values import SettingsComparison
 
 _MOST_READS = 30
+_MOST_CHANGES = 60
 
 
 def ledger(view: PassView) -> list[Block]:
@@ -93,6 +87,23 @@ def configuration(view: PassView) -> list[Block]:
     blocks: list[Block] = [Heading("Configuration"), *settings(report.configuration)]
     if not report.configuration and not report.scenario_text:
         blocks.append(view.absent("configuration", "Configuration"))
+    if report.comparison is not None:
+        blocks.append(_changed_settings(report.comparison))
     if report.scenario_text:
         blocks.append(Listing("Scenario file", report.scenario_text))
     return blocks
+
+
+def _changed_settings(comparison: SettingsComparison) -> Block:
+    if not comparison.changes:
+        return Paragraph(f"All settings are those of the previous pass, {comparison.previous_pass}.")
+    rest = len(comparison.changes) - _MOST_CHANGES
+    return Table(
+        f"Settings that differ from those of the previous pass, {comparison.previous_pass}.",
+        tuple(Column(words, numeric=False) for words in ("setting", "previous pass", "this pass")),
+        tuple(
+            (name, setting_text(before), setting_text(after))
+            for name, before, after in comparison.changes[:_MOST_CHANGES]
+        ),
+        note=f"{rest} further settings are in the JSON form of this report." if rest > 0 else "",
+    )

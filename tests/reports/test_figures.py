@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -88,12 +88,12 @@ def test_a_quantity_with_one_bin_is_a_sentence_and_no_plot() -> None:
     report = example.pass_report()
     assert report.detector is not None
     one = (BinScore(15.0, 20.0, 300, 0.8, 0.7), BinScore(20.0, 25.0, 0, float("nan"), float("nan")))
-    score = dataclasses.replace(report.detector, by_altitude_km=one)
-    words = Page(render_html(dataclasses.replace(report, detector=score))).text
+    score = replace(report.detector, by_altitude_km=one)
+    words = Page(render_html(replace(report, detector=score))).text
     assert "All craters were expected at one altitude, 15 to 20 km" in words
     assert "Precision and recall by light, over the craters" in words
-    score = dataclasses.replace(report.detector, by_altitude_km=one, by_sun_elevation_deg=())
-    words = Page(render_html(dataclasses.replace(report, detector=score))).text
+    score = replace(report.detector, by_altitude_km=one, by_sun_elevation_deg=())
+    words = Page(render_html(replace(report, detector=score))).text
     assert "over the craters expected in each bin" not in words
 
 

@@ -1,7 +1,7 @@
 """The page of a pass: complete, self-contained, the same bytes every time."""
 
-import dataclasses
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +14,9 @@ from reports.values import (
     HeadlineFigure,
     NavigationSeries,
     PassReport,
+    SettingsComparison,
     TrackSeries,
-)
+)  # fmt: skip
 from tests.reports import example
 from tests.reports.page import Page
 
@@ -27,17 +28,18 @@ def page(whole_page: str) -> Page:
 
 def _series(n: int, **more: object) -> NavigationSeries:
     """A navigation series of n samples at ten seconds, every value finite unless replaced."""
-    fields: dict[str, object] = {
-        "name": "anchored",
-        "kind": "estimate",
-        "utc_ns": example.START_UTC_NS + np.arange(n, dtype=np.int64) * 10_000_000_000,
-        "latitude_deg": np.linspace(-10.0, 10.0, n),
-        "longitude_deg": np.full(n, 300.0),
-        "altitude_m": np.full(n, 30_000.0),
-        "error_rtn_m": np.full((n, 3), 20.0),
-        **more,
-    }
-    return NavigationSeries(**fields)
+    return NavigationSeries(
+        **{
+            "name": "anchored",
+            "kind": "estimate",
+            "utc_ns": example.START_UTC_NS + np.arange(n, dtype=np.int64) * 10_000_000_000,
+            "latitude_deg": np.linspace(-10.0, 10.0, n),
+            "longitude_deg": np.full(n, 300.0),
+            "altitude_m": np.full(n, 30_000.0),
+            "error_rtn_m": np.full((n, 3), 20.0),
+            **more,
+        }
+    )
 
 
 def test_every_tag_of_the_page_is_closed(page: Page) -> None:
@@ -172,7 +174,7 @@ def test_only_false_alarms_of_the_scored_classes_are_marked_as_false(whole_pass:
 
     def marks(size_class: int) -> int:
         classes = np.full(len(nothing), size_class, np.int64)
-        shown = dataclasses.replace(frame, detection_matched=nothing, detection_class=classes)
+        shown = replace(frame, detection_matched=nothing, detection_class=classes)
         return draw_svg("g", 3.0, 3.5, lambda c: draw_gallery(c, (shown,), 1), "one frame").count(FALSE_TINT)
 
     assert marks(0) == 1, "one compound path holds all crosses of a colour"
@@ -197,9 +199,7 @@ def test_a_pass_without_a_reference_shows_what_the_estimators_said() -> None:
 
 
 def test_a_pass_without_frames_says_so_and_shows_the_rest(whole_pass: PassReport) -> None:
-    report = dataclasses.replace(
-        whole_pass, accounting=None, gallery=(), worst_frames=(), detector=None, craters=None
-    )
+    report = replace(whole_pass, accounting=None, gallery=(), worst_frames=(), detector=None, craters=None)
     page = Page(render_html(report))
     assert page.left_open == []
     assert "Frame accounting not available: the frames of the pass were not counted" in page.text
@@ -209,7 +209,7 @@ def test_a_pass_without_frames_says_so_and_shows_the_rest(whole_pass: PassReport
 
 
 def test_a_pass_without_navigation_says_so_and_shows_the_rest(whole_pass: PassReport) -> None:
-    page = Page(render_html(dataclasses.replace(whole_pass, navigation=(), truth_ledger=())))
+    page = Page(render_html(replace(whole_pass, navigation=(), truth_ledger=())))
     assert page.left_open == []
     assert "Navigation not available: no navigation telemetry was received" in page.text
     assert "Detection by size class" in page.text and "Filter consistency" not in page.text
@@ -223,19 +223,21 @@ def test_a_pass_of_one_frame_is_reported() -> None:
     assert "Of 1 expected" in page.text
 
 
+@pytest.mark.parametrize("changes", [(), (("link.coding", "rs", None),)])
+def test_settings_are_compared_with_those_of_the_previous_pass(changes: tuple[Any, ...]) -> None:
+    report = PassReport("Compared", "p8", comparison=SettingsComparison("W-1", changes))
+    _, _, text = Page(render_html(report)).text.rpartition("those of the previous pass, W-1. ")
+    row = "setting previous pass this pass link.coding rs not stated "
+    assert text.startswith(row if changes else "LINNA · Pass report")
+
+
 def test_series_of_nothing_but_nan_are_dashes_not_numbers() -> None:
     n = 25
-    one = _series(
-        n,
-        latitude_deg=np.full(n, np.nan),
-        longitude_deg=np.full(n, np.nan),
-        altitude_m=np.full(n, np.nan),
-        error_rtn_m=np.full((n, 3), np.nan),
-        sigma_rtn_m=np.full((n, 3), np.nan),
-        nees=np.full(n, np.nan),
-        nis=np.full(n, np.nan),
-        nis_dof=np.zeros(n, np.int64),
+    numbers = dict.fromkeys(
+        ("latitude_deg", "longitude_deg", "altitude_m", "nees", "nis"), np.full(n, np.nan)
     )
+    vectors = dict.fromkeys(("error_rtn_m", "sigma_rtn_m"), np.full((n, 3), np.nan))
+    one = _series(n, **numbers, **vectors, nis_dof=np.zeros(n, np.int64))
     track = TrackSeries(one.utc_ns, np.linspace(-5, 5, n), np.full(n, 10.0), np.full(n, np.nan))
     headline = (HeadlineFigure("Error", float("nan"), "m"), HeadlineFigure("Recall", None))
     text = Page(
@@ -259,7 +261,7 @@ def test_single_wild_values_do_not_break_a_page() -> None:
 
 
 def test_half_a_downlink_shows_the_share_that_came() -> None:
-    report = dataclasses.replace(
+    report = replace(
         example.pass_report(gallery=0, worst=0), accounting=FrameAccounting(expected=148, processed=74)
     )
     text = Page(render_html(report)).text

@@ -16,9 +16,11 @@ from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.passes.archive_import import import_archive
 from ground_service.store import repository
-from reports.values import PassReport
+from lunar.timescales import format_utc
+from reports.values import PassReport, SettingsComparison
 from tests.ground_service.archive_hash import archive_hash
 
+Imported = tuple[Ground, int, PassReport]
 FRAMES = 40
 STEP_M = 24_536.0
 """Ground track of 15 s on a circle at 30 km: 1737.4 km * sqrt(GM / (1767.4 km)^3) * 15 s = 24.56 km, less the Moon's
@@ -26,9 +28,7 @@ turning under an orbit inclined by 80 degrees (0.15 %)."""
 
 
 @pytest.fixture(scope="module")
-def imported(
-    synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[Ground, int, PassReport]]:
+def imported(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Imported]:
     with open_ground(tmp_path_factory.mktemp("imported") / "home") as ground:
         pass_id = import_archive(ground, synthetic_pass.folder)
         yield ground, pass_id, evaluate(ground, pass_id)
@@ -38,7 +38,7 @@ def series(report: PassReport, name: str) -> Any:
     return next(s for s in report.navigation if s.name == name)
 
 
-def test_a_constant_error_comes_back_in_its_own_axes(imported: tuple[Ground, int, PassReport]) -> None:
+def test_a_constant_error_comes_back_in_its_own_axes(imported: Imported) -> None:
     """30, -40 and 120 m put in along R, T and N come out to a millimetre: the OEM is written to that."""
     estimate = series(imported[2], "spherical")
     np.testing.assert_allclose(estimate.error_rtn_m, np.tile([30.0, -40.0, 120.0], (FRAMES, 1)), atol=2e-3)
@@ -46,7 +46,7 @@ def test_a_constant_error_comes_back_in_its_own_axes(imported: tuple[Ground, int
     assert estimate.statistics.drift_percent == pytest.approx(0.0, abs=1e-6)
 
 
-def test_drift_is_measured_between_resets(imported: tuple[Ground, int, PassReport]) -> None:
+def test_drift_is_measured_between_resets(imported: Imported) -> None:
     """400 m a step of the ground track, reset at half time: the figure is the same as without the reset."""
     estimate = series(imported[2], "paper")
     assert estimate.statistics.drift_percent == pytest.approx(100.0 * 400.0 / STEP_M, rel=2e-3)
@@ -57,17 +57,13 @@ def test_drift_is_measured_between_resets(imported: tuple[Ground, int, PassRepor
     assert (estimate.anchor_reads, estimate.anchor_reads_after_start) == (2, 1)
 
 
-def test_the_orbit_is_two_body_so_kepler_is_exact_and_gravity_is_not(
-    imported: tuple[Ground, int, PassReport],
-) -> None:
+def test_the_orbit_is_two_body_so_kepler_is_exact_and_gravity_is_not(imported: Imported) -> None:
     report = imported[2]
     assert series(report, "Kepler").statistics.max_3d_m < 0.1
     assert 1.0 < series(report, "propagate-only").statistics.max_3d_m < 1000.0
 
 
-def test_recall_and_precision_are_those_put_in(
-    imported: tuple[Ground, int, PassReport], synthetic_pass: Any
-) -> None:
+def test_recall_and_precision_are_those_put_in(imported: Imported, synthetic_pass: Any) -> None:
     detector = imported[2].detector
     assert detector is not None
     assert detector.micro is not None
@@ -81,9 +77,7 @@ def test_recall_and_precision_are_those_put_in(
     assert np.mean(detector.residuals.dv_px) == pytest.approx(-1.25, abs=1 / 64)
 
 
-def test_frames_and_packets_are_accounted_for(
-    imported: tuple[Ground, int, PassReport], synthetic_pass: Any
-) -> None:
+def test_frames_and_packets_are_accounted_for(imported: Imported, synthetic_pass: Any) -> None:
     report = imported[2]
     assert report.accounting is not None
     assert report.packets is not None
@@ -94,16 +88,14 @@ def test_frames_and_packets_are_accounted_for(
     assert len(report.events) == 1
 
 
-def test_the_first_and_the_last_frame_lie_inside_the_imaging_arc(
-    imported: tuple[Ground, int, PassReport],
-) -> None:
+def test_the_first_and_the_last_frame_lie_inside_the_imaging_arc(imported: Imported) -> None:
     (arc,) = imported[2].imaging_arcs
     times = np.asarray(series(imported[2], "paper").utc_ns)
     assert arc.start_utc_ns <= times[0] and times[-1] < arc.stop_utc_ns
 
 
 def test_importing_again_gives_the_same_pass_and_the_same_archive(
-    imported: tuple[Ground, int, PassReport], synthetic_pass: Any
+    imported: Imported, synthetic_pass: Any
 ) -> None:
     ground, pass_id, _ = imported
     with ground.database.reading() as connection:
@@ -115,7 +107,7 @@ def test_importing_again_gives_the_same_pass_and_the_same_archive(
     assert pass_summary(ground, pass_id)["packets"] == len(synthetic_pass.packets)
 
 
-def test_the_summary_has_what_the_demonstration_prints(imported: tuple[Ground, int, PassReport]) -> None:
+def test_the_summary_has_what_the_demonstration_prints(imported: Imported) -> None:
     ground, pass_id, _ = imported
     summary = pass_summary(ground, pass_id)
     json.dumps(summary, allow_nan=False)
@@ -126,7 +118,7 @@ def test_the_summary_has_what_the_demonstration_prints(imported: tuple[Ground, i
         assert set(summary["navigation"][mode]) >= {"median_3d_m", "p95_3d_m", "max_3d_m", "drift_percent"}
 
 
-def test_a_report_is_written_and_kept(imported: tuple[Ground, int, PassReport], tmp_path: Path) -> None:
+def test_a_report_is_written_and_kept(imported: Imported, tmp_path: Path) -> None:
     ground, pass_id, _ = imported
     made = make_report(ground, pass_id, out=tmp_path / "out")
     assert "synthetic pass" in made.html.read_text()
@@ -138,8 +130,7 @@ def test_a_report_is_written_and_kept(imported: tuple[Ground, int, PassReport], 
 
 def test_half_a_downlink_is_not_called_whole(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
     """No count has a gap where the end of a downlink is missing; the frames that were planned tell of it."""
-    folder = tmp_path / "half"
-    shutil.copytree(synthetic_pass.folder, folder)
+    folder = shutil.copytree(synthetic_pass.folder, tmp_path / "half")
     octets = (folder / "downlink.cadu").read_bytes()
     (folder / "downlink.cadu").write_bytes(octets[: len(octets) // 2])
     _rewrite_manifest(folder, lambda manifest: manifest.update(pass_name="half of it"))
@@ -156,12 +147,9 @@ def test_half_a_downlink_is_not_called_whole(synthetic_pass: Any, ground: Ground
 def test_without_a_reference_outcomes_and_ledger_are_still_told(
     synthetic_pass: Any, ground: Ground, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "alone"
-    shutil.copytree(synthetic_pass.folder, folder)
+    folder = shutil.copytree(synthetic_pass.folder, tmp_path / "alone")
+    _rewrite_manifest(folder, lambda manifest: manifest["files"].pop("reference.oem"))
     (folder / "reference.oem").unlink()
-    manifest = json.loads((folder / "manifest.json").read_text())
-    del manifest["files"]["reference.oem"]
-    (folder / "manifest.json").write_text(json.dumps(manifest))
     made = make_report(ground, import_archive(ground, folder), out=tmp_path / "out")
     report = json.loads(made.json.read_text())
     assert report["not_available"]["error"] == "no reference ephemeris covers this pass"
@@ -173,8 +161,22 @@ def test_without_a_reference_outcomes_and_ledger_are_still_told(
     assert "Outcomes of all frames" in text and "Reads of the anchor ephemeris" in text
 
 
+def test_settings_are_compared_with_those_of_the_pass_before(
+    imported: Imported, synthetic_pass: Any, tmp_path: Path
+) -> None:
+    ground, _, first = imported
+    assert first.comparison is None
+    folder = shutil.copytree(synthetic_pass.folder, tmp_path / "later")
+    start = format_utc(first.span.start_utc_ns + 1_000_000_000) if first.span else ""
+    changed = {"start_utc": start, "frames_expected": 41, "scenario_toml": "no scenario"}
+    _rewrite_manifest(folder, lambda manifest: manifest.update(changed))
+    changes = (("observation.frames_expected", FRAMES, 41), ("scenario", {}, "no scenario"))
+    later = evaluate(ground, import_archive(ground, folder))
+    assert later.comparison == SettingsComparison(first.title, changes)
+
+
 def test_a_pdf_is_made_on_request_and_reproducible(
-    imported: tuple[Ground, int, PassReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    imported: Imported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ground, pass_id, _ = imported
     monkeypatch.setattr(reports, "utc_now_ns", lambda: 0)
@@ -189,8 +191,7 @@ def test_a_pdf_is_made_on_request_and_reproducible(
 def test_a_lost_frame_shows_as_lost_packets(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
     from tmtc.downlink import encode_cadus
 
-    folder = tmp_path / "lossy"
-    shutil.copytree(synthetic_pass.folder, folder)
+    folder = shutil.copytree(synthetic_pass.folder, tmp_path / "lossy")
     stream = encode_cadus(synthetic_pass.packets, spacecraft_id=76)
     (folder / "downlink.cadu").write_bytes(stream[: 1279 * 10] + stream[1279 * 12 :])
     _rewrite_manifest(folder, lambda manifest: None)
@@ -223,8 +224,7 @@ def test_a_lost_frame_shows_as_lost_packets(synthetic_pass: Any, ground: Ground,
 def test_a_wrong_manifest_is_refused_and_nothing_is_stored(
     synthetic_pass: Any, ground: Ground, tmp_path: Path, change: Any, message: str
 ) -> None:
-    folder = tmp_path / "wrong"
-    shutil.copytree(synthetic_pass.folder, folder)
+    folder = shutil.copytree(synthetic_pass.folder, tmp_path / "wrong")
     _rewrite_manifest(folder, change)
     with pytest.raises(InvalidInput, match=message):
         import_archive(ground, folder)

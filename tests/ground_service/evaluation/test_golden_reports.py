@@ -38,6 +38,7 @@ from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
 
+Maker = Callable[..., Any]
 FRAMES = 12
 PACKETS_PER_FRAME = 6  # detections, two states, two outcomes, housekeeping
 DETECTIONS, STATES, OUTCOMES, HOUSEKEEPING = 0x0A1, 0x0A2, 0x0A3, 0x0A0
@@ -93,7 +94,7 @@ def evaluated(ground: Ground, folder: Path) -> PassReport:
     return evaluate(ground, import_archive(ground, folder))
 
 
-def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_a_whole_pass(make_pass: Maker, ground: Ground) -> None:
     """130 m in 3-D put in, the reference good to 5 m: 129.9 m are the estimate's. Two thirds of four craters found."""
     made = make_pass(frames=FRAMES, seed=41, mission=MISSION)
     report = evaluated(ground, made.folder)
@@ -146,7 +147,7 @@ def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
     ],
 )
 def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
-    make_pass: Callable[..., Any], ground: Ground, seen_frames: int, level: str
+    make_pass: Maker, ground: Ground, seen_frames: int, level: str
 ) -> None:
     """The pass flies to the north: the ground of training ends between two southern edges of its footprints."""
     times = START + np.arange(-1, FRAMES + 1) * CADENCE_S * NS
@@ -160,7 +161,7 @@ def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
     assert report.evidence_level.endswith("unseen terrain)") is (seen_frames == 8)
 
 
-def test_half_a_downlink(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_half_a_downlink(make_pass: Maker, ground: Ground) -> None:
     """Six of twelve frames were received: no count has a gap, but half of the image packets are missing."""
     made = make_pass(
         frames=FRAMES,
@@ -180,7 +181,7 @@ def test_half_a_downlink(make_pass: Callable[..., Any], ground: Ground) -> None:
     assert summary_of(report)["packets_lost"] == 30
 
 
-def test_a_gap_is_not_counted_twice(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_a_gap_is_not_counted_twice(make_pass: Maker, ground: Ground) -> None:
     """Frames 4 and 5 are lost in between, frames 10 and 11 at the end: 12 packets in gaps, 2 x 5 at the edge."""
     n = PACKETS_PER_FRAME
 
@@ -193,9 +194,7 @@ def test_a_gap_is_not_counted_twice(make_pass: Callable[..., Any], ground: Groun
     assert rows(report)["completeness.frames"].value == pytest.approx(100.0 * 8 / 12)
 
 
-def test_frames_that_were_never_made_are_no_lost_packets(
-    make_pass: Callable[..., Any], ground: Ground
-) -> None:
+def test_frames_that_were_never_made_are_no_lost_packets(make_pass: Maker, ground: Ground) -> None:
     """Twelve frames were planned; the payload counted from 0 to 6, and all of its packets came."""
 
     def six(packets: list[bytes]) -> bytes:
@@ -221,7 +220,7 @@ def test_frames_that_were_never_made_are_no_lost_packets(
     assert rows(report)["completeness.frames"].value == 50.0
 
 
-def test_packets_that_came_twice(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_packets_that_came_twice(make_pass: Maker, ground: Ground) -> None:
     def again(packets: list[bytes]) -> bytes:
         return encode_downlink([*packets, *packets[: 2 * PACKETS_PER_FRAME]])
 
@@ -233,7 +232,7 @@ def test_packets_that_came_twice(make_pass: Callable[..., Any], ground: Ground) 
     assert rows(report)["completeness.packets"].status == "met"
 
 
-def test_of_two_reports_on_one_image_one_counts(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_of_two_reports_on_one_image_one_counts(make_pass: Maker, ground: Ground) -> None:
     """Image 3 comes down again with another detection and another state of each estimator."""
     ticks = int(ticks_from_utc_ns(START + 3 * CADENCE_S * NS))
     image = {"frame_number": 3, "image_ticks": ticks}
@@ -263,7 +262,7 @@ def test_of_two_reports_on_one_image_one_counts(make_pass: Callable[..., Any], g
 
 
 def test_a_damaged_file_of_another_pass_changes_nothing(
-    make_pass: Callable[..., Any], ground: Ground, tmp_path: Path
+    make_pass: Maker, ground: Ground, tmp_path: Path
 ) -> None:
     made = make_pass(frames=FRAMES, seed=45, mission=MISSION)
     key = import_archive(ground, made.folder)
@@ -284,7 +283,7 @@ def test_a_damaged_file_of_another_pass_changes_nothing(
 
 
 def test_two_spacecraft_in_one_file(
-    make_pass: Callable[..., Any], ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_pass: Maker, ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each spacecraft has its own duplicates and frames; only files that may hold something of the pass are read."""
     made = make_pass(frames=FRAMES, seed=46)
@@ -316,7 +315,7 @@ def later_events(start_utc_ns: int, count: int, spacecraft_id: int = SPACECRAFT)
     return encode_cadus(packets, spacecraft_id=spacecraft_id)
 
 
-def test_no_reference(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_no_reference(make_pass: Maker, ground: Ground) -> None:
     made = make_pass(frames=FRAMES, seed=47, mission=MISSION)
     (made.folder / "reference.oem").unlink()
     manifest = json.loads((made.folder / "manifest.json").read_text())
@@ -330,7 +329,7 @@ def test_no_reference(make_pass: Callable[..., Any], ground: Ground) -> None:
     assert "not met" in judged.values() and "median 3-D error" in report.verdict.partition("unknown")[2]
 
 
-def test_the_wrong_orientation_is_refused(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_the_wrong_orientation_is_refused(make_pass: Maker, ground: Ground) -> None:
     """Values that need the orientation of the Moon are unknown if the declared one is not available."""
     mission = MISSION.replace("IAU WGCCRE 2009", "DE421")
     report = evaluated(ground, make_pass(frames=FRAMES, seed=48, mission=mission).folder)
@@ -346,7 +345,7 @@ TILT_DEG = 10.0
 """Corners of the image then look up to 78 degrees from nadir; the horizon lies at 79."""
 
 
-def test_a_tilted_camera_with_a_lens(make_pass: Callable[..., Any], ground: Ground) -> None:
+def test_a_tilted_camera_with_a_lens(make_pass: Maker, ground: Ground) -> None:
     """The declared camera finds all detections; a nadir pinhole camera would find almost none."""
     tilted = MISSION.replace("k1 = 0.0", f"k1 = -0.02\np1 = 5e-4\ntilt_deg = {TILT_DEG}\nyaw_deg = 0.0")
 
@@ -369,7 +368,7 @@ def test_a_tilted_camera_with_a_lens(make_pass: Callable[..., Any], ground: Grou
 
 @pytest.mark.parametrize(("nis", "mean", "status"), [(10.0, 1.0, "met"), (100.0, 10.0, "not met")])
 def test_an_overconfident_filter(
-    make_pass: Callable[..., Any], ground: Ground, nis: float, mean: float, status: str
+    make_pass: Maker, ground: Ground, nis: float, mean: float, status: str
 ) -> None:
     """Five craters give ten degrees of freedom."""
     mission = MISSION.replace('"spherical"', '"anchored"').replace(

@@ -16,25 +16,14 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ground_service.evaluation.core import (
-    PassInputs,
-    _imaging_arcs,
-    _joined,
-    evaluate_pass,
-    summary_of,
-)
+from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, evaluate_pass, summary_of
 from ground_service.evaluation.detection.fixes import IdentificationSamples
 from ground_service.evaluation.detection.landmarks import MappedCraters
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates
 from ground_service.evaluation.verdict import Limits
-from ground_service.passes.samples import (
-    DetectionSamples,
-    NavigationSamples,
-    OutcomeSamples,
-    no_detections,
-)
+from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -579,12 +568,12 @@ def test_the_galleries_show_the_images_and_the_worst_frames(report: PassReport) 
         (105, "2 of 3 craters of 5–30 km detected"),
     ]
     assert [(one.frame_number, one.caption) for one in report.worst_frames] == [
-        (103, "0 of 3 craters of 5–30 km detected"),
-        (105, "2 of 3 craters of 5–30 km detected"),
+        (105, "2 of 3 craters of 5–30 km detected")
     ]
-    lost, partly = report.worst_frames
-    assert lost.image.shape == (512, 512) and set(lost.image.ravel().tolist()) == {72}
-    assert lost.image.dtype == np.uint8 and known(lost.detection_matched).tolist() == [False]
+    assert report.not_available["worst_frames"] == (
+        "1 of the 2 frames with the lowest recall came down without their images: 103"
+    )
+    (partly,) = report.worst_frames
     assert partly.image is IMAGES[105] and partly.utc_ns == TIMES[5]
     assert known(partly.detection_matched).tolist() == [True, True]
     assert known(partly.catalogue_matched).tolist() == [True, True, False]

@@ -26,6 +26,7 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter import CommonErrors
 from tests.payload_emulator.flight.test_dynamics import start_state
 
+Arrays = tuple[np.ndarray, np.ndarray]
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 STEP_S, STATES = 60.0, 30
 SIGMA_M = 100.0
@@ -35,7 +36,7 @@ QUIET = SmootherModel(FORCES, (1e-18, 1e-18, 1e-18), (1e-15, 1e-15, 1e-15), 900.
 TIMES = EPOCH + np.arange(STATES) * round(STEP_S) * 10**9
 
 
-def carried(state: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+def carried(state: np.ndarray, k: int) -> Arrays:
     """Return state (6,) and transition (6, 6) from sample k to the next."""
     position, velocity, transition = propagate_with_stm(
         float(tdb_s_from_utc_ns(int(TIMES[k]))), state[:3], state[3:], STEP_S, FORCES
@@ -77,7 +78,7 @@ class Session:
         self.filtered = FilterStates(TIMES, np.array(states), np.array(covariances), ICRF)
 
 
-def batch(session: Session) -> tuple[np.ndarray, np.ndarray]:
+def batch(session: Session) -> Arrays:
     """Return the first state and its covariance by one least squares over all measurements and the prior."""
     state = session.prior_mean.copy()
     for _ in range(4):
@@ -169,7 +170,7 @@ WHITE, MARKOV, MEMORY_S = (6e-4, 3e-4, 2e-4), (2e-3, 3e-3, 4e-3), 80.0
 PUSHED = SmootherModel(NOTHING, WHITE, MARKOV, MEMORY_S)
 
 
-def step_matrices(seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def step_matrices(seconds: float) -> Arrays:
     """Transition and noise of constant velocity under white acceleration and under one that decays."""
     one, q, decay = np.eye(3), np.diag(WHITE), np.exp(-seconds / MEMORY_S)
     nothing = np.zeros((3, 3))
@@ -206,7 +207,7 @@ def rauch_tung_striebel(
     legs: list[list[float]],
     kicks: list[list[float]] | None = None,
     sigma_m_s: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Arrays:
     """Return smoothed states and covariances by equations 3.28 to 3.30, with plain inverses.
 
     `kicks` are the changes of the y velocity at the end of each leg.
@@ -228,7 +229,7 @@ def rauch_tung_striebel(
     return state, covariance
 
 
-def assert_same(found: FilterStates, expected: tuple[np.ndarray, np.ndarray], start: FilterStates) -> None:
+def assert_same(found: FilterStates, expected: Arrays, start: FilterStates) -> None:
     state, covariance = expected
     scale = np.sqrt(np.einsum("nii->ni", start.covariance))
     # Positions of 1e9 m have seven digits behind the point; the axes are turned by 1e-7.

@@ -15,8 +15,8 @@ from sqlalchemy import select, update
 from ground_service import events
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
-from ground_service.evaluation.model import ChangedFigure
-from ground_service.evaluation.service import changed_figures, make_report
+from ground_service.evaluation.model import ChangedFigure, changed_figures
+from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import list_reports
 from ground_service.events import (
     CommandsSent,
