@@ -165,7 +165,7 @@ function spacecraftOf(craft, data, newest) {
       "div",
       { class: "columns shift" },
       element("div", {}, part("Windows of the next day", ...windowsOf(craft, data))),
-      element("div", {}, part("Open alarms", alarmsOf(craft, data)), part("Last verdicts", verdictsOf(craft, data)), part("Handover", ...handoverOf(craft, data))),
+      element("div", {}, part("Open alarms", alarmsOf(craft, data)), part("Last verdicts", verdictsOf(craft, data), element("a", { href: "/passes#monthly" }, "Monthly reports")), part("Handover", ...handoverOf(craft, data))),
     ),
   );
 }
