@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from studies.harness.parts import (
@@ -16,15 +15,6 @@ from studies.harness.parts import (
     free_port,
     listens,
 )
-
-
-def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        if ready():
-            return
-        time.sleep(0.05)
-    raise SystemExit(f"{what}: not ready within {seconds:.0f} s")
 
 
 def service_environment(**settings: str) -> dict[str, str]:
