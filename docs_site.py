@@ -209,23 +209,14 @@ def save_executed_notebooks(out: Path) -> None:
 def cli_page() -> str:
     """Return every command with its arguments and options."""
     from linna.cli import GROUPS
-    from linna.completion import command_parser
     from linna.help import example
-    from linna.parser import all_commands
+    from linna.parser import all_commands, command_parser
 
     lines = [
         "# Commands",
         "",
         "Generated from the program. `--json` prints one JSON object on stdout; progress and logs go to stderr. "
         "Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or input, 3 inconclusive.",
-        "",
-        "A shell completes commands, options and names of shipped scenarios after this line in its start file:",
-        "",
-        "| shell | file | line |",
-        "|---|---|---|",
-        '| bash | `~/.bashrc` | `eval "$(linna completion bash)"` |',
-        '| zsh, after `compinit` | `~/.zshrc` | `eval "$(linna completion zsh)"` |',
-        "| fish | `~/.config/fish/config.fish` | <code>linna completion fish &#124; source</code> |",
     ]
     for group in GROUPS:
         importlib.import_module(f"linna.commands.{GROUPS[group][0]}")

@@ -10,7 +10,7 @@ import sys
 from benchmarks._rows import measure, report
 
 NAMES = (
-    "tmtc", "xtce", "downlink", "ground", "orbit", "render", "pages",
+    "tmtc", "downlink", "ground", "orbit", "render", "pages",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""
 

@@ -6,7 +6,6 @@ speed: milliseconds of processor time of a 512 x 512 frame with shadows, by stag
 nine; for comparison the ray march over the same frame, and Blender's Cycles at 16 samples where
 LINNA_BLENDER_PYTHON names an interpreter that has it.
 fast_vs_raymarch: random poses of 14 to 50 km, Sun of 3 to 60 degrees, any azimuth and yaw, tilt to 5 degrees.
-labels_vs_cast_rims: labels against rims found by casting rays onto the same terrain, pixels.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks._rows import Row
-from benchmarks.rims import rim_errors
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import find_data
 from lunar.errors import LunarError
@@ -48,7 +46,6 @@ SHADOW = 0.5
 """Ground that sees less of the Sun's disc is in shadow."""
 
 FULLY_LIT = 0.95
-SIZES_M = ((5e3, 10e3), (10e3, 15e3), (15e3, 30e3), (5e3, 30e3))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,10 +127,9 @@ def _speed_at(
 
 
 def agreement(terrain: Terrain, region: Region, poses: int, every: int) -> dict[str, object]:
-    """Fast against the ray march, and labels against cast rims, over the same random poses."""
+    """Fast against the ray march over the same random poses."""
     rng = np.random.default_rng(20)
     fast, marched = [], []
-    offsets: list[np.ndarray] = []
     tried = 0
     while len(fast) < poses and tried < 4 * poses:
         tried += 1
@@ -159,19 +155,6 @@ def agreement(terrain: Terrain, region: Region, poses: int, every: int) -> dict[
             continue
         fast.append(thinned(picture, every))
         marched.append(oracle)
-        if len(fast) % 2:
-            errors = rim_errors(terrain, CAMERA, position, rotation)
-            offsets.append(
-                np.stack(
-                    [
-                        terrain.catalogue.diameter_m[errors.index],
-                        errors.offset_u_px,
-                        errors.offset_v_px,
-                        errors.scatter_px,
-                    ]
-                )
-            )
-    found = np.concatenate(offsets, axis=1)
     return {
         "fast_vs_raymarch": {
             **{
@@ -192,9 +175,6 @@ def agreement(terrain: Terrain, region: Region, poses: int, every: int) -> dict[
                 ),
                 2,
             ),
-        },
-        "labels_vs_cast_rims": {
-            f"{low / 1e3:g}-{high / 1e3:g} km": _rims(found, low, high) for low, high in SIZES_M
         },
     }
 
@@ -235,20 +215,6 @@ def _correlation(one: NDArray[np.float32], two: NDArray[np.float32]) -> float:
     if one.size < 2 or one.std() == 0.0 or two.std() == 0.0:
         return math.nan
     return float(np.corrcoef(one, two)[0, 1])
-
-
-def _rims(found: np.ndarray, low_m: float, high_m: float) -> dict[str, float]:
-    chosen = found[:, (found[0] >= low_m) & (found[0] < high_m)]
-    if not chosen.shape[1]:
-        return {"craters": 0}
-    offset = np.hypot(chosen[1], chosen[2])
-    return {
-        "craters": int(offset.size),
-        "rms_px_per_axis": round(float(np.sqrt(np.mean(offset**2) / 2.0)), 4),
-        "median_px": round(float(np.median(offset)), 4),
-        "p95_px": round(float(np.percentile(offset, 95)), 4),
-        "scatter_along_rim_px": round(float(np.median(chosen[3])), 3),
-    }
 
 
 def _least_ms(work: Callable[[], Any]) -> float:

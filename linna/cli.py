@@ -76,7 +76,6 @@ TASKS: dict[str, dict[str, tuple[str, str]]] = {
         "audit": ("audit", "list the audit log, and show the head of its hash chain"),
         "user": ("user", "manage the users of the ground service and their tokens"),
         "doctor": ("doctor", "check a deployment: processes, clocks, broker, files, provider"),
-        "completion": ("completion", "complete commands, options and scenario names in a shell"),
     },
 }
 GROUPS = {name: group for groups in TASKS.values() for name, group in groups.items()}
@@ -94,10 +93,6 @@ def run(arguments: Sequence[str]) -> int:
 def _run(arguments: Sequence[str]) -> int:
     for name, value in _THREAD_POLICY.items():
         os.environ.setdefault(name, value)
-    if "_ARGCOMPLETE" in os.environ:
-        from linna.completion import complete
-
-        complete(GROUPS)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0 if arguments else 2

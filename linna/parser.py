@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from linna.help import example
@@ -147,3 +148,14 @@ def all_commands(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.Ar
             for one in action.choices.values():
                 found += [(one.prog, one), *all_commands(one)]
     return found
+
+
+def command_parser(groups: Mapping[str, tuple[str, str]], group: str) -> argparse.ArgumentParser:
+    """Return a parser of all groups, with the commands and options of one of them."""
+    top = LinnaParser(prog="linna")
+    commands = top.add_subparsers()
+    for name, (module_name, help_line) in groups.items():
+        parser = commands.add_parser(name, help=help_line)
+        if name == group:
+            importlib.import_module(f"linna.commands.{module_name}").configure(parser)
+    return top

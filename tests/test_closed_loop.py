@@ -133,18 +133,6 @@ def test_the_manifest_hashes_what_lies_in_the_archive(demo) -> None:
         assert (len(octets), hashlib.sha256(octets).hexdigest()) == (entry["bytes"], entry["sha256"])
 
 
-def test_importing_the_archive_again_changes_nothing(demo) -> None:
-    from ground_service.evaluation.service import pass_summary
-    from ground_service.ground import open_ground
-    from ground_service.passes.archive_import import import_archive
-
-    figures, out = demo
-    with open_ground(out / "ground") as ground:
-        before = pass_summary(ground, int(figures["pass_id"]))
-        assert import_archive(ground, out / "pass") == figures["pass_id"]
-        assert pass_summary(ground, int(figures["pass_id"])) == before
-
-
 def test_the_same_scenario_gives_the_same_octets(demo, scenario_file: Path, tmp_path: Path) -> None:
     _, out = demo
     assert cli.run(["emulate", str(scenario_file), "--out", str(tmp_path / "again"), "--json"]) == 0

@@ -14,8 +14,7 @@ from PIL import Image
 import docs_site
 from ground_service.web import documentation, pages
 from linna.cli import GROUPS
-from linna.completion import command_parser
-from linna.parser import all_commands
+from linna.parser import all_commands, command_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -207,20 +207,18 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
     remarks += attitude_remarks(inputs.events)
     accounting = _frame_accounting(inputs)
-    table = requirements(
-        inputs.limits,
-        Evaluated(
-            navigation,
-            detector,
-            accounting,
-            inputs.packets,
-            inputs.housekeeping,
-            inputs.cpu_percent,
-            inputs.experiment,
-            _reference_px(inputs, reference),
-            inputs.clock_step_s,
-        ),
+    evaluated = Evaluated(
+        navigation,
+        detector,
+        accounting,
+        inputs.packets,
+        inputs.housekeeping,
+        inputs.cpu_percent,
+        inputs.experiment,
+        _reference_px(inputs, reference),
+        inputs.clock_step_s,
     )
+    table = requirements(inputs.limits, evaluated)
     if inputs.no_mission:
         table = without_mission(table, inputs.no_mission)
     verdict, level = verdict_of(table)

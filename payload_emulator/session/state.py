@@ -19,7 +19,7 @@ import re
 from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator, Mapping
 from enum import Enum
-from itertools import accumulate
+from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType, MethodType
 from typing import Any
@@ -81,7 +81,7 @@ def unpack_state(octets: bytes, scenario: str, known: Mapping[str, object]) -> d
     try:
         end = octets.index(b"\n", header.end())
         name, root, lengths = json.loads(octets[header.end() : end])
-        found = dict(_Reader(known, memoryview(octets)[end + 1 :], lengths).value(root))
+        found = dict(_Reader(known, octets[end + 1 :], lengths).value(root))
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError) as error:
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise RecordError(f"expected {_EXPECTED}, found damage ({reason})") from None
@@ -189,11 +189,11 @@ class _Writer:
 class _Reader:
     """JSON to values, which are made without calls of their classes."""
 
-    def __init__(self, known: Mapping[str, object], octets: memoryview, lengths: list[int]) -> None:
+    def __init__(self, known: Mapping[str, object], octets: bytes, lengths: list[int]) -> None:
         self._known = known
         self._made: list[Any] = []
-        ends = list(accumulate(lengths))
-        self._octets = [octets[end - length : end] for end, length in zip(ends, lengths, strict=True)]
+        stream = BytesIO(octets)
+        self._octets = [stream.read(length) for length in lengths]
 
     def value(self, node: Any) -> Any:
         if type(node) in _PLAIN:

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -11,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from linna import cli
-from linna.completion import command_parser
-from linna.parser import ABOVE_ZERO, REQUIRED, all_commands, number
+from linna.parser import ABOVE_ZERO, REQUIRED, all_commands, command_parser, number
 from payload_emulator.errors import install_hint
 from payload_emulator.session.recipe import load_recipe, procedural_recipe
 from payload_emulator.session.scenario import load_scenario
@@ -136,26 +134,6 @@ def test_a_mission_description_is_checked_by_a_dry_run(
     assert cli.run(["mission", "check", str(path), "--flight", "--json"]) == 2
     [fault] = json.loads(capsys.readouterr().out)["faults"]
     assert fault.endswith("reference.oem: expected a file beside the mission description, found none")
-
-
-def completions(line: str, tmp_path: Path) -> set[str]:
-    found = tmp_path / "completions"
-    environment = os.environ | {
-        "_ARGCOMPLETE": "1",
-        "_ARGCOMPLETE_IFS": "\n",
-        "_ARGCOMPLETE_STDOUT_FILENAME": str(found),
-        "COMP_LINE": line,
-        "COMP_POINT": str(len(line)),
-    }
-    subprocess.run([sys.executable, "-m", "linna"], env=environment, check=False)
-    return {word.strip() for word in found.read_text().split("\n")}
-
-
-def test_a_shell_completes_commands_options_and_scenarios(tmp_path: Path) -> None:
-    assert {"plan", "pass", "paper"} <= completions("linna p", tmp_path)
-    assert "--craters" in completions("linna emulate --c", tmp_path)
-    assert {"paper-day", "paper-dataset"} <= completions("linna emulate paper", tmp_path)
-    assert "paper-dataset" in completions("linna dataset build paper", tmp_path)
 
 
 def test_a_number_outside_its_limits_is_refused() -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from linna.cli import GROUPS
-from linna.completion import command_parser
+from linna.parser import command_parser
 
 RELIED_ON = """
 demo --out D

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.rims import rim_errors
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -15,6 +14,7 @@ from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim.render.labels import label_frame, project_craters
 from payload_emulator.sim.render.raymarch import cast
 from payload_emulator.sim.terrain.opening import open_terrain
+from tests.payload_emulator.sim.cast_rims import rim_errors
 
 CAMERA = PinholeCamera()
 
@@ -25,9 +25,8 @@ def errors_px(terrain, latitude_deg, longitude_deg, altitudes_m, camera=CAMERA):
         place = math.radians(latitude_deg), math.radians(longitude_deg)
         position = mcmf_from_spherical(*place, altitude_m)
         rotation = pointed_camera_from_mcmf(position, math.radians(2.0 * number), 0.7 * number)
-        errors = rim_errors(terrain, camera, position, rotation)
-        labelled = terrain.catalogue.diameter_m[errors.index] <= 30e3
-        offsets += [*errors.offset_u_px[labelled], *errors.offset_v_px[labelled]]
+        index, found = rim_errors(terrain, camera, position, rotation)
+        offsets += [*found[terrain.catalogue.diameter_m[index] <= 30e3].ravel()]
     return np.array(offsets)
 
 
@@ -49,9 +48,8 @@ def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
     slope = 300.0 / (7_000.0 / MOON_RADIUS_M)
     terrain = formula_terrain(lambda lat, lon: slope * (lat - latitude) + 0.0 * lon, catalogue)
     position = mcmf_from_spherical(0.2, 1.0, 25e3)
-    errors = rim_errors(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
-    assert errors.index.tolist() == [0]
-    assert math.hypot(errors.offset_u_px[0], errors.offset_v_px[0]) < 0.01
+    index, offsets = rim_errors(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
+    assert index.tolist() == [0] and math.hypot(*offsets[0]) < 0.01
     level = project_craters(
         terrain.measured(np.array([0])), CAMERA, position, nadir_camera_from_mcmf(position)
     )

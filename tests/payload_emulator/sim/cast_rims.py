@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,7 @@ from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.raymarch import cast
 from payload_emulator.sim.terrain.tiles import Terrain
 
-AZIMUTHS = 48
+AZIMUTH = np.arange(48) * (math.pi / 24.0)
 ROUNDS = 8
 FOUND_M = 10.0
 """A ray has found a rim point when it meets the ground this close to it: a tenth of a pixel at the least altitude."""
@@ -25,53 +24,33 @@ LEAST_FOUND = 0.9
 """Share of a rim that must be in sight: the mean over a part of it would say little of the centre."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class RimErrors:
-    """Of the craters of one picture, arrays (n): those whole in the picture with their rims in sight.
-
-    Attributes
-    ----------
-    index
-        Row in the terrain's catalogue.
-    offset_u_px, offset_v_px
-        Middle of the rim that rays find, less the label's place.
-    scatter_px
-        Rms of the rim's single points about the label's ellipse, its middle set right: rims are uneven.
-    """
-
-    index: IntArray
-    offset_u_px: FloatArray
-    offset_v_px: FloatArray
-    scatter_px: FloatArray
-
-
 def rim_errors(
     terrain: Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
-    minimum_diameter_m: float = 5_000.0,
-) -> RimErrors:
+) -> tuple[IntArray, FloatArray]:
     """Labels of a picture against rims found by casting rays onto the terrain.
+
+    Of the craters that are whole in the picture with their rims in sight: the rows (n,) in the terrain's catalogue, and
+    the middle (n, 2) of the rim that rays find less the label's place, pixels.
 
     The rim at an azimuth is the ground that lies a radius from the centre there, whatever its height.  A ray is turned
     until it meets just that ground; where nearer ground is in the way it never does.
     """
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
-    labels = label_frame(terrain, camera, position, rotation, minimum_diameter_m)
+    labels = label_frame(terrain, camera, position, rotation, 5_000.0)
     craters = terrain.measured(labels.index)
     chosen = np.flatnonzero(
         labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m)
     )
     index, craters = labels.index[chosen], craters.select(chosen)
     if not index.size:
-        empty = np.empty(0)
-        return RimErrors(index, empty, empty, empty)
+        return index, np.empty((0, 2))
     latitude, longitude = _circle(craters.latitude_rad, craters.longitude_rad, craters.diameter_m)
-    azimuth = _azimuths()
     level = np.broadcast_to(craters.rim_height_m[:, None], latitude.shape)
-    tilted = level + terrain.rim_tilts_m(index) @ np.stack([np.cos(azimuth), np.sin(azimuth)])
+    tilted = level + terrain.rim_tilts_m(index) @ np.stack([np.cos(AZIMUTH), np.sin(AZIMUTH)])
     centre = project_mcmf(camera, rotation, position, craters.position_mcmf_m)
     expected = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, tilted))
     circle = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, level))
@@ -88,12 +67,9 @@ def rim_errors(
     found = miss <= FOUND_M
     difference = np.where(found[..., None], uv - expected, 0.0)
     count = found.sum(axis=1)
-    good = count >= LEAST_FOUND * AZIMUTHS
+    good = count >= LEAST_FOUND * len(AZIMUTH)
     mean = difference[good].sum(axis=1) / count[good][:, None]
-    offset = middle[good] + mean - place[good]
-    about = np.where(found[good][..., None], difference[good] - mean[:, None], 0.0)
-    scatter = np.sqrt((about**2).sum(axis=(1, 2)) / count[good])
-    return RimErrors(index[good], offset[:, 0], offset[:, 1], scatter)
+    return index[good], middle[good] + mean - place[good]
 
 
 def _circle(
@@ -101,12 +77,7 @@ def _circle(
 ) -> tuple[FloatArray, FloatArray]:
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
-    azimuth = _azimuths()
     sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]
-    sine = sine0 * np.cos(radius) + cosine0 * np.sin(radius) * np.cos(azimuth)
-    east = np.sin(azimuth) * np.sin(radius) * cosine0
+    sine = sine0 * np.cos(radius) + cosine0 * np.sin(radius) * np.cos(AZIMUTH)
+    east = np.sin(AZIMUTH) * np.sin(radius) * cosine0
     return np.arcsin(sine), longitude[:, None] + np.arctan2(east, np.cos(radius) - sine0 * sine)
-
-
-def _azimuths() -> FloatArray:
-    return np.asarray(np.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS))
