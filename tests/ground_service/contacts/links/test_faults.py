@@ -28,7 +28,7 @@ from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.store import repository
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
-from tests.ground_service.conftest import START, circular_states
+from tests.ground_service.conftest import START, Clock, circular_states
 from tests.ground_service.contacts.links.conftest import Station, declare, operated
 from tests.ground_service.contacts.links.test_links import (
     CADU,
@@ -181,7 +181,7 @@ def test_a_segment_that_could_not_be_cut_is_kept(
 
 
 def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_contact(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
+    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch, mission_time: Clock
 ) -> None:
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
@@ -193,6 +193,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
     monkeypatch.setattr(service, "acquire", failing(service.acquire, {2}))
     with operated(ground) as runner:
         wait_for(lambda: runner.octets_received == len(stream), "the segment")
+        mission_time.advance(100.0)
         wait_for(lambda: contact_events(ground)[-1] == "contact ended", "the end of the contact")
         assert runner.alive
 

@@ -618,7 +618,7 @@ def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_i
 
 
 def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
-    either: Ground, stream: bytes
+    either: Ground, stream: bytes, mission_time: Clock
 ) -> None:
     """At a handover the link of the first station does not know yet that its contact has ended."""
     first, second = Confirming(*[0] * 1000), Confirming()
@@ -638,6 +638,7 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
                 keys = released(either, 2)
                 wait_for(lambda: first.transmissions, "the refused transmission")
                 # Also when its contact has ended, the station is asked.
+                mission_time.advance(100.0)
                 wait_for(
                     lambda: either.read(store.open_contact, "lab") is None, "the end of the first contact"
                 )
