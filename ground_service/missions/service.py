@@ -73,7 +73,7 @@ def check_mission(ground: Ground, octets: bytes, *, caller: Caller = LOCAL_CALLE
         return MissionCheck(faults=tuple(map(str, faults)), unknown=(), changes=())
     _require_own(mission, "mission.toml", caller)
     with ground.database.reading() as connection:
-        key = store.newest_of_spacecraft(connection, mission.spacecraft.id or -1)
+        key = store.newest_of_spacecraft(connection, mission.spacecraft.id)
         before = "" if key is None else store.detail(connection, key).text
     changes = difflib.unified_diff(before.splitlines(), text.splitlines(), lineterm="", n=1)
     return MissionCheck(faults=tuple(map(str, faults)), unknown=mission.unknown, changes=tuple(changes)[2:])

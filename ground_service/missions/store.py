@@ -168,8 +168,8 @@ def keys_in_force(connection: Connection, ccsds_id: int | None = None) -> dict[i
     return found
 
 
-def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:
-    """Return the id of the revision of a spacecraft that a person entered last; None without any.
+def newest_of_spacecraft(connection: Connection, ccsds_id: int | None) -> int | None:
+    """Return the id of the revision of a spacecraft (None: that states none) that a person entered last, or None.
 
     The description that comes with an archive holds for its own pass: another pass may have flown another world.
     """

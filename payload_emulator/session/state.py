@@ -75,14 +75,14 @@ def unpack_state(octets: bytes, scenario: str, known: Mapping[str, object]) -> d
         raise RecordError(f"expected {_EXPECTED}, found octets that begin with {octets[:24]!r}")
     if int(header[1]) != VERSION:
         raise RecordError(f"expected version {VERSION} of the state, found {int(header[1])}")
-    body = memoryview(octets)[header.end() :]
+    body = octets[header.end() :]
     if hashlib.sha256(body).hexdigest().encode() != header[2]:
         raise RecordError(f"expected {_EXPECTED} with the checksum of line 1, found damage")
     try:
-        end = octets.index(b"\n", header.end())
-        name, root, lengths = json.loads(octets[header.end() : end])
-        found = dict(_Reader(known, octets[end + 1 :], lengths).value(root))
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError) as error:
+        document, _, rest = body.partition(b"\n")
+        name, root, lengths = json.loads(document)
+        found = dict(_Reader(known, rest, lengths).value(root))
+    except (ValueError, TypeError, LookupError, AttributeError, ImportError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise RecordError(f"expected {_EXPECTED}, found damage ({reason})") from None
     if name != scenario:
@@ -192,8 +192,7 @@ class _Reader:
     def __init__(self, known: Mapping[str, object], octets: bytes, lengths: list[int]) -> None:
         self._known = known
         self._made: list[Any] = []
-        stream = BytesIO(octets)
-        self._octets = [stream.read(length) for length in lengths]
+        self._octets = list(map(BytesIO(octets).read, lengths))
 
     def value(self, node: Any) -> Any:
         if type(node) in _PLAIN:
