@@ -33,6 +33,7 @@ from tmtc.frames import frame_checksums_hold
 from tmtc.link import LinkSettings
 from tmtc.packets import PacketSequencer, pack_packet
 from tmtc.randomiser import randomise
+from tmtc.stream import PacketForm
 
 SPACECRAFT, OTHER_SPACECRAFT = 76, 33
 FRAMES = 2000
@@ -328,7 +329,7 @@ def checked(stream: Stream) -> Found:
     found = false = accounted = 0
     for spacecraft, packets in stream.packets.items():
         try:
-            decoded = decode(octets, spacecraft_id=spacecraft, error_control=stream.error_control)
+            decoded = decode(octets, spacecraft_id=spacecraft, form=PacketForm(stream.error_control))
         except TmtcError:
             return Found(0, 0, 0)
         mine = set(decoded.cut.packets(decoded.buffer))

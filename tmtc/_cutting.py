@@ -23,7 +23,12 @@ import numpy as np
 from kernels.compiled import njit
 from tmtc.arrays import RecordArray
 
-GOOD = 0
+GOOD, BAD, SKIPPED, IDLE = 0, 1, 2, 3
+"""Kinds of rows."""
+
+NO_CHECKSUM, UNKNOWN = 1, 2
+"""Marks of APIDs whose packets do not end with a checksum, or of which that is unknown."""
+
 POLYNOMIAL = 0x1021
 _PUS_TM_LENGTH = 22
 _PUS_TC_LENGTH = 13
@@ -226,34 +231,40 @@ def walk_unchecked(
     p: int,
     stop: int,
     packet_type: int,
+    prefix: int,
     last: RecordArray,
+    unchecked: RecordArray,
+    tables: RecordArray,
     rows: RecordArray,
     count: int,
 ) -> tuple[int, int]:
-    """Like `walk` for packets without error control: goes on as long as headers follow each other.
+    """Like `walk` for packets that are found by their headers: goes on as long as these follow each other.
 
-    Idle packets are rows of their own kind; `last` (2048,) keeps the sequence count of each APID.
+    Packets of an APID in `unchecked` (2048,) do not end with a checksum; those of others are rows of their own kind if
+    it is wrong, as idle packets are. `last` (2048,) keeps the sequence count of each APID.
     """
     while p < stop and count < rows.shape[0]:
         length = header_at(buffer, p, stop, packet_type)
         if length == 0 or length > stop - p:
             break
-        idle = is_idle(buffer, p)
-        if not idle:
+        kind = IDLE
+        if not is_idle(buffer, p):
             apid = (np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])
             last[apid] = (np.int64(buffer[p + 2]) & 0x3F) << 8 | np.int64(buffer[p + 3])
-        rows[count, 0] = 3 if idle else GOOD
+            kind = GOOD if unchecked[apid] or _crc(buffer, p, p + length, tables) == 0 else BAD
+        rows[count, 0] = kind
         rows[count, 1] = p
-        p += length
-        rows[count, 2] = p
+        rows[count, 2] = p + length
+        p += length + prefix
         count += 1
     return p, count
 
 
 @njit(nogil=True)
 def proves(
-    buffer: RecordArray, q: int, stop: int, packet_type: int, last: RecordArray, is_begin: bool
-) -> bool:
+    buffer: RecordArray, q: int, stop: int, packet_type: int, prefix: int, last: RecordArray,
+    is_begin: bool,
+) -> bool:  # fmt: skip
     """Whether packets without error control begin at `q`.
 
     Headers must follow each other until one continues the sequence counts of its APID: those before the damage, or
@@ -264,7 +275,7 @@ def proves(
     counts = np.empty(CHAIN, dtype=np.int64)
     p = q
     for k in range(CHAIN):
-        if p == stop:
+        if p >= stop:
             return is_begin and k > 0
         length = header_at(buffer, p, stop, packet_type)
         if length == 0 or length > stop - p:
@@ -278,22 +289,32 @@ def proves(
             for j in range(k):
                 if apids[j] == apids[k] and (counts[k] - counts[j]) % 16384 == 1:
                     return True
-        p += length
+        p += length + prefix
     return is_begin
 
 
 @njit(nogil=True)
-def search_unchecked(buffer: RecordArray, first: int, stop: int, packet_type: int, last: RecordArray) -> int:
-    """First position in [first, stop) at which packets without error control begin, or `stop`."""
+def search_unchecked(
+    buffer: RecordArray, first: int, stop: int, packet_type: int, prefix: int, last: RecordArray,
+    unchecked: RecordArray, tables: RecordArray,
+) -> int:  # fmt: skip
+    """First position in [first, stop) at which packets begin that are found by their headers, or `stop`."""
     for q in range(first, stop):
-        if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, last, False):
-            return q
+        if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, prefix, last, False):
+            end = q + header_at(buffer, q, stop, packet_type)
+            if _is_unchecked(buffer, q, unchecked) or is_idle(buffer, q) or _crc(buffer, q, end, tables) == 0:
+                return q
     return stop
 
 
 @njit(nogil=True)
 def _is_unchecked(buffer: RecordArray, p: int, unchecked: RecordArray) -> bool:
-    return unchecked[(np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])]
+    return unchecked[(np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])] == NO_CHECKSUM
+
+
+@njit(nogil=True)
+def _is_unknown(buffer: RecordArray, p: int, unchecked: RecordArray) -> bool:
+    return unchecked[(np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])] == UNKNOWN
 
 
 @njit(nogil=True)
@@ -315,19 +336,28 @@ def follows(
     tables: RecordArray,
     open_end: bool,
 ) -> bool:
-    """Return whether a packet can end at `e`; `open_end`: more octets will follow `stop`."""
-    if e == stop:
-        return not open_end
-    if stop - e < 7:
-        return not open_end and (buffer[e] >> 4) == packet_type
-    claimed = header_at(buffer, e, stop, packet_type)
-    if claimed == 0:
-        return False
-    if is_idle(buffer, e) or _is_unchecked(buffer, e, unchecked):
-        return True
-    if claimed > stop - e:
-        return True
-    return length_at(buffer, e, stop, packet_type) > 0 and _crc(buffer, e, e + claimed, tables) == 0
+    """Return whether a packet can end at `e`; `open_end`: more octets will follow `stop`.
+
+    Packets of which it is unknown whether they have a checksum must lead to one that can be judged.
+    """
+    for _ in range(CHAIN):
+        if e == stop:
+            return not open_end
+        if stop - e < 7:
+            return not open_end and (buffer[e] >> 4) == packet_type
+        claimed = header_at(buffer, e, stop, packet_type)
+        if claimed == 0:
+            return False
+        if is_idle(buffer, e) or _is_unchecked(buffer, e, unchecked):
+            return True
+        if claimed > stop - e:
+            return not open_end
+        if claimed > 8 and _crc(buffer, e, e + claimed, tables) == 0:
+            return True
+        if not _is_unknown(buffer, e, unchecked):
+            return False
+        e += claimed
+    return False
 
 
 @njit(nogil=True)
@@ -339,7 +369,8 @@ def walk(
     start, stop.
 
     Stops at the end, at the first position where no right packet stands (an idle one included), or with
-    full rows. A packet of an APID in `unchecked` (2048,) does not end with a checksum: what follows it decides.
+    full rows. `unchecked` (2048,): `NO_CHECKSUM` for APIDs whose packets do not end with one: what follows decides, as
+    it does for a packet without a right checksum of an `UNKNOWN` APID.
     """
     while p < stop and count < rows.shape[0]:
         length = unchecked_length(buffer, p, stop, packet_type, unchecked)
@@ -348,8 +379,14 @@ def walk(
                 break
         else:
             length = length_at(buffer, p, stop, packet_type)
-            if length == 0 or is_idle(buffer, p) or _crc(buffer, p, p + length, tables) != 0:
+            if length == 0 or is_idle(buffer, p):
                 break
+            if _crc(buffer, p, p + length, tables) != 0:
+                leads = _is_unknown(buffer, p, unchecked)
+                if not leads or not follows(
+                    buffer, p + length, stop, packet_type, unchecked, tables, open_end
+                ):
+                    break
         rows[count, 0] = GOOD
         rows[count, 1] = p
         p += length

@@ -39,7 +39,7 @@ from tmtc.pus import TM_HEADER_LENGTH
 from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary, Table
 from tmtc.sequence import SequenceReport, account
-from tmtc.stream import PacketCut, PrimaryHeaders, cut_packets, primary_headers
+from tmtc.stream import CHECKED, PacketCut, PacketForm, PrimaryHeaders, cut_packets, primary_headers
 
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
 _DEFAULT = LinkSettings()
@@ -195,7 +195,8 @@ class DownlinkDecode:
     `buffer` holds the packet octets that `cut` points into. `unknown` counts packets with a right checksum that the
     dictionary does not know or that are not as long as it says. `octets` says where the octets of the input went;
     its values sum to their number. `frames_bad` counts frames that were found but could not be used, truncated ones
-    included. `plan` holds the sections of a stream of frames; `settings` are those of the first section.
+    included. `plan` holds the sections of a stream of frames; `settings` are those of the first section. Each packet of
+    a stream without frames follows `prefix_octets`.
     """
 
     buffer: OctetArray
@@ -210,6 +211,7 @@ class DownlinkDecode:
     frames_bad: int
     frames_lost: int
     symbols_corrected: int
+    prefix_octets: int = 0
 
     @property
     def settings(self) -> LinkSettings | None:
@@ -282,6 +284,7 @@ class DownlinkDecode:
             "crc_errors": self.crc_errors,
             "unknown": self.unknown,
             "octets_skipped": self.octets_skipped,
+            "prefix_octets": self.prefix_octets,
             "frames": self.frame_count,
             "frames_bad": self.frames_bad,
             "frames_unchecked": self.frames_unchecked,
@@ -305,7 +308,7 @@ def decode(
     settings: LinkSettings | None = None,
     spacecraft_id: int | None = None,
     dictionary: Dictionary = DICTIONARY,
-    error_control: bool = True,
+    form: PacketForm = CHECKED,
     plan: LinkPlan | None = None,
 ) -> DownlinkDecode:
     """Everything that a downlink file holds: a stream of CADUs or of bare packets, told apart by their
@@ -317,8 +320,8 @@ def decode(
         Of the link; found out by trial when not given.
     spacecraft_id
         Frames of other spacecraft are not used; the commonest id by default.
-    error_control
-        False: packets do not end with a checksum; they are told by their headers and sequence counts.
+    form
+        Of the packets: whether they end with a checksum, and octets before each packet of a stream without frames.
     plan
         Sections of the stream, if they are already known.
 
@@ -331,22 +334,22 @@ def decode(
     if plan is None and settings is not None:
         plan = one_section(stream, settings)
     if plan is None:
-        plan = plan_of(stream, dictionary=dictionary, error_control=error_control)
+        plan = plan_of(stream, dictionary=dictionary, form=form)
     if not plan.sections:
-        return _bare_packets(stream, dictionary, error_control)
+        return _bare_packets(stream, dictionary, form)
     sections = []
     for section in plan.sections:
         part = stream[section.start : section.stop]
         verify = proof_of(part, section.settings)
         sync = cadu.synchronise(part, section.settings.cadu_length, verify=verify)
         sections.append(_read_section(part, sync, section))
-    return _frames_to_packets(stream, sections, plan, spacecraft_id, dictionary, error_control)
+    return _frames_to_packets(stream, sections, plan, spacecraft_id, dictionary, form.in_frames)
 
 
 def propose_settings(octets: Octets) -> LinkProposal:
     """Return the link settings that the whole stream supports, with the evidence."""
     stream = as_octets(octets)
-    counter = _packet_counter(stream, DICTIONARY, True)
+    counter = _packet_counter(stream, DICTIONARY, CHECKED)
     return propose_link(stream, counter, survey_markers(stream))
 
 
@@ -355,7 +358,7 @@ def plan_of(
     known: Sequence[LinkSettings] = (),
     *,
     dictionary: Dictionary = DICTIONARY,
-    error_control: bool = True,
+    form: PacketForm = CHECKED,
 ) -> LinkPlan:
     """Return the sections of a stream of CADUs and their link settings; no sections for bare packets.
 
@@ -367,10 +370,10 @@ def plan_of(
         The stream contains markers, but no frame is valid under any known link setting.
     """
     stream = as_octets(octets)
-    plan = plan_link(stream, _packet_counter(stream, dictionary, error_control), known)
+    plan = plan_link(stream, _packet_counter(stream, dictionary, form.in_frames), known)
     if plan.sections or not plan.has_regular_markers:
         return plan
-    cut = cut_packets(stream, error_control=error_control)
+    cut = cut_packets(stream, form=form)
     if 2 * int(cut.lengths[cut.crc_ok].sum()) <= stream.size:  # bare packets do not fill most of the stream
         proposal = plan.proposal
         distance = next(iter(proposal.distances), 0) if proposal else 0
@@ -378,21 +381,24 @@ def plan_of(
     return plan
 
 
-def _packet_counter(stream: OctetArray, dictionary: Dictionary, error_control: bool) -> CountPackets:
+def _packet_counter(stream: OctetArray, dictionary: Dictionary, form: PacketForm) -> CountPackets:
     def count_packets(sync: cadu.CaduSync, settings: LinkSettings) -> tuple[int, float]:
         section = _read_section(stream, sync, LinkSection(0, stream.size, settings))
         plan = one_section(stream, settings)
-        found = _frames_to_packets(stream, [section], plan, None, dictionary, error_control)
+        found = _frames_to_packets(stream, [section], plan, None, dictionary, form)
         filled = found.octets["packets"] + found.octets["idle_packets"] + found.octets["idle_frames"]
         return found.packets, filled / max(len(sync.start_bits) * settings.frame_length, 1)
 
     return count_packets
 
 
-def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: bool) -> DownlinkDecode:
-    cut = cut_packets(stream, error_control=error_control)
+def _bare_packets(stream: OctetArray, dictionary: Dictionary, form: PacketForm) -> DownlinkDecode:
+    cut = cut_packets(stream, form=form)
     headers = primary_headers(stream, cut)
     octets = _octet_account(stream.size, cut)
+    if form.prefix_octets:
+        octets["prefixes"] = octets["skipped"] - cut.octets_skipped
+        octets["skipped"] = cut.octets_skipped
     return DownlinkDecode(
         buffer=stream,
         cut=cut,
@@ -406,6 +412,7 @@ def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: boo
         frames_bad=0,
         frames_lost=0,
         symbols_corrected=0,
+        prefix_octets=form.prefix_octets,
     )
 
 
@@ -542,18 +549,18 @@ def _frames_to_packets(
     plan: LinkPlan,
     spacecraft_id: int | None,
     dictionary: Dictionary,
-    error_control: bool,
+    form: PacketForm,
 ) -> DownlinkDecode:
     if spacecraft_id is None:
         spacecraft_id = _commonest_spacecraft(sections)
     filling = _Filling()
     depth = max(one.found.corrected.shape[1] for one in sections)
     for section in sections:
-        filling.add(section, spacecraft_id, depth, error_control)
+        filling.add(section, spacecraft_id, depth, form.error_control)
     parts, segments = filling.parts, filling.segments
     buffer = np.concatenate(parts) if parts else np.empty(0, dtype=np.uint8)
     ranges = np.concatenate(segments) if segments else np.empty((0, 2), dtype=np.int64)
-    cut = cut_packets(buffer, segments=ranges, error_control=error_control)
+    cut = cut_packets(buffer, segments=ranges, form=form)
     headers = primary_headers(buffer, cut)
     table = filling.table()
     octets = _octet_account(int((ranges[:, 1] - ranges[:, 0]).sum()), cut)

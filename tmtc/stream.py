@@ -11,8 +11,8 @@ counts must continue. Damage inside such a packet cannot be detected.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,10 @@ from tmtc.errors import ValueRefused
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
 
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
+_NO_CHECKSUM, _UNKNOWN = 1, 2
+
+LONGEST_PREFIX = 64
+"""Largest number of octets before each packet that is found by trial."""
 
 LOOK_AHEAD = 3 * PACKET_MAX_LENGTH + PRIMARY_HEADER_LENGTH
 """Octets that one decision after damage can need: a window of search, a packet begun in it, its successor."""
@@ -35,7 +39,7 @@ class PacketCut:
 
     `offsets`, `lengths` (n,) and `crc_ok` (n,) hold the packets in the buffer's order, the damaged ones
     included; `idle` (m, 2) and `skipped` (k, 2) are ranges [start, stop) of idle packets and of octets that
-    belong to no packet. All of them together are [0, consumed) without overlap.
+    belong to no packet. All of them together, and the prefixes of packets, are [0, consumed) without overlap.
     """
 
     offsets: IntArray
@@ -82,14 +86,63 @@ class PrimaryHeaders:
     secondary_header: BoolArray
 
 
+@dataclass(frozen=True, slots=True)
+class PacketForm:
+    """How packets stand in a stream.
+
+    Attributes
+    ----------
+    error_control
+        False: no packet ends with a checksum, as in most captures of other missions; they are found by their headers.
+    unchecked
+        APIDs whose packets do not end with a checksum, among others that do. Such a packet is accepted if another one,
+        or the end of its segment, follows it.
+    unknown
+        APIDs of which it is not known whether their packets end with a checksum. One packet or several without a right
+        checksum must lead to a packet that is accepted.
+    prefix_octets
+        Octets, of a recorder for example, before each packet of a stream without frames. Packets are found by their
+        headers.
+    """
+
+    error_control: bool = True
+    unchecked: frozenset[int] = frozenset()
+    unknown: frozenset[int] = frozenset()
+    prefix_octets: int = 0
+
+    @property
+    def by_headers(self) -> bool:
+        """Whether packets are found by their headers, which needs the octets behind them."""
+        return not self.error_control or self.prefix_octets > 0
+
+    @property
+    def in_frames(self) -> PacketForm:
+        """The form of the same packets in frames, where they adjoin."""
+        return replace(self, prefix_octets=0)
+
+    def lacks_checksum(self, apid: int) -> bool:
+        """Return whether packets of an APID do not end with a checksum."""
+        return not self.error_control or apid in self.unchecked
+
+    def apids(self) -> OctetArray:
+        """Return the marks of all APIDs (2048,) of the compiled cutters."""
+        marks = np.zeros(1 << 11, dtype=np.uint8)
+        marks[list(self.unknown)] = _UNKNOWN
+        marks[list(self.unchecked) if self.error_control else slice(None)] = _NO_CHECKSUM
+        return marks
+
+
+CHECKED = PacketForm()
+UNCHECKED = PacketForm(error_control=False)
+
+
 def cut_packets(
     buffer: Octets,
     *,
     packet_type: int = TYPE_TELEMETRY,
     segments: IntArray | None = None,
     final: bool = True,
-    error_control: bool = True,
-    unchecked_apids: Collection[int] = (),
+    form: PacketForm = CHECKED,
     begins: bool = True,
 ) -> PacketCut:
     """Where packets stand in `buffer`.
@@ -102,27 +155,26 @@ def cut_packets(
         Ranges that are cut each for itself, for example between lost frames; the whole buffer by default.
     final
         False when more octets may follow: `consumed` then tells from where to go on.
-    error_control
-        False: packets do not end with a checksum, as in most captures of other missions. `crc_ok` then says that the
-        headers before and after fit. Supported for whole streams (`final`) only.
-    unchecked_apids
-        APIDs whose packets do not end with a checksum, in a stream of others that do. Such a packet is accepted if
-        another one, or the end of its segment, follows it.
+    form
+        If packets are found by their headers, `crc_ok` says of those without a checksum that the headers before and
+        after fit; supported for whole streams (`final`) only.
     begins
-        Whether a packet is expected at the beginning of each segment, for packets without error control.
+        Whether a packet is expected at the beginning of each segment, for packets that are found by their headers.
     """
-    if not error_control and not final:
-        raise ValueRefused("packet stream", "final", final, "true for packets without error control")
+    if form.by_headers and not final:
+        raise ValueRefused(
+            "packet stream", "final", final, "true for packets that are found by their headers"
+        )
     octets = as_octets(buffer).view()
     octets.flags.writeable = False  # one compiled variant for bytes and arrays alike
     if segments is None:
         segments = np.array([[0, octets.size]], dtype=np.int64)
     consumed = 0
-    cutter: _Cutter | _UncheckedCutter
-    if not error_control:
-        cutter = _UncheckedCutter(octets, packet_type, begins)
+    cutter: _Cutter | _HeaderCutter
+    if form.by_headers:
+        cutter = _HeaderCutter(octets, packet_type, form, begins)
     else:
-        cutter = _Cutter(octets, packet_type, unchecked_apids)
+        cutter = _Cutter(octets, packet_type, form)
     for start, stop in segments.tolist():
         consumed = cutter.cut(start, stop, final)
     rows = cutter.rows[: cutter.count]
@@ -136,6 +188,17 @@ def cut_packets(
         idle=rows[kind == _IDLE, 1:],
         consumed=octets.size if final else consumed,
     )
+
+
+def find_prefix(octets: OctetArray, form: PacketForm) -> int:
+    """Return the number of octets before each packet that packets of most of a stream (n,) have; 0 if there is none."""
+    sample = octets[: 4 * PACKET_MAX_LENGTH]
+    found = {0: 2}
+    for prefix in range(1, LONGEST_PREFIX + 1):
+        cut = cut_packets(sample, form=replace(form, prefix_octets=prefix))
+        good = cut.lengths[cut.crc_ok] + prefix
+        found[prefix] = good.size if 2 * int(good.sum()) > sample.size else 0
+    return max(found, key=lambda prefix: found[prefix])
 
 
 def whole_packets(lengths: IntArray) -> PacketCut:
@@ -161,7 +224,7 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
 class _Cutter:
     """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
 
-    def __init__(self, octets: OctetArray, packet_type: int, unchecked_apids: Collection[int]) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int, form: PacketForm) -> None:
         from tmtc import _cutting  # numba is imported only where it is used
 
         self.kernels: Any = _cutting
@@ -172,8 +235,7 @@ class _Cutter:
         self.count = 0
         self.prefix: npt.NDArray[np.uint16] | None = None
         self.known = np.full(2, -1, dtype=np.int64)
-        self.unchecked = np.zeros(1 << 11, dtype=np.bool_)
-        self.unchecked[list(unchecked_apids)] = True
+        self.unchecked = form.apids()
 
     def cut(self, p: int, stop: int, final: bool) -> int:
         """The position reached in [p, stop): `stop`, or earlier where octets to come could change what follows."""
@@ -280,29 +342,34 @@ class _Cutter:
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
 
 
-class _UncheckedCutter:
-    """One pass over packets without error control: walk over headers, search where they end."""
+class _HeaderCutter:
+    """One pass over packets that are found by their headers: walk over headers, search where they end."""
 
-    def __init__(self, octets: OctetArray, packet_type: int, begins: bool) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int, form: PacketForm, begins: bool) -> None:
         from tmtc import _cutting
 
         self.kernels: Any = _cutting
         self.begins = begins
         self.octets = octets
         self.packet_type = packet_type
+        self.prefix_octets = form.prefix_octets
+        self.checks = form.apids(), _cutting.crc_tables()
         self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
         self.count = 0
         self.last = np.full(1 << 11, -1, dtype=np.int64)
 
     def cut(self, start: int, stop: int, final: bool) -> int:
-        """Cut [start, stop), where a packet is expected at `start`."""
+        """Cut [start, stop), where a packet is expected behind a prefix at `start`."""
         kernels, key = self.kernels, (stop, self.packet_type)
-        p = start
-        if p < stop and not kernels.proves(self.octets, p, *key, self.last, self.begins):
-            p = self.skip(p, *key)
+        place = (*key, self.prefix_octets, self.last)
+        p = start + self.prefix_octets
+        if start < stop and not kernels.proves(self.octets, p, *place, self.begins):
+            p = self.skip(start, *key)
         while p < stop:
             before = self.count
-            p, self.count = kernels.walk_unchecked(self.octets, p, *key, self.last, self.rows, self.count)
+            p, self.count = kernels.walk_unchecked(
+                self.octets, p, *place, *self.checks, self.rows, self.count
+            )
             if self.count == self.rows.shape[0]:
                 self.grow()
             elif p < stop and (self.count == before or self.is_begun(p, *key)):
@@ -310,15 +377,19 @@ class _UncheckedCutter:
             elif p < stop:
                 # the length of the last packet leads to no header: it is wrong, or what follows is no packet
                 begin = int(self.rows[self.count - 1, 1])
-                q = int(kernels.search_unchecked(self.octets, begin + 1, *key, self.last))
+                q = int(kernels.search_unchecked(self.octets, begin + 1, *place, *self.checks))
                 if q < p:
                     self.count -= 1
                     p = begin
-                else:  # nothing follows that would confirm the packet: octets of it may be missing
+                elif self.is_unchecked(begin):  # nothing confirms the packet: octets of it may be missing
                     self.rows[self.count - 1, 0] = _BAD
                 self.note(p, q)
                 p = q
         return p
+
+    def is_unchecked(self, p: int) -> bool:
+        """Return whether the packet at `p` does not end with a checksum."""
+        return bool(self.checks[0][(int(self.octets[p]) & 0x07) << 8 | int(self.octets[p + 1])])
 
     def is_begun(self, p: int, stop: int, packet_type: int) -> bool:
         """Return whether a packet can begin at `p` and end behind `stop`."""
@@ -328,7 +399,8 @@ class _UncheckedCutter:
 
     def skip(self, p: int, stop: int, packet_type: int) -> int:
         """Skip from `p` to the next position at which packets begin; return it."""
-        q = int(self.kernels.search_unchecked(self.octets, p + 1, stop, packet_type, self.last))
+        key = (stop, packet_type, self.prefix_octets, self.last)
+        q = int(self.kernels.search_unchecked(self.octets, p + 1, *key, *self.checks))
         self.note(p, q)
         return q
 

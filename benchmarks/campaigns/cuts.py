@@ -48,18 +48,20 @@ from tmtc.frames import Clcw, pack_clcw
 from tmtc.link import LinkSettings
 from tmtc.packets import pack_packet
 
-SPACECRAFT, OTHER, RECORDED, FOREIGN = 76, 33, 90, 91
+SPACECRAFT, OTHER, RECORDED, FOREIGN, PREFIXED, BARE = 76, 33, 90, 91, 92, 93
 ORDERS = ("in order", "reversed", "shuffled", "interleaved", "repeated", "cut twice")
 SHORT = LinkSettings(frame_length=223)
 UNCODED = LinkSettings(frame_length=256, coding="none")
 UNPROVED = LinkSettings(frame_length=256, coding="none", checksum=False)
-STATION_HEADER, STATION_TRAILER = 16, 4
+STATION_HEADER, STATION_TRAILER, PREFIX = 16, 4, 12
 MISSIONS = (
     f'name = "records"\n[spacecraft]\nid = {RECORDED}\n[link]\nframe_length = 223\ncoding = "rs"\n'
     f'randomiser = "legacy"\nframe_checksum = true\n[link.stations.madrid]\nheader_octets = {STATION_HEADER}\n'
     f'trailer_octets = {STATION_TRAILER}\ntime_code = "unix_ns"\ntime_offset = 8\n',
     f'name = "foreign"\n[spacecraft]\nid = {FOREIGN}\n'
     '[[packets]]\nname = "bus"\napids = [100, 101]\npacket_checksum = "none"\n',
+    f'name = "prefixed"\n[spacecraft]\nid = {PREFIXED}\n[link]\npacket_prefix_octets = {PREFIX}\n',
+    f'name = "bare"\n[spacecraft]\nid = {BARE}\n[link]\npacket_checksum = "none"\n',
 )
 NEW = ("packets_new", "samples")
 SUMS = ("crc_errors", "frames", "frames_bad", "symbols_corrected")
@@ -209,13 +211,31 @@ def bare(rng: Rng) -> list[Recording]:
 
 
 def foreign(rng: Rng) -> list[Recording]:
-    """Packets without a checksum that a mission description declares, between others, in frames."""
+    """Packets without a checksum, declared by a mission description or not, between others, in frames."""
     own = list(telemetry(20, int(rng.integers(1 << 20)), SHORT))
-    packets = [
-        pack_packet(100 + k % 2, rng.bytes(60 + 40 * (k % 2)), sequence_count=k // 2) for k in range(len(own))
-    ]
+    packets = unchecked_packets(rng, len(own))
     mixed = [packet for pair in zip(own, packets, strict=True) for packet in pair]
     return [Recording("r", DownlinkEncoder(FOREIGN, SHORT).encode(mixed))]
+
+
+def unchecked_packets(rng: Rng, count: int) -> list[bytes]:
+    """Packets without checksum and time of two declared processes and of an undeclared one."""
+    return [
+        pack_packet(100 + k % 3, bytes(20) + rng.bytes(40 + 40 * (k % 3)), sequence_count=k // 3)
+        for k in range(count)
+    ]
+
+
+def without_checksum(rng: Rng) -> list[Recording]:
+    """Packets without frames and without checksums."""
+    return [Recording("r", b"".join(unchecked_packets(rng, 300)), spacecraft=BARE)]
+
+
+def prefixed(rng: Rng) -> list[Recording]:
+    """Packets without frames, each behind octets of a recorder."""
+    packets = telemetry(12, int(rng.integers(1 << 20)), LinkSettings())
+    octets = b"".join(rng.bytes(PREFIX) + packet for packet in packets)
+    return [Recording("r", octets, spacecraft=PREFIXED)]
 
 
 KINDS: dict[str, Callable[[Rng], list[Recording]]] = {
@@ -230,6 +250,8 @@ KINDS: dict[str, Callable[[Rng], list[Recording]]] = {
     "damaged": damaged,
     "packets": bare,
     "foreign": foreign,
+    "without checksum": without_checksum,
+    "prefixed": prefixed,
 }
 
 
@@ -318,7 +340,7 @@ def ingest(ground: Ground, piece: Piece, instance: str, name: str) -> int:
 def contents(ground: Ground, case: Case, instance: str) -> dict[str, Any]:
     """Return what the archive of an instance holds, with nothing that depends on the way it was filled."""
     found: dict[str, Any] = {}
-    ids = [SPACECRAFT, OTHER, RECORDED, FOREIGN]
+    ids = [SPACECRAFT, OTHER, RECORDED, FOREIGN, PREFIXED, BARE]
     with ground.database.writing() as connection:
         vehicles = {one: vehicle_id(connection, one, instance) for one in ids}
         found["archive"] = {one: archive_hash(connection, key) for one, key in vehicles.items()}

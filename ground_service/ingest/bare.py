@@ -17,7 +17,7 @@ from lunar.arrays import IntArray, OctetArray
 from tmtc.dictionary import DICTIONARY
 from tmtc.packets import PACKET_MAX_LENGTH
 from tmtc.schema import Dictionary
-from tmtc.stream import PacketCut, cut_packets
+from tmtc.stream import CHECKED, PacketCut, PacketForm, cut_packets
 
 REACH_OCTETS = 2 * PACKET_MAX_LENGTH
 """Octets before and after a piece that are read with it."""
@@ -28,10 +28,8 @@ class PacketReader:
 
     Parameters
     ----------
-    unchecked_apids
-        APIDs whose packets do not end with a checksum.
-    error_control
-        Whether packets end with a checksum.
+    form
+        How the packets stand in the section.
 
     Attributes
     ----------
@@ -43,17 +41,14 @@ class PacketReader:
         self,
         section: Section,
         found: Found,
+        form: PacketForm = CHECKED,
         *,
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
-        unchecked_apids: frozenset[int] = frozenset(),
-        error_control: bool = True,
     ) -> None:
-        self.section, self.found = section, found
+        self.section, self.found, self._form = section, found, form
         self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
-        self._unchecked_apids = unchecked_apids
-        self._error_control = error_control
         self._new = section.start, section.stop
         self.end = 0
 
@@ -63,12 +58,13 @@ class PacketReader:
 
     def exclude(self, before: OctetArray, after: OctetArray) -> None:
         """Exclude the packets that the octets before and after the piece give by themselves."""
-        section = self.section
-        earlier, later = self._cut(before, True, self._is_start), self._cut(after, True, begins=False)
+        section, at = self.section, self.section.first - before.size
+        earlier = _cut(before, self._form, begins=self._is_start and at == section.start)
+        later = _cut(after, self._form, begins=False)
         stops = np.concatenate([earlier.offsets + earlier.lengths, earlier.idle[:, 1]])
         starts = later.offsets[later.crc_ok]
         self._new = (
-            section.start + int(stops.max(initial=0)),
+            at + int(stops.max()) if stops.size else section.start,
             section.last + int(starts[0]) if starts.size else section.stop,
         )
 
@@ -82,7 +78,7 @@ class PacketReader:
         at, is_start, located = self.section.start, self._is_start, False
         for window, final in windows:
             octets = np.concatenate((rest, window)) if rest.size else window
-            cut = self._cut(octets, final, is_start)
+            cut = _cut(octets, self._form, final, is_start)
             if not located and (len(cut) or final):
                 located = True
                 self._count_waiting(cut.skipped[:1], 0)
@@ -96,15 +92,11 @@ class PacketReader:
         """Whether a packet begins where the section begins."""
         return self.section.position + self.section.start == 0
 
-    def _cut(self, octets: OctetArray, final: bool, begins: bool) -> PacketCut:
-        if self._error_control:
-            return cut_packets(octets, final=final, unchecked_apids=self._unchecked_apids)
-        return _cut_unchecked(octets, final, begins)
-
     def _batch(self, octets: OctetArray, cut: PacketCut, at: int) -> PacketBatch:
         """Return the packets of a window that are read now."""
         starts, stops = cut.offsets + at, cut.offsets + cut.lengths + at
-        used = np.concatenate([np.stack((starts, stops), axis=1), cut.idle + at])
+        prefixed = np.stack((starts - self._form.prefix_octets, stops), axis=1)
+        used = np.concatenate([prefixed, cut.idle + at])
         self.found.octets_used += self.section.of_piece(used[:, 0], used[:, 1])
         new = (starts >= self._new[0]) & (stops <= self._new[1])
         mine = PacketCut(
@@ -126,14 +118,14 @@ class PacketReader:
             self.found.octets_waiting += stop - start
 
 
-def _cut_unchecked(window: OctetArray, final: bool, begins: bool) -> PacketCut:
-    """Return the packets without error control of a window, as far as the octets behind confirm them."""
-    cut = cut_packets(window, error_control=False, begins=begins)
-    if final:
-        return cut
-    border = len(window) - 2 * PACKET_MAX_LENGTH
+def _cut(octets: OctetArray, form: PacketForm, final: bool = True, begins: bool = True) -> PacketCut:
+    """Return the packets of a window; of those that are found by headers, as many as others certainly follow."""
+    if final or not form.by_headers:
+        return cut_packets(octets, final=final, form=form, begins=begins)
+    cut = cut_packets(octets, form=form, begins=begins)
+    border = octets.size - 2 * PACKET_MAX_LENGTH
     starts = cut.offsets[cut.crc_ok & (cut.offsets <= border)]
-    consumed = int(starts[-1]) if starts.size else 0
+    consumed = max(int(starts[-1]) - form.prefix_octets, 0) if starts.size else 0
     whole = cut.offsets < consumed
     return PacketCut(
         cut.offsets[whole],

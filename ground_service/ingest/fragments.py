@@ -13,6 +13,7 @@ from itertools import pairwise
 
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
+from tmtc.stream import PacketForm
 
 COUNTS = 256
 UNKNOWN = -1
@@ -64,21 +65,24 @@ Lookup = Callable[[Fragment, int], Iterable[Fragment]]
 
 
 def complete(
-    fragment: Fragment, before: Lookup, behind: Lookup, unchecked: frozenset[int]
+    fragment: Fragment, before: Lookup, behind: Lookup, form: PacketForm
 ) -> tuple[list[Fragment], bytes] | None:
     """Return the fragments and octets of the packet that a fragment belongs to; None if a part is missing.
 
-    Packets of `unchecked` APIDs have no checksum: their fragments must adjoin in one recording.
+    The fragments of packets without a checksum must adjoin in one recording.
     """
     for begin in _beginnings(fragment, before):
         for path in _paths(begin, behind):
             octets = b"".join(one.octets for one in path)
             if len(octets) != packet_length(octets):
                 continue
-            if int.from_bytes(octets[:2], "big") & 0x7FF in unchecked:
-                if all(one.precedes(other) for one, other in pairwise(path)):
-                    return path, octets
-            elif len(octets) > PRIMARY_HEADER_LENGTH + CRC_LENGTH and crc16(octets) == 0:
+            apid = int.from_bytes(octets[:2], "big") & 0x7FF
+            lacks = form.lacks_checksum(apid)
+            if (lacks or apid in form.unknown) and all(one.precedes(other) for one, other in pairwise(path)):
+                return path, octets
+            if lacks:
+                continue
+            if len(octets) > PRIMARY_HEADER_LENGTH + CRC_LENGTH and crc16(octets) == 0:
                 return path, octets
     return None
 
@@ -114,7 +118,7 @@ def _paths(begin: Fragment, behind: Lookup) -> Iterator[list[Fragment]]:
 
 
 def join(
-    fragments: Sequence[Fragment], unchecked: Callable[[int], frozenset[int]]
+    fragments: Sequence[Fragment], form_of: Callable[[int], PacketForm]
 ) -> tuple[list[tuple[int, bytes]], list[Fragment]]:
     """Complete packets with fragments of one reading; return spacecraft and octets of each, and the other fragments."""
     firsts: dict[tuple[Channel, int], list[Fragment]] = {}
@@ -140,7 +144,7 @@ def join(
             one,
             lambda other, fit: among(lasts.get((other.channel, other.count), []), fit),
             lambda other, fit: among(firsts.get((other.channel, other.next_count), []), fit),
-            unchecked(one.channel[0]),
+            form_of(one.channel[0]),
         )
         if found is not None:
             used.update(found[0])

@@ -27,7 +27,7 @@ from tmtc.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, OCF_LENGTH, ONLY_
 from tmtc.link import LinkSettings
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.schema import Dictionary
-from tmtc.stream import PacketCut, cut_packets
+from tmtc.stream import CHECKED, PacketCut, PacketForm, cut_packets
 
 CADU_MAX_OCTETS = FRAME_MAX_LENGTH + 2 * 16 * 8 + cadu.ASM_LENGTH
 """Length of the longest CADU of the known link settings."""
@@ -41,13 +41,13 @@ REACH_OCTETS = (CONTEXT_CADUS + 2) * CADU_MAX_OCTETS
 FOREIGN_FRAMES = 2
 """Number of frames from which a spacecraft is accepted in a stream of frames without code or checksum."""
 
-UncheckedApids = Callable[[int], frozenset[int]]
-"""APIDs of a spacecraft whose packets do not end with a checksum."""
+FormOf = Callable[[int], PacketForm]
+"""Returns the form of the packets of a spacecraft."""
 
 
-def all_checked(_spacecraft_id: int) -> frozenset[int]:
-    """Return no APIDs: all packets end with a checksum."""
-    return frozenset()
+def all_checked(_spacecraft_id: int) -> PacketForm:
+    """Return that all packets end with a checksum."""
+    return CHECKED
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,12 +115,10 @@ class FrameReader:
     ----------
     spacecraft_id
         Only frames of this spacecraft are used; None: those of every spacecraft in the stream.
-    unchecked_apids
-        APIDs of each spacecraft whose packets do not end with a checksum.
+    form_of
+        Form of the packets of each spacecraft.
     record
         Octets of the station around each CADU.
-    error_control
-        Whether packets end with a checksum.
 
     Attributes
     ----------
@@ -136,16 +134,13 @@ class FrameReader:
         *,
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
-        unchecked_apids: UncheckedApids = all_checked,
+        form_of: FormOf = all_checked,
         record: RecordFormat,
-        error_control: bool = True,
     ) -> None:
         self.section, self.settings, self.found = section, settings, found
         self._spacecraft_id = spacecraft_id
         self._record = record
-        self._channels = ChannelReader(
-            dictionary, unchecked_apids, error_control, section.position, section.stream
-        )
+        self._channels = ChannelReader(dictionary, form_of, section.position, section.stream)
         self._length = settings.cadu_length
         self._new = (8 * section.start, 8 * section.stop)
         self.end = 0
@@ -309,8 +304,7 @@ class ChannelReader:
     """
 
     dictionary: Dictionary
-    unchecked_apids: UncheckedApids = all_checked
-    error_control: bool = True
+    form_of: FormOf = all_checked
     position: int = 0
     stream: str = ""
     fragments: list[Fragment] = field(default_factory=list)
@@ -341,8 +335,7 @@ class ChannelReader:
         cut = cut_packets(
             buffer,
             segments=ranges_used,
-            error_control=self.error_control,
-            unchecked_apids=self.unchecked_apids(spacecraft_id),
+            form=self.form_of(spacecraft_id).in_frames,
         )
         self.packets += int(np.count_nonzero(cut.crc_ok))
         self.crc_errors += cut.crc_errors

@@ -8,8 +8,8 @@ descriptions are only ever added: they are kept in memory and read again when on
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -26,9 +26,10 @@ from ground_service.ingest.recording_store import (
     surroundings,
 )
 from ground_service.missions.definitions import PacketDefinitions
-from ground_service.missions.model import FrameSettings, Link, StationLink
+from ground_service.missions.model import Link, StationLink
 from ground_service.missions.store import links_in_force
 from tmtc.link import LinkSettings
+from tmtc.stream import CHECKED, PacketForm
 
 STATED, MISSION, REMEMBERED, PROPOSED = "stated", "mission", "remembered", "proposed"
 ACTOR = "ingest"
@@ -54,15 +55,15 @@ _NAMES = {
 class ExpectedLink:
     """What is known of the link of a piece before it is read.
 
-    `stated` settings are used as they are. `mission` and `remembered` settings are tried in this order.
-    `error_control` is False if the packets of the spacecraft do not end with a checksum.
+    `stated` settings are used as they are. `mission` and `remembered` settings are tried in this order. `form` is that
+    of the packets of the spacecraft.
     """
 
     stated: LinkSettings | None = None
     mission: tuple[LinkSettings, ...] = ()
     remembered: tuple[LinkSettings, ...] = ()
     record: RecordFormat = NO_RECORD
-    error_control: bool = True
+    form: PacketForm = CHECKED
 
     @property
     def candidates(self) -> list[LinkSettings]:
@@ -125,28 +126,43 @@ def expected_link(connection: Connection, piece: Piece) -> ExpectedLink:
     found = [settings_of(link, piece.station) for link in links.values()]
     stations = [station for link in links.values() if (station := _station(link, piece.station))]
     remembered = [*good_links(connection, piece, piece.station), *good_links(connection, piece, None)]
-    own = links.get(piece.spacecraft_id) if piece.spacecraft_id is not None else None
+    form = CHECKED
+    if piece.spacecraft_id is not None:
+        form = packet_form(connection, piece.spacecraft_id, piece.scope, piece.station)
     return ExpectedLink(
         stated=None if piece.link is None else LinkSettings.parse(piece.link).explicit,
         mission=tuple(dict.fromkeys(one for one in found if one is not None)),
         remembered=tuple(dict.fromkeys(remembered)),
         record=_record(stations[0]) if stations else NO_RECORD,
-        error_control=own is None or own.packet_checksum != "none",
+        form=form,
+    )
+
+
+def packet_form(connection: Connection, spacecraft: int, scope: str, station: str) -> PacketForm:
+    """Return how the packets of a spacecraft stand in the recordings of a station."""
+    link = links_in_force(connection, spacecraft, scope).get(spacecraft)
+    stated = {} if link is None else _stated(link, station)
+    definitions, _ = definitions_of_spacecraft(connection, spacecraft, scope)
+    return replace(
+        definitions.form,
+        error_control=stated.get("packet_checksum") != "none",
+        prefix_octets=stated.get("packet_prefix_octets", 0),
     )
 
 
 def settings_of(link: Link, station: str) -> LinkSettings | None:
     """Return the settings that a description states for a station; None if coding or frame length are not stated."""
-    parts: list[FrameSettings] = [link]
-    if (special := _station(link, station)) is not None:
-        parts.append(special)
-    values: dict[str, Any] = {}
-    for part in parts:
-        stated: Mapping[str, Any] = part.model_dump(exclude_none=True)
-        values |= {_NAMES[name]: value for name, value in stated.items() if name in _NAMES}
-    if not {"frame_length", "coding"} <= values.keys():
+    stated = _stated(link, station)
+    if not {"frame_length", "coding"} <= stated.keys():
         return None
-    return LinkSettings(**values).explicit
+    return LinkSettings(**{_NAMES[name]: value for name, value in stated.items() if name in _NAMES}).explicit
+
+
+def _stated(link: Link, station: str) -> dict[str, Any]:
+    """Return what a description states by name for a station."""
+    special = _station(link, station)
+    of_station = {} if special is None else special.model_dump(exclude_none=True)
+    return link.model_dump(exclude_none=True) | of_station
 
 
 def _station(link: Link, station: str) -> StationLink | None:

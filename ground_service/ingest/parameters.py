@@ -70,7 +70,7 @@ def definitions_of_spacecraft(
     """As `definitions_in_force`, by spacecraft id and instance."""
     mission_id = missions.packets_in_force(connection, spacecraft, instance)
     if mission_id is None:
-        return PacketDefinitions("", ()), 0
+        return PacketDefinitions(), 0
     return packet_definitions(missions.get_mission(connection, mission_id)), mission_id
 
 
@@ -85,7 +85,7 @@ def _next_block(connection: Connection, vehicle: int) -> int | None:
     progress = parameters.decoding(connection, vehicle, definition)
     if progress is None:
         earlier = _readable_definitions(connection, vehicle)
-        new = definitions.unchecked_apids - earlier.unchecked_apids
+        new = definitions.form.unchecked - earlier.form.unchecked
         progress = parameters.begin(connection, vehicle, definition, read_again=bool(new))
     packets = parameters.packets_after(
         connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS
@@ -106,7 +106,7 @@ def _readable_definitions(connection: Connection, vehicle: int) -> PacketDefinit
     """Return the packets of the definition that the values of a vehicle are read with."""
     decoding = parameters.readable_decoding(connection, vehicle)
     if decoding is None:
-        return PacketDefinitions("", ())
+        return PacketDefinitions()
     mission_id = parameters.mission_of_definition(connection, decoding.definition_id)
     return packet_definitions(missions.get_mission(connection, mission_id))
 

@@ -22,7 +22,7 @@ from ground_service.ingest import recording_store as recordings
 from ground_service.ingest.bare import PacketReader
 from ground_service.ingest.fragments import Fragment, complete, join
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
-from ground_service.ingest.link_settings import known_before, remember_link
+from ground_service.ingest.link_settings import known_before, packet_form, remember_link
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
 from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
 from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
@@ -42,7 +42,7 @@ from tmtc.downlink import plan_of
 from tmtc.errors import UnknownCoding
 from tmtc.link import LinkSettings
 from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.stream import cut_packets, whole_packets
+from tmtc.stream import PacketForm, cut_packets, find_prefix, primary_headers, whole_packets
 
 Progress = Callable[[float], None]
 
@@ -58,6 +58,9 @@ FRAGMENTS_LIMIT = 1_000
 
 CERTAIN_OCTETS = 4 * CADU_MAX_OCTETS
 """Length of a piece from which an unknown coding is an error, and not a lack of evidence."""
+
+MOST_APIDS = 8
+"""Largest number of APIDs that a message names."""
 
 HINT = "pieces of one recording are ingested with its name and their offsets (--recording NAME FILE...)"
 
@@ -167,6 +170,9 @@ class Reading:
         self.definitions: dict[int, PacketDefinitions] = {}
         if piece.spacecraft_id is not None and self.known.definitions is not None:
             self.definitions[piece.spacecraft_id] = self.known.definitions
+        self.forms: dict[int, PacketForm] = {}
+        if piece.spacecraft_id is not None:
+            self.forms[piece.spacecraft_id] = self.expected.form
         self.found = Found()
         self.unknown = 0
         self.ticks: list[int] = []
@@ -196,7 +202,8 @@ class Reading:
             end = reader.end
         if not self.piece.stream and not self.found.frames and not self.found.packets:
             self._refuse(
-                "no valid frame or packet" + _without_checksum(run.read(0, min(run.octets, WINDOW_OCTETS)))
+                "no valid frame or packet"
+                + _remedy(run.read(0, min(run.octets, WINDOW_OCTETS)), self.expected.form)
             )
         self._settle(held, fragments, is_last=True)
 
@@ -231,7 +238,7 @@ class Reading:
         around = self.piece.octets <= WINDOW_OCTETS
         octets = run.whole() if around else mapped_octets(run.files.path(self.piece.file_sha256))
         try:
-            plan = plan_of(octets, self.expected.candidates, error_control=self.expected.error_control)
+            plan = plan_of(octets, self.expected.candidates, form=self.expected.form)
         except UnknownCoding as error:
             if self.piece.octets >= CERTAIN_OCTETS or not self.piece.stream:
                 self._refuse(error.found, error.expected)
@@ -263,17 +270,15 @@ class Reading:
 
     def _has_packets(self, octets: OctetArray) -> bool:
         """Return whether octets are packets without frames."""
-        unchecked = frozenset[int]()
-        if self.piece.spacecraft_id is not None:
-            unchecked = self._unchecked_apids(self.piece.spacecraft_id)
+        form = self.expected.form
         for start in range(0, octets.size, WINDOW_OCTETS):
             window = octets[start : start + WINDOW_OCTETS + PACKET_MAX_LENGTH]
-            cut = cut_packets(window, error_control=self.expected.error_control, unchecked_apids=unchecked)
+            cut = cut_packets(window, form=form)
             packets = int(np.count_nonzero(cut.crc_ok))
-            fills = 2 * int(cut.lengths[cut.crc_ok].sum()) >= window.size
-            if fills if unchecked or not self.expected.error_control else packets >= 2 or (packets and fills):
+            fills = 2 * int((cut.lengths[cut.crc_ok] + form.prefix_octets).sum()) >= window.size
+            if fills if form.by_headers or form.unchecked else packets >= 2 or (packets and fills):
                 return True
-            if not self.expected.error_control:
+            if form.by_headers:
                 return False
         return False
 
@@ -286,9 +291,8 @@ class Reading:
                 section.settings,
                 self.found,
                 spacecraft_id=piece.spacecraft_id,
-                unchecked_apids=self._unchecked_apids,
+                form_of=self._form_of,
                 record=self.expected.record,
-                error_control=self.expected.error_control,
             )
         elif piece.spacecraft_id is None:
             raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
@@ -296,16 +300,26 @@ class Reading:
             reader = PacketReader(
                 section,
                 self.found,
+                self.expected.form,
                 spacecraft_id=piece.spacecraft_id,
-                unchecked_apids=self._unchecked_apids(piece.spacecraft_id),
-                error_control=self.expected.error_control,
             )
         if section.start < section.first or section.last < section.stop:
-            reader.exclude(run.read(section.start, section.first), run.read(section.last, section.stop))
+            start, stop = section.start, section.stop
+            if (
+                section.settings is None
+            ):  # packets do not prove themselves: only with what earlier pieces were read with
+                start = max(start, 0, *(one for _, one in run.new if one <= section.first))
+                stop = min(stop, run.octets, *(one for one, _ in run.new if one >= section.last))
+            reader.exclude(run.read(start, section.first), run.read(section.last, stop))
         return reader
 
-    def _unchecked_apids(self, spacecraft: int) -> frozenset[int]:
-        return self._definitions(spacecraft).unchecked_apids
+    def _form_of(self, spacecraft: int) -> PacketForm:
+        """Return the form of the packets of a spacecraft."""
+        if spacecraft not in self.forms:
+            with self.ground.database.reading() as connection:
+                found = packet_form(connection, spacecraft, self.piece.scope, self.piece.station)
+            self.forms[spacecraft] = found
+        return self.forms[spacecraft]
 
     def _definitions(self, spacecraft: int) -> PacketDefinitions:
         """Return the packets that the mission description of a spacecraft declares."""
@@ -349,7 +363,7 @@ class Reading:
 
     def _settle(self, batch: PacketBatch | None, fragments: list[Fragment], *, is_last: bool) -> None:
         """Store a batch and fragments, and complete packets with fragments; finish the ingest if it is the last one."""
-        packets, rest = join(fragments, self._unchecked_apids)
+        packets, rest = join(fragments, self._form_of)
         with self.ground.database.writing() as connection:
             stored = Stored(0, 0, 0) if batch is None or not len(batch) else self._store(connection, batch)
             stored += self._store_whole(connection, packets)
@@ -382,7 +396,7 @@ class Reading:
                 behind = partial(recordings.fragments_behind, connection, vehicle)
                 if one in used:
                     continue
-                if found := complete(one, before, behind, self._unchecked_apids(spacecraft)):
+                if found := complete(one, before, behind, self._form_of(spacecraft)):
                     used.update(found[0])
                     packets.append((spacecraft, found[1]))
         return packets, used
@@ -519,12 +533,21 @@ class Reading:
         )
 
 
-def _without_checksum(octets: OctetArray) -> str:
-    """Return the remedy for octets that are space packets without a checksum; empty if they are none."""
-    cut = cut_packets(octets, error_control=False)
-    if not len(cut) or 2 * int(cut.lengths.sum()) < octets.size:
-        return ""
-    return (
-        f"; the first {octets.size} octets look like {len(cut)} packets without checksum: state "
-        'link.packet_checksum = "none" in the mission description'
-    )
+def _remedy(octets: OctetArray, form: PacketForm) -> str:
+    """Return what a mission description must state for octets without packets of a form; empty if nothing helps."""
+    for tried in (form, replace(form, error_control=False)):
+        prefix = find_prefix(octets, tried)
+        cut = cut_packets(octets, form=replace(tried, prefix_octets=prefix))
+        good = cut.lengths[cut.crc_ok] + prefix
+        stated = [] if tried.error_control else ['link.packet_checksum = "none"']
+        stated += [f"link.packet_prefix_octets = {prefix}"] if prefix != form.prefix_octets else []
+        if not stated or 2 * int(good.sum()) < octets.size:
+            continue
+        checksum = "" if tried.error_control else " without checksum"
+        behind = f", each behind {prefix} other octets" if prefix else ""
+        apids = ", ".join(str(one) for one in np.unique(primary_headers(octets, cut).apid)[:MOST_APIDS])
+        return (
+            f"; the first {octets.size} octets look like {good.size} packets{checksum} of APID {apids}{behind}: "
+            f"state {' and '.join(stated)} in the mission description"
+        )
+    return ""

@@ -39,6 +39,7 @@ _PLACE = (
     _PIECES.c.scope,
     func.coalesce(_PIECES.c.stream, "").label("stream"),
     func.coalesce(_PIECES.c.position, 0).label("position"),
+    func.coalesce(_PIECES.c.station, "").label("station"),
 )
 
 log = logging.getLogger(__name__)
@@ -356,12 +357,13 @@ def _accounting(result: IngestResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A piece of a recording with its result; `stream` is empty for a file that is a recording of its own."""
+    """A piece of a recording of a station with its result; `stream` is empty for a file that is a whole recording."""
 
     sha256: str
     octets: int
     stream: str
     position: int
+    station: str
     result: IngestResult | None
 
 
@@ -369,8 +371,9 @@ def recordings_of_vehicle(
     connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int
 ) -> list[list[Received]]:
     """Return the recordings that may have packets of a vehicle in a time: the different pieces of each, by position."""
+    columns = _INGESTS.c.id, _INGESTS.c.file_sha256, _INGESTS.c.accounting, _FILES.c.octets, *_PLACE
     query = (
-        select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.id, _INGESTS.c.accounting, *_PLACE)
+        select(*columns)
         .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
         .outerjoin(_PIECES, _PIECES.c.ingest_id == _INGESTS.c.id)
         .order_by(_INGESTS.c.file_sha256, _INGESTS.c.id)
@@ -384,12 +387,14 @@ def recordings_of_vehicle(
         if row.stream:
             streams.add((row.scope, row.stream))
         else:
-            found["", row.file_sha256] = {(0, ""): Received(row.file_sha256, row.octets, "", 0, result)}
+            one = Received(row.file_sha256, row.octets, "", 0, row.station, result)
+            found["", row.file_sha256] = {(0, ""): one}
     for scope, stream in sorted(streams):
         pieces = found.setdefault((scope, stream), {})
         mine = query.where(_PIECES.c.scope == scope, _PIECES.c.stream == stream)
         for row in connection.execute(mine):
-            one = Received(row.file_sha256, row.octets, stream, row.position, _result(row.id, row.accounting))
+            result = _result(row.id, row.accounting)
+            one = Received(row.file_sha256, row.octets, stream, row.position, row.station, result)
             pieces.setdefault((one.position, one.sha256), one)
     return [[one for _, one in sorted(pieces.items())] for _, pieces in sorted(found.items())]
 

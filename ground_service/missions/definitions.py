@@ -9,7 +9,7 @@ import hashlib
 import json
 import re
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,10 @@ from pathlib import Path
 from ground_service.errors import InvalidInput
 from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketSource, format_toml
 from ground_service.toml import read_table
+from tmtc.dictionary import DICTIONARY
 from tmtc.errors import DefinitionError
+from tmtc.packets import IDLE_APID
+from tmtc.stream import CHECKED, PacketForm
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
 from tmtc.xtce.nodes import MAX_OCTETS
@@ -51,25 +54,20 @@ class DeclaredPackets:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketDefinitions:
-    """All declared packets of a mission description; `digest` identifies what is declared."""
+    """All declared packets of a mission description; `digest` identifies what is declared.
 
-    digest: str
-    declared: tuple[DeclaredPackets, ...]
+    `form`: if there are packets without a checksum, it is unknown whether those have one that neither the description
+    nor the dictionary of the payload declares.
+    """
+
+    digest: str = ""
+    declared: tuple[DeclaredPackets, ...] = ()
+    form: PacketForm = CHECKED
 
     @property
     def apids(self) -> tuple[int, ...]:
         """APIDs with a definition."""
         return tuple(sorted(apid for one in self.declared if one.decoder for apid in one.source.apids))
-
-    @property
-    def unchecked_apids(self) -> frozenset[int]:
-        """APIDs whose packets do not end with a checksum."""
-        return unchecked_apids(one.source for one in self.declared)
-
-
-def unchecked_apids(sources: Iterable[PacketSource]) -> frozenset[int]:
-    """Return the APIDs of packets without a checksum."""
-    return frozenset(apid for one in sources if one.packet_checksum == "none" for apid in one.apids)
 
 
 def packet_definitions(mission: Mission) -> PacketDefinitions:
@@ -209,7 +207,7 @@ def _decoder(source: PacketSource) -> Decoder | None:
 @lru_cache(maxsize=16)
 def _compiled(sources: Sequence[PacketSource]) -> PacketDefinitions:
     if not sources:
-        return PacketDefinitions("", ())
+        return PacketDefinitions()
     stated = json.dumps([one.model_dump(mode="json", exclude_none=True) for one in sources], sort_keys=True)
     declared = []
     number = 0
@@ -218,4 +216,8 @@ def _compiled(sources: Sequence[PacketSource]) -> PacketDefinitions:
         layouts = {} if decoder is None else dict(sorted(packet_layouts(decoder.root).items()))
         declared.append(DeclaredPackets(source, decoder, layouts, number))
         number += len(layouts)
-    return PacketDefinitions(hashlib.sha256(stated.encode()).hexdigest(), tuple(declared))
+    unchecked = {apid for one in sources if one.packet_checksum == "none" for apid in one.apids}
+    known = {apid for one in sources for apid in one.apids} | {one.apid for one in DICTIONARY.telemetry}
+    unknown = frozenset(range(IDLE_APID)) - known if unchecked else frozenset()
+    form = PacketForm(unchecked=frozenset(unchecked), unknown=unknown)
+    return PacketDefinitions(hashlib.sha256(stated.encode()).hexdigest(), tuple(declared), form)

@@ -71,7 +71,10 @@ class DictionarySection(Section):
 
 
 class FrameSettings(Section):
-    """Settings of frames; `frame_checksum` is the frame error control field (FECF)."""
+    """Settings of frames; `frame_checksum` is the frame error control field (FECF).
+
+    `packet_prefix_octets`: octets before each packet of recordings without frames.
+    """
 
     frame_length: int | None = None
     coding: Literal["rs", "none"] | None = None
@@ -80,6 +83,7 @@ class FrameSettings(Section):
     rs_errors: int | None = None
     dual_basis: bool | None = None
     frame_checksum: bool | None = None
+    packet_prefix_octets: Annotated[int, Field(ge=0, le=1024)] | None = None
 
 
 def _span(text: str) -> str:

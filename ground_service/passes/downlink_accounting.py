@@ -21,6 +21,7 @@ from tmtc.arrays import Octets
 from tmtc.cuc import NO_TICKS
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
 from tmtc.link_plan import LinkPlan, LinkSection
+from tmtc.stream import CHECKED, PacketForm
 
 DIGEST_OCTETS = 16
 
@@ -84,10 +85,15 @@ class RawAccount:
     crc_errors: dict[int, int]
 
 
-def read_raw(octets: Octets, spacecraft_id: int | None, sections: Sequence[LinkSection] = ()) -> RawFile:
+def read_raw(
+    octets: Octets,
+    spacecraft_id: int | None,
+    sections: Sequence[LinkSection] = (),
+    form: PacketForm = CHECKED,
+) -> RawFile:
     """Return the content of a raw file for one spacecraft.
 
-    `sections` are those of its ingest; without any, they follow from the file.
+    `sections` are those of its ingest; without any, they follow from the file. `form` is that of the packets.
 
     Raises
     ------
@@ -95,7 +101,7 @@ def read_raw(octets: Octets, spacecraft_id: int | None, sections: Sequence[LinkS
         If the file has frames with an unknown coding.
     """
     plan = LinkPlan(tuple(sections), None, has_regular_markers=True) if sections else None
-    found = decode(octets, spacecraft_id=spacecraft_id, plan=plan)
+    found = decode(octets, spacecraft_id=spacecraft_id, form=form, plan=plan)
     starts, good = found.cut.offsets, found.cut.crc_ok
     ticks = np.full(len(found.cut), NO_TICKS, dtype=np.int64)
     rows = np.flatnonzero(good)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from ground_service.ingest.core import Gap, account_sequence
+from ground_service.ingest.link_settings import packet_form
 from ground_service.ingest.model import ReceivedLink
 from ground_service.ingest.store import Received, recordings_of_vehicle
 from ground_service.passes import sample_store
@@ -29,6 +30,7 @@ from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting,
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
 from tmtc.link import LinkSettings
 from tmtc.link_plan import LinkSection
+from tmtc.stream import PacketForm
 
 IntArray = NDArray[np.int64]
 
@@ -49,7 +51,10 @@ def packet_accounting(
     headers = telemetry.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
     recordings = recordings_of_vehicle(connection, span.vehicle, span.start_ticks, span.stop_ticks)
     runs = [run for pieces in recordings for run in _runs(pieces)]
-    raw = _raw_account(files, get_vehicle(connection, span.vehicle).ccsds_id, runs, span)
+    vehicle = get_vehicle(connection, span.vehicle)
+    own = vehicle.ccsds_id, vehicle.instance
+    forms = {one: packet_form(connection, *own, one) for one in {run.station for run in runs}}
+    raw = _raw_account(files, vehicle.ccsds_id, runs, forms, span)
     names = _apid_names()
     by_apid: dict[int, ApidAccounting] = {}
     lost = np.zeros((0, 2), dtype=np.float64)
@@ -104,8 +109,12 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Contiguous octets of a recording, and the sections of its link settings; none: they follow from the octets."""
+    """Contiguous octets of a recording of a station.
 
+    `sections` are those of its link settings; none: they follow from the octets.
+    """
+
+    station: str
     parts: tuple[_Part, ...]
     sections: tuple[LinkSection, ...]
 
@@ -115,11 +124,16 @@ class _Run:
         return sum(one.stop - one.start for one in self.parts)
 
 
-def _raw_account(files: FileArchive, spacecraft: int, runs: list[_Run], span: PassSpan) -> RawAccount | None:
-    """Return sums over the recordings of the vehicle; None without any, or if one is too large."""
+def _raw_account(
+    files: FileArchive, spacecraft: int, runs: list[_Run], forms: dict[str, PacketForm], span: PassSpan
+) -> RawAccount | None:
+    """Return sums over the recordings of the vehicle; None without any, or if one is too large.
+
+    `forms`: of its packets, by station.
+    """
     if not runs or any(one.octets > RAW_LIMIT_OCTETS for one in runs):
         return None
-    found = [_RAW_FILES.get(files, one, spacecraft) for one in runs]
+    found = [_RAW_FILES.get(files, one, spacecraft, forms[one.station]) for one in runs]
     return account_raw(found, span.start_ticks, span.stop_ticks)
 
 
@@ -134,7 +148,10 @@ def _runs(pieces: list[Received]) -> list[_Run]:
         if start < one.octets or not runs[-1]:
             runs[-1].append((one, _Part(one.sha256, start, one.octets)))
             reached = one.position + one.octets
-    return [_Run(tuple(part for _, part in run), _sections([one for one, _ in run])) for run in runs]
+    return [
+        _Run(run[0][0].station, tuple(part for _, part in run), _sections([one for one, _ in run]))
+        for run in runs
+    ]
 
 
 def _sections(pieces: list[Received]) -> tuple[LinkSection, ...]:
@@ -176,7 +193,7 @@ def _reception(received: list[ReceivedLink], octets: int) -> ReceptionQuality:
     return ReceptionQuality(
         station=received[0].station,
         source=", ".join(sorted({section.source for one in received for section in one.sections})),
-        ambiguous=any(one.ambiguous for one in received),
+        ambiguous=all(one.ambiguous for one in received),  # the evidence of one piece is enough
         frames=total("frames"),
         frames_good=total("frames_good"),
         symbols_corrected=total("symbols_corrected"),
@@ -198,15 +215,15 @@ class _RawFiles:
         self._kept: OrderedDict[Hashable, RawFile] = OrderedDict()
         self._octets = 0
 
-    def get(self, files: FileArchive, run: _Run, spacecraft_id: int) -> RawFile:
+    def get(self, files: FileArchive, run: _Run, spacecraft_id: int, form: PacketForm) -> RawFile:
         """Return the content of a run."""
-        key = (files.root, run, spacecraft_id)
+        key = (files.root, run, spacecraft_id, form)
         with self._lock:
             if (found := self._kept.get(key)) is not None:
                 self._kept.move_to_end(key)
                 return found
         octets = b"".join(files.get(one.sha256)[one.start : one.stop] for one in run.parts)
-        found = read_raw(octets, spacecraft_id, run.sections)
+        found = read_raw(octets, spacecraft_id, run.sections, form)
         with self._lock:
             if key not in self._kept:
                 self._kept[key] = found

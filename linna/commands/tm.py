@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -169,6 +170,9 @@ def _add_definition_options(parser: argparse.ArgumentParser) -> None:
     )
     option(group, "--container NAME", str, "container that packets begin with, where there are several")
     option(group, "--no-error-control", bool, "packets do not end with a checksum (CRC-16)")
+    option(
+        group, "--prefix-octets N", int, "octets before each packet of a file without frames (default: tried)"
+    )
 
 
 def _add_link_options(parser: argparse.ArgumentParser) -> None:
@@ -183,12 +187,15 @@ def _add_link_options(parser: argparse.ArgumentParser) -> None:
 
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
     from linna.errors import UsageError
+    from tmtc.arrays import as_octets
     from tmtc.dictionary import DICTIONARY
     from tmtc.downlink import decode
     from tmtc.errors import UnknownCoding
     from tmtc.link import LinkSettings
+    from tmtc.stream import PacketForm, find_prefix
 
     octets = arguments.file.read_bytes()
+    form = PacketForm(not arguments.no_error_control, prefix_octets=arguments.prefix_octets or 0)
     given = {
         "frame_length": arguments.frame_length,
         "coding": arguments.coding,
@@ -199,14 +206,13 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
     if arguments.no_frame_checksum:
         chosen["checksum"] = False
     settings = LinkSettings(**chosen) if chosen else None
+    own = DICTIONARY if dictionary is None else dictionary
+    read = partial(decode, octets, settings=settings, spacecraft_id=arguments.spacecraft_id, dictionary=own)
     try:
-        decoded = decode(
-            octets,
-            settings=settings,
-            spacecraft_id=arguments.spacecraft_id,
-            dictionary=DICTIONARY if dictionary is None else dictionary,
-            error_control=not arguments.no_error_control,
-        )
+        decoded = read(form=form)
+        is_bare = decoded.settings is None and arguments.prefix_octets is None
+        if is_bare and decoded.octets_skipped > decoded.packets:
+            decoded = read(form=replace(form, prefix_octets=find_prefix(as_octets(octets), form)))
     except UnknownCoding as error:
         raise UsageError(f"{arguments.file}: expected {error.expected}, found {error.found}") from error
     if not decoded.packets and not decoded.frame_count:
@@ -241,6 +247,8 @@ def _describe(decoded: DownlinkDecode) -> str:
         f"duplicates {sequence.duplicates}, conflicts {sequence.conflicts}, "
         f"wrong checksum {decoded.crc_errors}, not in the dictionary {decoded.unknown}"
     )
+    if decoded.prefix_octets:
+        lines.append(f"  each behind {decoded.prefix_octets} other octets")
     lines += [f"  APID 0x{apid:03X}: {count}" for apid, count in decoded.by_apid.items()]
     total = sum(decoded.octets.values())
     parts = [f"{name.replace('_', ' ')} {count}" for name, count in decoded.octets.items() if count]

@@ -185,6 +185,10 @@ def test_packets_without_error_control_are_checked_only_when_told(foreign, capsy
     assert "definition: decoded 120" in capsys.readouterr().out
     capture.write_bytes(b"".join([*packets, packets[-1][:-1]]))
     assert run(strict) == 1
+    capture.write_bytes(b"".join(bytes(4) + packet for packet in packets))
+    assert run(strict) == 0
+    assert "each behind 4 other octets" in capsys.readouterr().out
+    assert run([*strict, "--prefix-octets", "5"]) == 2
 
 
 def test_packets_of_another_mission_are_decoded_through_their_definition(foreign, tmp_path, capsys):

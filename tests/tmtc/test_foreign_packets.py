@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,10 +26,11 @@ from tests.tmtc.foreign import (
     integer,
     space_packet,
 )
+from tmtc.crc import append_crc
 from tmtc.downlink import DownlinkDecode, decode, encode_cadus
 from tmtc.errors import ValueRefused
 from tmtc.packets import idle_packet
-from tmtc.stream import PacketCut, cut_packets
+from tmtc.stream import UNCHECKED, PacketCut, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
 
@@ -42,7 +44,7 @@ def ephemeris(count: int) -> bytes:
 
 
 def cut(octets: bytes) -> PacketCut:
-    found = cut_packets(octets, error_control=False)
+    found = cut_packets(octets, form=UNCHECKED)
     rows = [(s, s + n) for s, n in zip(found.offsets.tolist(), found.lengths.tolist(), strict=True)]
     rows += [tuple(r) for r in found.skipped.tolist()] + [tuple(r) for r in found.idle.tolist()]
     rows.sort()
@@ -60,7 +62,7 @@ def test_a_capture_of_7200_packets_without_error_control_is_read_whole():
     assert packets_of(octets) == packets
     theirs = parse_space_packets(octets, [PacketId(PacketType.TM, True, 11)])
     assert [bytes(p) for p in theirs.tm_list] == packets
-    decoded = decode(octets, error_control=False)
+    decoded = decode(octets, form=UNCHECKED)
     assert (decoded.packets, decoded.sequence.gaps, decoded.octets_skipped) == (7200, 0, 0)
     assert decoded.by_apid == {11: 7200}
 
@@ -213,13 +215,46 @@ def test_noise_is_no_packet(seed):
     assert len(cut(noise)) == 0
 
 
+@pytest.mark.parametrize("error_control", [False, True])
+def test_packets_behind_octets_of_a_recorder_are_found_and_damage_costs_no_other(error_control):
+    form, rng = PacketForm(error_control), np.random.default_rng(3)
+    packets = capture(200, 4)
+    if error_control:
+        packets = [
+            append_crc(packet[:4] + (len(packet) - 5).to_bytes(2, "big") + packet[6:]) for packet in packets
+        ]
+    stream = b"".join(rng.bytes(12) + packet for packet in packets)
+    assert find_prefix(np.frombuffer(stream, dtype=np.uint8), form) == 12
+    prefixed = replace(form, prefix_octets=12)
+    whole = cut_packets(stream, form=prefixed)
+    assert (list(whole.packets(stream)), whole.octets_skipped) == (packets, 0)
+    at = int(whole.offsets[50])
+    damaged = stream[: at + 4] + bytes((0x7F,)) + stream[at + 5 :]  # its length
+    found = list(cut_packets(damaged, form=prefixed).packets(damaged))
+    assert found == packets[:50] + packets[51:]
+    damaged = stream[: at + 9] + bytes((stream[at + 9] ^ 1,)) + stream[at + 10 :]
+    assert cut_packets(damaged, form=prefixed).crc_errors == error_control
+
+
+def test_packets_of_unknown_checksum_are_kept_where_they_lead_to_known_ones():
+    known = [space_packet(9, bytes(30), k) for k in range(60)]
+    strangers = [space_packet(10 + k % 2, bytes(33), k) for k in range(120)]
+    groups = zip(known, strangers[::2], strangers[1::2], strict=True)
+    packets = [packet for group in groups for packet in group]
+    form = PacketForm(unchecked=frozenset({9}), unknown=frozenset({10, 11}))
+    octets = b"".join(packets)
+    assert list(cut_packets(octets, form=form).packets(octets)) == packets
+    found = cut_packets(octets, form=replace(form, unknown=frozenset()))
+    assert len(list(found.packets(octets))) < 120
+
+
 @given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=3))
 def test_every_octet_of_anything_is_accounted_for(octets, ends):
     packet = space_packet(7, b"abc", 1)
     mixed = octets
     for place in ends:
         mixed = mixed[:place] + packet + mixed[place:]
-    found = cut_packets(mixed, error_control=False)
+    found = cut_packets(mixed, form=UNCHECKED)
     total = int(found.lengths.sum()) + found.octets_skipped + found.octets_idle
     assert total == len(mixed)
 
@@ -232,7 +267,7 @@ def test_idle_packets_are_told_from_the_others():
 
 def test_pieces_of_a_stream_are_refused_without_error_control():
     with pytest.raises(ValueRefused, match="final"):
-        cut_packets(b"abc", error_control=False, final=False)
+        cut_packets(b"abc", form=UNCHECKED, final=False)
 
 
 # in transfer frames
@@ -246,16 +281,16 @@ def check(decoded: DownlinkDecode, packets: list[bytes]) -> None:
 def test_packets_without_error_control_are_taken_out_of_frames():
     packets = capture(400, 7)
     octets = encode_cadus(packets, spacecraft_id=42)
-    check(decode(octets, error_control=False), packets)
+    check(decode(octets, form=UNCHECKED), packets)
     uncoded = encode_cadus(packets, spacecraft_id=42, coding="none", frame_length=223)
-    check(decode(uncoded, error_control=False), packets)
+    check(decode(uncoded, form=UNCHECKED), packets)
 
 
 def test_a_lost_frame_costs_the_packets_that_are_in_it():
     packets = capture(400, 8)
     octets = encode_cadus(packets, spacecraft_id=42)
     size = 1279
-    decoded = decode(octets[: 5 * size] + octets[6 * size :], error_control=False)
+    decoded = decode(octets[: 5 * size] + octets[6 * size :], form=UNCHECKED)
     zone = 1115 - 6 - 2
     ends = np.cumsum([len(p) for p in packets])
     starts = ends - [len(p) for p in packets]

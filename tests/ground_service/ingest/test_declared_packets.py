@@ -38,6 +38,7 @@ from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.crc import crc16
 from tmtc.downlink import decode, encode_cadus
+from tmtc.packets import pack_packet
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T00:00:00Z")
@@ -428,6 +429,22 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, 
         path.write_bytes(octets[start:stop])
         ingest_file(ground, path, spacecraft_id=76, place=Place("s", start))
     assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 120
+
+
+@pytest.mark.parametrize("framed", [False, True])
+def test_packets_that_nothing_declares_are_kept_between_declared_ones(
+    ground: Ground, tmp_path: Path, framed: bool
+) -> None:
+    enter(ground, tmp_path / "m")
+    packets = bus_packets(274)
+    for k in range(49):
+        packets.insert(8 * k + 3, pack_packet(300, bytes(40), sequence_count=k))
+    path = downlink(tmp_path, packets)
+    if not framed:
+        path.write_bytes(b"".join(packets))
+    result = ingest_file(ground, path, spacecraft_id=76)
+    assert (result.packets_new, result.crc_errors, result.octets_skipped) == (len(packets), 0, 0)
+    assert result.unknown == 49
 
 
 def test_a_bare_stream_without_checksums_is_read_in_windows(

@@ -222,6 +222,22 @@ def test_packets_without_error_control_are_read_if_the_mission_says_so(
     result = ingest(ground, tmp_path, capture.files[0], spacecraft_id=SPACECRAFT)
     assert (result.packets, result.octets_skipped) == (7200, 0)
     assert stored(ground) == capture.packets[SPACECRAFT]
+    pass_id = define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=1 << 62, spacecraft_id=SPACECRAFT)
+    assert completeness(ground, pass_id).crc_errors == 0
+
+
+def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(
+    ground: Ground, tmp_path: Path
+) -> None:
+    packets = without_error_control().packets[SPACECRAFT]
+    octets = b"".join(bytes(3) + packet for packet in sorted(packets))
+    with pytest.raises(InvalidInput, match=r"each behind 3 other octets.*packet_prefix_octets = 3"):
+        ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT)
+    text = 'name = "foreign"\n[spacecraft]\nid = 76\n[link]\npacket_checksum = "none"\n'
+    add_mission(ground, f"{text}[link.stations.recorder]\npacket_prefix_octets = 3\n".encode())
+    result = ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT, station="recorder")
+    assert (result.packets, result.octets_skipped) == (7200, 0)
+    assert stored(ground) == packets
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.campaign) for k in (1, 2, 3))])

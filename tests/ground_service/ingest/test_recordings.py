@@ -48,6 +48,10 @@ def test_any_number_of_processes_gives_the_same_archive(several_processes: Archi
     assert several_processes.difference(case_of(number)) == ""
 
 
+def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process: Archive) -> None:
+    assert one_process.difference(case_of(10, ["without checksum", "foreign"])) == ""
+
+
 def test_a_lost_piece_is_a_difference(one_process: Archive) -> None:
     case = case_of(200 * len(ORDERS), ["short frames"])
     case.pieces.pop()
