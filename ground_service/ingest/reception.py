@@ -305,9 +305,8 @@ class Reading:
             )
         if section.start < section.first or section.last < section.stop:
             start, stop = section.start, section.stop
-            if (
-                section.settings is None
-            ):  # packets do not prove themselves: only with what earlier pieces were read with
+            if section.settings is None:
+                # packets do not prove themselves: earlier pieces were read without the octets that are new beyond them
                 start = max(start, 0, *(one for _, one in run.new if one <= section.first))
                 stop = min(stop, run.octets, *(one for one, _ in run.new if one >= section.last))
             reader.exclude(run.read(start, section.first), run.read(section.last, stop))
