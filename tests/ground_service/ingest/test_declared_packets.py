@@ -27,7 +27,7 @@ from ground_service.passes import series
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import live_parameters
 from ground_service.passes.parameters import export_packets, pass_parameters
-from ground_service.passes.service import define_pass, get_pass, parameter_series, trend_series
+from ground_service.passes.service import completeness, define_pass, get_pass, parameter_series, trend_series
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
@@ -147,6 +147,8 @@ def test_packets_without_a_checksum_between_others_become_series(
         "UrgentEvent": sum(p[14] >= 200 for p in bus if p[1] == foreign.APID_EVENT),
     }
     assert listed.outcomes == {"100": {"decoded": 300}, "101": {"decoded": 75}}
+    whole = define_pass(either, name="whole", start_utc_ns=0, stop_utc_ns=1 << 62, spacecraft_id=76)
+    assert completeness(either, whole).crc_errors == 0
 
 
 def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path) -> None:
