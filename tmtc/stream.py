@@ -26,6 +26,9 @@ from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETR
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 _NO_CHECKSUM, _UNKNOWN = 1, 2
 
+PREFIX_LIMIT = 1024
+"""Largest number of octets before each packet."""
+
 LONGEST_PREFIX = 64
 """Largest number of octets before each packet that is found by trial."""
 
@@ -109,6 +112,10 @@ class PacketForm:
     unchecked: frozenset[int] = frozenset()
     unknown: frozenset[int] = frozenset()
     prefix_octets: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.prefix_octets <= PREFIX_LIMIT:
+            raise ValueRefused("packet", "prefix_octets", self.prefix_octets, f"0..{PREFIX_LIMIT}")
 
     @property
     def by_headers(self) -> bool:

@@ -189,6 +189,7 @@ def test_packets_without_error_control_are_checked_only_when_told(foreign, capsy
     assert run(strict) == 0
     assert "each behind 4 other octets" in capsys.readouterr().out
     assert run([*strict, "--prefix-octets", "5"]) == 2
+    assert run([*strict, "--prefix-octets", "-1"]) == 2
 
 
 def test_packets_of_another_mission_are_decoded_through_their_definition(foreign, tmp_path, capsys):
