@@ -263,13 +263,13 @@ def walk_unchecked(
 @njit(nogil=True)
 def proves(
     buffer: RecordArray, q: int, stop: int, packet_type: int, prefix: int, last: RecordArray,
-    is_begin: bool,
+    is_begin: bool, first: bool = False,
 ) -> bool:  # fmt: skip
     """Whether packets without error control begin at `q`.
 
     Headers must follow each other until one continues the sequence counts of its APID: those before the damage, or
     those of another packet of this chain. At the beginning of a segment it is also enough that they lead to its end, or
-    that three follow each other.
+    that three follow each other. `first`: the count of the first packet of the chain must continue or be continued.
     """
     apids = np.empty(CHAIN, dtype=np.int64)
     counts = np.empty(CHAIN, dtype=np.int64)
@@ -284,9 +284,9 @@ def proves(
         counts[k] = (np.int64(buffer[p + 2]) & 0x3F) << 8 | np.int64(buffer[p + 3])
         if apids[k] != 0x7FF:
             before = last[apids[k]]
-            if before >= 0 and 1 <= (counts[k] - before) % 16384 <= _AHEAD:
+            if before >= 0 and 1 <= (counts[k] - before) % 16384 <= _AHEAD and (k == 0 or not first):
                 return True
-            for j in range(k):
+            for j in range(min(k, 1) if first else k):
                 if apids[j] == apids[k] and (counts[k] - counts[j]) % 16384 == 1:
                     return True
         p += length + prefix
@@ -302,8 +302,18 @@ def search_unchecked(
     for q in range(first, stop):
         if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, prefix, last, False):
             end = q + header_at(buffer, q, stop, packet_type)
-            if _is_unchecked(buffer, q, unchecked) or is_idle(buffer, q) or _crc(buffer, q, end, tables) == 0:
+            if is_idle(buffer, q) or (
+                not _is_unchecked(buffer, q, unchecked) and _crc(buffer, q, end, tables) == 0
+            ):
                 return q
+            if not _is_unchecked(buffer, q, unchecked):
+                continue
+            if proves(buffer, q, stop, packet_type, prefix, last, False, True):
+                return q
+            for r in range(q + 1, end):  # any header can lead to a packet by chance: one in it may be surer
+                if proves(buffer, r, stop, packet_type, prefix, last, False, True):
+                    return r
+            return q
     return stop
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from typing import NoReturn
 
 import numpy as np
 from sqlalchemy import Connection
@@ -276,7 +277,9 @@ class Reading:
             cut = cut_packets(window, form=form)
             packets = int(np.count_nonzero(cut.crc_ok))
             fills = 2 * int((cut.lengths[cut.crc_ok] + form.prefix_octets).sum()) >= window.size
-            if fills if form.by_headers or form.unchecked else packets >= 2 or (packets and fills):
+            # two right checksums prove packets; packets without one must fill half of the window
+            is_weak = form.by_headers or bool(form.unchecked)
+            if fills if is_weak else packets >= 2 or (packets and fills):
                 return True
             if form.by_headers:
                 return False
@@ -329,7 +332,7 @@ class Reading:
                 )
         return self.definitions[spacecraft]
 
-    def _refuse(self, found: str, expected: str = "a stream of CADUs or of space packets") -> None:
+    def _refuse(self, found: str, expected: str = "a stream of CADUs or of space packets") -> NoReturn:
         """Refuse a piece.
 
         Raises

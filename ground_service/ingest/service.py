@@ -191,17 +191,21 @@ def _ingest(ground: Ground, piece: Piece, progress: Progress | None = None) -> I
         try:
             reading = Reading(ground, piece, progress)
             reading.read()
+            readings = [reading]
             for other in reading.readable_now():
                 with suppress(InvalidInput):
-                    Reading(ground, other).read()
-            reading.decode()
+                    again = Reading(ground, other)
+                    again.read()
+                    readings.append(again)
+            for one in readings:
+                one.decode()
         except PASSING:
             raise
         except (GroundError, TmtcError) as error:
             with ground.database.writing() as connection:
                 store.fail_ingest(connection, piece.ingest_id, str(error), utc_now_ns())
             raise
-    return reading.result
+    return [one.result for one in readings if one.piece.ingest_id == piece.ingest_id][-1]
 
 
 def apply_definition(ground: Ground, vehicle: int) -> int:

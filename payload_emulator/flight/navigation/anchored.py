@@ -3,7 +3,7 @@
 It reads neither truth nor the anchor ephemeris. `step` is a function from a frozen state and the observation of one
 frame to a new state and a report of all decisions:
 
-1. predict the orbit to the time of the frame (`prediction`);
+1. predict the orbit to the time of the frame (`correction`, `dynamics`);
 2. associate detections with craters of the map (`association`) and correct the estimate (`correction`);
 3. where image and map keep disagreeing, widen the search, then search without a prior (`recovery`);
 4. monitor the noise of the attitude (`attitude_monitor`);

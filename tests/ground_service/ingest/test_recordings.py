@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, archive, case_of
+from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, case_of, ingest
+from ground_service.ingest.reception import Reading, Run
+from ground_service.ingest.service import Place, ingest_file
 
 FEW = 2 * len(KINDS)
 """Cases of a run in one process; the campaign has 500."""
@@ -50,6 +52,24 @@ def test_any_number_of_processes_gives_the_same_archive(several_processes: Archi
 
 def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process: Archive) -> None:
     assert one_process.difference(case_of(10, ["without checksum", "foreign"])) == ""
+
+
+def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
+    one_process: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (recording,) = case_of(3, ["without proof"]).recordings
+    rest, ground = Piece(recording, 600, len(recording.octets)), one_process.ground
+
+    def just_before_the_rest(_reading: Reading, _run: Run) -> list[object]:
+        monkeypatch.undo()
+        ingest(ground, rest, "late", "rest")
+        return []
+
+    monkeypatch.setattr(Reading, "_links_of_recording", just_before_the_rest)
+    path = ground.home / "first"
+    path.write_bytes(recording.octets[:600])
+    result = ingest_file(ground, path, instance="late", place=Place("r", 0))
+    assert (result.frames, result.octets_pending) == (2, 80)
 
 
 def test_a_lost_piece_is_a_difference(one_process: Archive) -> None:
