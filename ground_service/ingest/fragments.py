@@ -107,12 +107,11 @@ def _paths(begin: Fragment, behind: Lookup) -> Iterator[list[Fragment]]:
         if not waiting:
             return
         path = waiting.pop()
-        if path[-1].ends:
-            yield path
-            continue
         octets = b"".join(one.octets for one in path)
         length = packet_length(octets)
-        if len(octets) < PACKET_MAX_LENGTH and (length == UNKNOWN or len(octets) < length):
+        if path[-1].ends or len(octets) == length:  # it can end with a frame that nothing follows
+            yield path
+        elif len(octets) < PACKET_MAX_LENGTH and (length == UNKNOWN or len(octets) < length):
             fit = UNKNOWN if length == UNKNOWN else length - len(octets)
             waiting += [[*path, one] for one in behind(path[-1], fit) if one not in path]
 
