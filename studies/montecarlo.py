@@ -35,6 +35,7 @@ from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look
 from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.session.distortion import regional_field
 from payload_emulator.sim.detector import SimulatedDetector
 from tmtc.tables import (
     CatalogueTable,
@@ -51,7 +52,6 @@ from tmtc.tables import (
 _NS = 1_000_000_000
 _ORIENTATION_STEP_NS = 7_200 * _NS
 _PUSH_S = 60.0
-_WAVES = 100
 _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 
 
@@ -416,34 +416,6 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
         sigma_m,
     )
     return unpack_catalogue_table(pack_catalogue_table(moved))
-
-
-def regional_field(
-    latitude_rad: FloatArray, longitude_rad: FloatArray, correlation_rad: float, rng: np.random.Generator
-) -> FloatArray:
-    """Return three random fields (n, 3) of variance 1 and covariance exp(-d / correlation) over the chord d.
-
-    Sums of waves, with wave vectors from the spectral density of the covariance in three dimensions.
-
-    References
-    ----------
-    Rahimi, Recht (2007), Random features for large-scale kernel machines.
-    """
-    level = np.cos(latitude_rad)
-    places = np.stack(
-        [level * np.cos(longitude_rad), level * np.sin(longitude_rad), np.sin(latitude_rad)], axis=1
-    )
-    fields = []
-    for _ in range(3):
-        vectors = rng.standard_normal((_WAVES, 3)) / (
-            correlation_rad * np.abs(rng.standard_normal((_WAVES, 1)))
-        )
-        phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
-        total = np.zeros(latitude_rad.size)
-        for vector, phase in zip(vectors, phases, strict=True):
-            total += np.cos(places @ vector + phase)
-        fields.append(total * math.sqrt(2.0 / _WAVES))
-    return np.stack(fields, axis=1)
 
 
 def _truth(

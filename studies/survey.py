@@ -126,6 +126,9 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
         )
     unseen = unseen_share(world)
     level = level_text(level_of("real-terrain" if world.terrain.is_real else "procedural", unseen), unseen)
+    navigation = world.scenario.navigation
+    if distortion_m := navigation.catalogue_distortion_m:
+        level += f", map distorted by {distortion_m:g} m over {navigation.catalogue_distortion_deg:g}°"
     return SurveySession(
         windows=_windows(world, judged),
         detections=judged.detections.sum(),

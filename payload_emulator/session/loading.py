@@ -33,6 +33,7 @@ from payload_emulator.flight.payload import FlightParameters, FlightTables, Payl
 from payload_emulator.flight.ports import Board
 from payload_emulator.flight.vision.detections import Detector
 from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
+from payload_emulator.session.distortion import displaced
 from payload_emulator.session.instruments import flight_parameters
 from payload_emulator.session.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.session.scenario import Scenario
@@ -261,18 +262,22 @@ def _attitude_errors(scenario: Scenario) -> CommonErrors:
 
 def _catalogue_octets(scenario: Scenario, catalogue: CraterCatalogue) -> bytes:
     """The anchoring catalogue as uploaded: the table the scenario names, else one of the terrain's craters."""
-    named = scenario.navigation.anchoring_catalogue
-    if not named:
-        return pack_catalogue_table(onboard_catalogue(scenario, catalogue))
-    try:
-        octets = Path(named).read_bytes()
-    except OSError as error:
-        raise TableError(
-            f"navigation.anchoring_catalogue {named}: expected a table made by linna catalogue curate, "
-            f"found {error.strerror}"
-        ) from None
-    unpack_catalogue_table(octets)
-    return octets
+    navigation = scenario.navigation
+    if named := navigation.anchoring_catalogue:
+        try:
+            octets = Path(named).read_bytes()
+        except OSError as error:
+            raise TableError(
+                f"navigation.anchoring_catalogue {named}: expected a table made by linna catalogue curate, "
+                f"found {error.strerror}"
+            ) from None
+    else:
+        octets = pack_catalogue_table(onboard_catalogue(scenario, catalogue))
+    table = unpack_catalogue_table(octets)
+    if not (distortion_m := navigation.catalogue_distortion_m):
+        return octets
+    correlation_deg = navigation.catalogue_distortion_deg
+    return pack_catalogue_table(displaced(table, distortion_m, correlation_deg, scenario.seed))
 
 
 def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:

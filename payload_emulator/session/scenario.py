@@ -188,7 +188,9 @@ class NavigationSection:
 
     The initial errors are of the state that starts the filter (1 sigma per axis declared, that length drawn). Errors of
     the on-board catalogue come on top of those that the terrain's own catalogue has. `anchoring_catalogue` names a
-    table made by `linna catalogue curate`; it is uploaded as it is, in place of the terrain's catalogue.
+    table made by `linna catalogue curate`; it is uploaded in place of the terrain's catalogue. The uploaded craters are
+    displaced by a smooth distortion of the map of `catalogue_distortion_m` (1 sigma east and north) over an arc of
+    `catalogue_distortion_deg`, of which the payload does not know.
     """
 
     estimators: tuple[str, ...] = ("paper", "spherical", "anchored")
@@ -201,6 +203,8 @@ class NavigationSection:
     catalogue_max_diameter_km: float = 30.0
     catalogue_error_fraction_of_diameter: float = 0.0
     catalogue_height_error_m: float = 0.0
+    catalogue_distortion_m: float = 0.0
+    catalogue_distortion_deg: float = 10.0
     safety_timeout_s: float = 0.0
 
 

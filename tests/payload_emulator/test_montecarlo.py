@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.frames import rtn_from_inertial
 from lunar.timescales import tdb_s_from_utc_ns
@@ -16,6 +18,9 @@ from payload_emulator.flight.navigation.anchored_parameters import AnchoredParam
 from payload_emulator.flight.navigation.dynamics import ProcessNoise, process_noise
 from payload_emulator.flight.navigation.filter import CommonErrors
 from payload_emulator.flight.navigation.outcomes import Outcome
+from payload_emulator.session import loading
+from payload_emulator.session.distortion import regional_field
+from payload_emulator.session.scenario import load_scenario
 from payload_emulator.sim.detector import SimulatedDetector
 from studies import montecarlo
 from studies.montecarlo import (
@@ -26,10 +31,10 @@ from studies.montecarlo import (
     consistency,
     fly,
     fly_many,
-    regional_field,
     verdict,
 )
-from studies.montecarlo_world import TRACKS, standard_case
+from studies.montecarlo_world import TRACKS, crater_world, standard_case
+from tmtc.tables import unpack_catalogue_table
 
 # Tuned on other seeds than the tests use: what degree 50 leaves out of the field of degree 60 in the fixture.
 NOISE = ProcessNoise(
@@ -257,6 +262,32 @@ def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle() -> None:
     together = np.corrcoef(fields.T)
     assert together[0, 1] == pytest.approx(np.exp(-0.067), abs=0.06)
     assert together[0, 2] == pytest.approx(np.exp(-0.989), abs=0.12)
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(
+    tmp_path: Path, named: bool
+) -> None:
+    scenario, craters = load_scenario("selenita"), crater_world()
+    plain = loading._catalogue_octets(scenario, craters)
+    if named:
+        (tmp_path / "table.bin").write_bytes(plain)
+    navigation = replace(
+        scenario.navigation,
+        anchoring_catalogue=str(tmp_path / "table.bin") if named else "",
+        catalogue_distortion_m=80.0,
+        catalogue_distortion_deg=1.0,
+    )
+    one, other = (
+        unpack_catalogue_table(octets)
+        for octets in (plain, loading._catalogue_octets(replace(scenario, navigation=navigation), craters))
+    )
+    first, second = np.argsort(one.ids), np.argsort(other.ids)
+    north = other.latitude_rad[second] - one.latitude_rad[first]
+    east = np.sin(other.longitude_rad[second] - one.longitude_rad[first]) * np.cos(one.latitude_rad[first])
+    assert MOON_RADIUS_M * np.std(north) == pytest.approx(80.0, rel=0.05)
+    assert MOON_RADIUS_M * np.std(east) == pytest.approx(80.0, rel=0.05)
+    np.testing.assert_array_equal(one.sigma_m[first], other.sigma_m[second])
 
 
 def test_slow_errors_wander_with_the_memory_they_are_given() -> None:
