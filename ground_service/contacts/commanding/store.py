@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 from sqlalchemy import BigInteger, Connection, and_, cast, func, or_, select, update
 from sqlalchemy.sql import Select
 
-from ground_service.contacts.commanding.core import SentCommand, VerificationReport, fate_of
+from ground_service.contacts.commanding.core import CommandFate, SentCommand, VerificationReport, fate_of
 from ground_service.contacts.commanding.model import (
     CommandOctets,
     CommandRecord,
@@ -188,7 +189,7 @@ def get_record(connection: Connection, command_id: int) -> CommandRecord:
 
 def get_view(connection: Connection, command_id: int, now_utc_ns: int) -> CommandView:
     """Return a telecommand and its verification."""
-    return _view(connection, get_record(connection, command_id), now_utc_ns)
+    return _views(connection, [get_record(connection, command_id)], now_utc_ns)[0]
 
 
 def list_views(
@@ -196,7 +197,7 @@ def list_views(
 ) -> tuple[list[CommandView], int]:
     """Return a page of the telecommands, newest first, and their number."""
     rows, total = repository.newest(connection, TELECOMMANDS, asked)
-    return [_view(connection, CommandRecord.of(row), now_utc_ns) for row in rows], total
+    return _views(connection, [CommandRecord.of(row) for row in rows], now_utc_ns), total
 
 
 def views_of_window(connection: Connection, window_id: int, now_utc_ns: int) -> list[CommandView]:
@@ -204,7 +205,7 @@ def views_of_window(connection: Connection, window_id: int, now_utc_ns: int) -> 
     query = select(TELECOMMANDS).where(
         TELECOMMANDS.c.window_id == window_id, TELECOMMANDS.c.state != "rejected"
     )
-    return _views(connection, query, now_utc_ns)
+    return _selected(connection, query, now_utc_ns)
 
 
 def views_of_unnoted_timeouts(
@@ -218,7 +219,7 @@ def views_of_unnoted_timeouts(
         due >= since_utc_ns,
         due < until_utc_ns,
     )
-    return _views(connection, query, now_utc_ns)
+    return _selected(connection, query, now_utc_ns)
 
 
 def ids_of_windows(connection: Connection, windows: Sequence[int]) -> dict[int, list[int]]:
@@ -354,48 +355,68 @@ def _readable_reports(connection: Connection, vehicle: int) -> tuple[Any, ...]:
     )
 
 
-def _views(connection: Connection, query: Select[Any], now_utc_ns: int) -> list[CommandView]:
+def _selected(connection: Connection, query: Select[Any], now_utc_ns: int) -> list[CommandView]:
     records = [CommandRecord.of(row) for row in connection.execute(query).mappings().all()]
-    return [_view(connection, record, now_utc_ns) for record in records]
+    return _views(connection, records, now_utc_ns)
 
 
-def _view(connection: Connection, record: CommandRecord, now_utc_ns: int) -> CommandView:
-    vehicle = get_vehicle(connection, record.vehicle_id)
-    sent = _sent(connection, record)
-    if sent is None:
-        return CommandView(record, vehicle.ccsds_id, vehicle.instance, None)
+def _views(connection: Connection, records: Sequence[CommandRecord], now_utc_ns: int) -> list[CommandView]:
+    """Return telecommands with their verification, in the same order."""
+    views: dict[int, CommandView] = {}
+    for key in {record.vehicle_id for record in records}:
+        vehicle = get_vehicle(connection, key)
+        mine = [record for record in records if record.vehicle_id == key]
+        fates = _fates(connection, key, mine, now_utc_ns)
+        views |= {
+            one.id: CommandView(one, vehicle.ccsds_id, vehicle.instance, fates.get(one.id)) for one in mine
+        }
+    return [views[record.id] for record in records]
+
+
+def _fates(
+    connection: Connection, vehicle: int, records: Sequence[CommandRecord], now_utc_ns: int
+) -> dict[int, CommandFate]:
+    """Return what telemetry says of the telecommands of a vehicle that were sent, by their ids."""
+    sent = {one.id: known for one in records if (known := _sent(one)) is not None}
+    if not sent:
+        return {}
+    requests = {one.request_id for one in sent.values()}
     reports = connection.execute(
-        select(
-            VERIFICATIONS.c.subtype,
-            VERIFICATIONS.c.request_id,
-            VERIFICATIONS.c.ticks,
-            VERIFICATIONS.c.step,
-            VERIFICATIONS.c.failure_code,
-        ).where(
-            *_readable_reports(connection, record.vehicle_id),
-            VERIFICATIONS.c.ticks > sent.sent_after_ticks,
-            VERIFICATIONS.c.request_id == sent.request_id,
+        select(*(VERIFICATIONS.c[one.name] for one in fields(VerificationReport))).where(
+            *_readable_reports(connection, vehicle),
+            VERIFICATIONS.c.ticks > min(one.sent_after_ticks for one in sent.values()),
+            VERIFICATIONS.c.request_id.in_(requests),
         )
     )
-    fate = fate_of(sent, [VerificationReport(*report) for report in reports], now_utc_ns)
-    return CommandView(record, vehicle.ccsds_id, vehicle.instance, fate)
+    told: dict[int, list[VerificationReport]] = {}
+    for row in reports:
+        told.setdefault(row.request_id, []).append(VerificationReport(*row))
+    copies = connection.execute(
+        select(TELECOMMANDS.c.request_id, TELECOMMANDS.c.id, TELECOMMANDS.c.sent_after_ticks).where(
+            TELECOMMANDS.c.vehicle_id == vehicle,
+            TELECOMMANDS.c.request_id.in_(requests),
+            TELECOMMANDS.c.sent_after_ticks.is_not(None),
+        )
+    ).all()
+    fates = {}
+    for key, one in sent.items():
+        later = [ticks for request, number, ticks in copies if request == one.request_id and number > key]
+        fates[key] = fate_of(
+            replace(one, repeated_after_ticks=min(later, default=None)),
+            told.get(one.request_id, ()),
+            now_utc_ns,
+        )
+    return fates
 
 
-def _sent(connection: Connection, record: CommandRecord) -> SentCommand | None:
+def _sent(record: CommandRecord) -> SentCommand | None:
     """Return what verification needs about a sent telecommand; None if it was not sent."""
     if record.request_id is None or record.sent_utc_ns is None or record.sent_after_ticks is None:
         return None
-    repeated = connection.execute(
-        select(func.min(TELECOMMANDS.c.sent_after_ticks)).where(
-            TELECOMMANDS.c.vehicle_id == record.vehicle_id,
-            TELECOMMANDS.c.request_id == record.request_id,
-            TELECOMMANDS.c.id > record.id,
-        )
-    ).scalar()
     return SentCommand(
         request_id=record.request_id,
         sent_utc_ns=record.sent_utc_ns,
         sent_after_ticks=record.sent_after_ticks,
-        repeated_after_ticks=repeated,
+        repeated_after_ticks=None,
         timeout_ns=record.timeout_s * NANOSECONDS_PER_SECOND,
     )

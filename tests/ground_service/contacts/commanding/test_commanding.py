@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sqlalchemy import select, update
+from sqlalchemy import event, select, update
 
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.core import SentCommand, VerificationReport, fate_of
@@ -543,6 +543,18 @@ def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) 
     assert listed(limit=2, offset=1) == ([ids[2], ids[1]], 4)
     assert listed(state="queued") == ([ids[3], ids[2], ids[0]], 3)
     assert listed(state="released") == ([ids[1]], 1)
+
+
+def test_a_list_of_sent_commands_takes_as_many_statements_as_one_of_them(ground: Ground) -> None:
+    statements: list[str] = []
+    event.listen(ground.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    counts = []
+    for _ in range(3):
+        sent(ground)
+        statements.clear()
+        ground.read(list_telecommands, TelecommandFilter())
+        counts.append(len(statements))
+    assert len(set(counts)) == 1
 
 
 def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last(
