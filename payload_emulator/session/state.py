@@ -17,7 +17,7 @@ import json
 import os
 import re
 from collections import Counter, OrderedDict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from enum import Enum
 from io import BytesIO
 from pathlib import Path
@@ -39,6 +39,7 @@ _SEQUENCES: dict[str, type] = {
 }
 _PLAIN_NEW: object = object.__new__
 _MAPPINGS = (dict, Counter, OrderedDict)
+_UNSET = object()
 
 
 def pack_state(scenario: str, values: Mapping[str, Any], known: Mapping[str, object]) -> bytes:
@@ -135,6 +136,7 @@ class _Writer:
         self._numbers: dict[int, int] = {}
         # A value that is dropped while others are written would give away its id.
         self._kept: list[object] = []
+        self._classes: dict[type, tuple[str, list[str]]] = {}
         self.octets: dict[bytes, int] = {}
 
     def node(self, value: Any) -> Any:
@@ -147,6 +149,8 @@ class _Writer:
         self._numbers[id(value)] = len(self._kept)
         self._kept.append(value)
         kind = type(value)
+        if kind in self._classes:
+            return self._object(value)
         if isinstance(value, Enum):
             return ["enum", _name(kind), self.node(value.value)]
         if kind in (bytes, bytearray):
@@ -166,8 +170,18 @@ class _Writer:
         if kind is np.random.Generator and isinstance(value.bit_generator, np.random.PCG64):
             return ["PCG64", self.node(dict(value.bit_generator.state))]
         if kind.__module__.partition(".")[0] in _PACKAGES and kind.__new__ is _PLAIN_NEW:
-            return ["object", _name(kind), *([name, self.node(one)] for name, one in _attributes(value))]
+            self._classes[kind] = _name(kind), _slots(kind)
+            return self._object(value)
         raise RecordError(f"state: expected values that can be kept, found {kind.__name__}")
+
+    def _object(self, value: object) -> list[Any]:
+        """Return the attributes of an instance of a class whose slots are known."""
+        name, slots = self._classes[type(value)]
+        found = [(slot, getattr(value, slot, _UNSET)) for slot in (*slots, *getattr(value, "__dict__", ()))]
+        nodes = (
+            [slot, one if type(one) in _PLAIN else self.node(one)] for slot, one in found if one is not _UNSET
+        )
+        return ["object", name, *nodes]
 
     def _numbers_of(self, value: Any) -> list[Any]:
         """Return an array, a view of one, or a number of numpy."""
@@ -264,12 +278,9 @@ class _Reader:
         return one
 
 
-def _attributes(value: object) -> Iterator[tuple[str, Any]]:
-    """Yield the attributes of an instance by their names."""
-    slots = [name for one in type(value).__mro__ for name in getattr(one, "__slots__", ())]
-    for name in (*slots, *getattr(value, "__dict__", ())):
-        if name not in ("__weakref__", "__dict__") and hasattr(value, name):
-            yield name, getattr(value, name)
+def _slots(kind: type) -> list[str]:
+    slots = [name for one in kind.__mro__ for name in getattr(one, "__slots__", ())]
+    return [name for name in slots if name not in ("__weakref__", "__dict__")]
 
 
 def _name(kind: type) -> str:
