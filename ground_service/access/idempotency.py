@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
 
 from ground_service.access import store
 from ground_service.clock import utc_now_ns
@@ -17,6 +19,27 @@ from ground_service.errors import Conflict, GroundError, StoreError
 from ground_service.ground import Ground
 
 Work = Callable[[], dict[str, Any]]
+Added = TypeVar("Added", bound=BaseModel)
+
+
+def added_once(
+    ground: Ground,
+    kind: type[Added],
+    actor: str,
+    key: str | None,
+    given: BaseModel,
+    work: Callable[[], Added],
+) -> Added:
+    """Return the entity that `work` adds as `once` does; its kind is the operation."""
+    answer = once(
+        ground,
+        actor=actor,
+        operation=kind.__name__,
+        key=key,
+        request=given.model_dump(mode="json"),
+        work=lambda: work().model_dump(mode="json"),
+    )
+    return kind.model_validate(answer, strict=False)
 
 
 def once(

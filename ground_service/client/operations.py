@@ -350,10 +350,6 @@ class Operations(Connection):
     def add_mission(self, file: Path | bytes, *, name: str | None = None) -> missions.MissionDetail:
         """Add a mission description (TOML) as a revision; the same content gives the same revision."""
 
-    @operation("POST /missions/check")
-    def check_mission(self, file: Path | bytes) -> missions.MissionCheck:
-        """Check a mission description and compare it with the revision in force of its spacecraft; add nothing."""
-
     @operation("GET /missions/{revision}")
     def get_mission(self, revision: str) -> missions.MissionDetail:
         """Show a revision with its document; viewers see the hosts of webhooks only, not what may be a token."""
@@ -409,6 +405,10 @@ class Operations(Connection):
         """List the received time reports with their light time and residuals."""
 
     # planning
+
+    @operation("POST /missions/check")
+    def check_mission(self, file: Path | bytes, *, plan: bool = False) -> missions.MissionCheck:
+        """Check a mission description and compare it with the revision in force of its spacecraft; add nothing."""
 
     @operation("POST /windows/search", body="constraints")
     def search_windows(self, constraints: Document) -> planning.SearchResult:

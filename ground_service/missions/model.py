@@ -737,6 +737,10 @@ class MissionCheck(Entity):
     faults: tuple[str, ...] = Field(description="One line for each fault; empty if it can be added")
     unknown: tuple[str, ...] = Field(description="Keys that it does not state")
     changes: tuple[str, ...] = Field(description="Unified difference to the revision in force")
+    windows: tuple[tuple[UtcTime, UtcTime], ...] = Field(default=(), description="Windows of the dry run")
+    contradictions: tuple[str, ...] = Field(
+        default=(), description="What the dry run found, such as what excludes all windows"
+    )
 
 
 class HeldCatalogue(Entity):

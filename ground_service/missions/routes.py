@@ -10,7 +10,7 @@ from ground_service.access.security import Operator, UploadOf, Viewer, add_list
 from ground_service.http.common import API_PREFIX, GroundOf, Name, upload_body
 from ground_service.http.requests import operations, problems
 from ground_service.missions import catalogues, service, store
-from ground_service.missions.model import HeldCatalogue, MissionCheck, MissionDetail
+from ground_service.missions.model import HeldCatalogue, MissionDetail
 
 UPLOAD_PATHS = (f"{API_PREFIX}/catalogues",)
 
@@ -35,12 +35,6 @@ def add_mission(
     Only an administrator may change which telecommands need a second person.
     """
     return service.add_mission(ground, document, source=name, actor=caller.name, caller=caller)
-
-
-@missions.post("/missions/check")
-def check_mission(ground: GroundOf, caller: Operator, document: Text) -> MissionCheck:
-    """Check a mission description and compare it with the revision in force of its spacecraft; add nothing."""
-    return service.check_mission(ground, document, caller=caller)
 
 
 @missions.get("/missions/{revision}")

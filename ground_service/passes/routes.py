@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from ground_service.access.idempotency import once
+from ground_service.access.idempotency import added_once
 from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
 from ground_service.errors import InvalidInput
 from ground_service.http.common import (
@@ -99,7 +99,7 @@ def define_pass(
 ) -> PassDetail:
     """Define a pass: an interval of a spacecraft's time."""
 
-    def define() -> dict[str, Any]:
+    def define() -> PassDetail:
         pass_id = service.define_pass(
             ground,
             name=given.name,
@@ -108,17 +108,9 @@ def define_pass(
             spacecraft_id=given.spacecraft_id,
             instance=given.instance,
         )
-        return service.get_pass(ground, pass_id).model_dump(mode="json")
+        return service.get_pass(ground, pass_id)
 
-    answer = once(
-        ground,
-        actor=caller.name,
-        operation="pass",
-        key=idempotency_key,
-        request=given.model_dump(mode="json"),
-        work=define,
-    )
-    return PassDetail.model_validate(answer)
+    return added_once(ground, PassDetail, caller.name, idempotency_key, given, define)
 
 
 @passes.get("/passes/{pass_id}")

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ground_service.clock import mission_now_ns
 from ground_service.contacts.links import service as links
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.missions.definitions import read_mission_file
 from ground_service.missions.ephemerides.service import add_ephemeris
-from ground_service.missions.service import add_mission
+from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.service import add_mission, read_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
 from ground_service.planning.model import Window, WindowFilter
@@ -23,8 +28,13 @@ from ground_service.toml import parse_table, read_json
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
 
-CATALOGUE, REFERENCE, REQUEST = "craters.csv", "reference.oem", "request.json"
+MISSION, CATALOGUE, REFERENCE, REQUEST = "mission.toml", "craters.csv", "reference.oem", "request.json"
 """Files beside a mission description that the ground posts; a description can do without the catalogue."""
+
+ASSUMED = {"name": "dry run", "windows": 10, "period_days": 1.0, "horizon_days": 1.0}
+"""Request of a dry run in a service without one of the spacecraft."""
+
+NO_EPHEMERIS = "no ephemeris of the spacecraft covers the time from now on"
 
 OPERATOR, APPROVER = "dry run", "dry run, second person"
 
@@ -37,25 +47,52 @@ class DryRun:
     faults: tuple[str, ...] = ()
 
 
-def fly(mission: Path, data: DataFolder) -> DryRun:
-    """Plan the standing request beside a mission description and release its telecommands; nothing is sent.
+def rehearsed(ground: Ground, octets: bytes) -> DryRun:
+    """Make the dry run of a description over the ephemeris and the active requests of its spacecraft in a service.
 
-    The time is that at which the reference ephemeris begins. A person approves windows that are not approved
-    automatically, another one releases them.
+    Without a request it is one of ten windows in a day. Windows in the plan of the service do not count.
+    """
+    craft, now = read_mission(octets)[0].spacecraft, mission_now_ns()
+    with ground.database.reading() as connection:
+        held = covering_ephemerides(connection, now, 1 << 62, craft.id)
+        listed = request_store.list_requests(connection, Paging(limit=1000)).items
+    mine = [one.sha256 for one in held if craft.is_object(one.object_name)]
+    if not mine:
+        return DryRun(faults=(NO_EPHEMERIS,))
+    asked = [
+        one.terms.model_dump(mode="json", exclude_none=True) | {"name": one.name, "spacecraft_id": craft.id}
+        for one in listed
+        if one.spacecraft_id == craft.id and one.state == "active"
+    ]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / MISSION).write_bytes(octets)
+        (folder / REQUEST).write_text(json.dumps(asked or [ASSUMED | {"spacecraft_id": craft.id}]))
+        shutil.copyfile(ground.files.path(mine[0]), folder / REFERENCE)
+        flown = fly(folder / MISSION, ground.data, now)
+    return replace(flown, faults=tuple(one.replace(f"{folder}/", "") for one in flown.faults))
+
+
+def fly(mission: Path, data: DataFolder, now_utc_ns: int = 0) -> DryRun:
+    """Plan the standing requests beside a mission description and release their telecommands; nothing is sent.
+
+    The time is that at which the reference ephemeris begins, or `now_utc_ns` if that is later. A person approves
+    windows that are not approved automatically, another one releases them.
     """
     with tempfile.TemporaryDirectory() as home, open_ground(Path(home), data) as ground:
         try:
-            request_id, start_utc_ns = _posted(ground, mission)
+            requests, begin_utc_ns = _posted(ground, mission)
+            start_utc_ns = max(begin_utc_ns, now_utc_ns)
             standing.plan_tick(ground, start_utc_ns)
-            faults = list(_faults(ground, mission, request_id, start_utc_ns))
+            faults = list(_faults(ground, mission, requests, start_utc_ns))
             windows = ground.read(store.list_windows, WindowFilter()).items
         except (GroundError, LunarError) as error:
             return DryRun(faults=(str(error),))
     return DryRun(tuple(sorted(windows, key=lambda one: one.start.utc_ns)), tuple(faults))
 
 
-def _posted(ground: Ground, mission: Path) -> tuple[int, int]:
-    """Add the files to a service; return the request and the time at which the ephemeris begins."""
+def _posted(ground: Ground, mission: Path) -> tuple[list[int], int]:
+    """Add the files to a service; return the requests and the time at which the ephemeris begins."""
     folder = mission.parent
     for name in (REFERENCE, REQUEST):
         if not (folder / name).is_file():
@@ -66,23 +103,27 @@ def _posted(ground: Ground, mission: Path) -> tuple[int, int]:
     reference = add_ephemeris(
         ground, ground.files.put_file(folder / REFERENCE), name=REFERENCE, precedence=0, actor=OPERATOR
     )
-    path = folder / REQUEST
-    given = parse_table(StandingRequestIn, read_json(path.read_bytes(), str(path)), str(path))
-    if given.start is None:
-        given = given.model_copy(update={"start": reference.start})
-    return standing.add_request(ground, given, actor=OPERATOR).id, reference.start.utc_ns
+    path, requests = folder / REQUEST, []
+    found = read_json(path.read_bytes(), str(path))
+    for one in found if isinstance(found, list) else [found]:
+        given = parse_table(StandingRequestIn, one, str(path))
+        if given.start is None:
+            given = given.model_copy(update={"start": reference.start})
+        requests.append(standing.add_request(ground, given, actor=OPERATOR).id)
+    return requests, reference.start.utc_ns
 
 
-def _faults(ground: Ground, mission: Path, request_id: int, now: int) -> Iterator[str]:
+def _faults(ground: Ground, mission: Path, requests: list[int], now: int) -> Iterator[str]:
     """Yield what contradicts the flight, as place, expected and found; release what a person has to release."""
     if (reason := _no_uplink(ground, now)) is not None:
         yield str(InvalidInput(str(mission), "links", "contacts of a link with an uplink", reason))
     with ground.database.reading() as connection:
-        plan = request_store.get_plan(connection, request_id)
+        plans = [request_store.get_plan(connection, one) for one in requests]
         windows = store.list_windows(connection, WindowFilter()).items
     if not windows:
-        reasons = Counter(one.reason for one in plan.candidates if one.reason is not None)
-        found = plan.reason or next((reason for reason, _ in reasons.most_common(1)), "none")
+        reasons = Counter(one.reason for plan in plans for one in plan.candidates if one.reason is not None)
+        told = [one.reason for one in plans if one.reason is not None]
+        found = next(iter(told or dict(reasons.most_common(1))), "none")
         yield str(InvalidInput(str(mission.parent / REQUEST), "", "windows that can be planned", found))
     for one in windows:
         try:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import Response
 
-from ground_service.access.idempotency import once
+from ground_service.access.idempotency import added_once
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PassId
 from ground_service.http.requests import operations, problems
@@ -34,18 +32,10 @@ def add_request(
 ) -> StandingRequest:
     """Add a standing request; the planner fills the coming days from then on."""
 
-    def add() -> dict[str, Any]:
-        return standing.add_request(ground, request, actor=caller.name).model_dump(mode="json")
+    def add() -> StandingRequest:
+        return standing.add_request(ground, request, actor=caller.name)
 
-    answer = once(
-        ground,
-        actor=caller.name,
-        operation="request",
-        key=idempotency_key,
-        request=request.model_dump(mode="json"),
-        work=add,
-    )
-    added = StandingRequest.model_validate(answer, strict=False)
+    added = added_once(ground, StandingRequest, caller.name, idempotency_key, request, add)
     response.headers["Location"] = f"{API_PREFIX}/requests/{added.id}"
     return added
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Header, Query, Response
 
-from ground_service.access.idempotency import once
+from ground_service.access.idempotency import added_once
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.model import Telecommand
@@ -22,7 +22,11 @@ from ground_service.http.model import PageOf
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime
+from ground_service.missions import service as missions
+from ground_service.missions.model import MissionCheck
+from ground_service.missions.routes import Text
 from ground_service.planning import forecast, service, store
+from ground_service.planning.dry_run import rehearsed
 from ground_service.planning.model import (
     CraterDensity,
     PlanForecast,
@@ -39,6 +43,22 @@ planning = operations("planning")
 IfMatch = Annotated[
     str | None, Header(alias=IF_MATCH_HEADER, max_length=200, description="ETag of the version to change")
 ]
+
+
+@planning.post("/missions/check")
+def check_mission(
+    ground: GroundOf,
+    caller: Operator,
+    document: Text,
+    plan: Annotated[bool, Query(description="Also make a dry run of the planner")] = False,
+) -> MissionCheck:
+    """Check a mission description and compare it with the revision in force of its spacecraft; add nothing."""
+    checked = missions.check_mission(ground, document, caller=caller)
+    if not plan or checked.faults:
+        return checked
+    flown = rehearsed(ground, document)
+    windows = tuple((one.start, one.stop) for one in flown.windows)
+    return checked.model_copy(update={"windows": windows, "contradictions": flown.faults})
 
 
 @planning.post("/windows/search", responses=problems(404))
@@ -60,18 +80,10 @@ def add_window(
 ) -> Window:
     """Add a window as a draft; 409 lists the conflicts with committed windows and resources."""
 
-    def add() -> dict[str, Any]:
-        return service.add_window(ground, window.entry(), actor=caller.name).model_dump(mode="json")
+    def add() -> Window:
+        return service.add_window(ground, window.entry(), actor=caller.name)
 
-    answer = once(
-        ground,
-        actor=caller.name,
-        operation="window",
-        key=idempotency_key,
-        request=window.model_dump(mode="json"),
-        work=add,
-    )
-    added = Window.model_validate(answer)
+    added = added_once(ground, Window, caller.name, idempotency_key, window, add)
     response.headers["Location"] = f"{API_PREFIX}/windows/{added.id}"
     return _tagged(response, added)
 

@@ -17,7 +17,7 @@ from fastapi.responses import RedirectResponse
 
 from ground_service.access.security import caller_of
 from ground_service.errors import NotAuthorised, NotFound
-from ground_service.web.pages import DISPLAYS, page_response, rendered
+from ground_service.web.pages import DISPLAYS, MEDIA, page_response, rendered
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "openmct" / "node_modules" / "openmct"
 """Where `make openmct` installs the npm package `openmct`."""
@@ -28,16 +28,6 @@ POLICY = (
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
 
-_MEDIA = {
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".jpg": "image/jpeg",
-    ".md": "text/plain; charset=utf-8",
-    ".png": "image/png",
-    ".svg": "image/svg+xml",
-    ".ttf": "font/ttf",
-    ".woff": "font/woff",
-}
 _COMPRESSED = (".css", ".js", ".md", ".svg")
 
 displays = APIRouter(include_in_schema=False)
@@ -81,7 +71,7 @@ def displays_file(request: Request, version: str, path: str) -> Response:
     if path in found.compressed and "gzip" in request.headers.get("accept-encoding", ""):
         body = found.compressed[path]
         headers["Content-Encoding"] = "gzip"
-    return Response(body, media_type=_MEDIA[Path(path).suffix], headers=headers)
+    return Response(body, media_type=MEDIA[Path(path).suffix], headers=headers)
 
 
 @cache
@@ -98,7 +88,7 @@ def installation(folder: Path) -> Installation | None:
     plain = {"LICENSE.md": licence} | {
         file.relative_to(folder / "dist").as_posix(): file.read_bytes()
         for file in sorted((folder / "dist").rglob("*"))
-        if file.suffix in _MEDIA and file.is_file()
+        if file.suffix in MEDIA and file.is_file()
     }
     packed = {
         path: gzip.compress(body, 6, mtime=0) for path, body in plain.items() if path.endswith(_COMPRESSED)

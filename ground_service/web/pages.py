@@ -6,16 +6,20 @@ Nothing here needs a token: pages hold no data but the telemetry dictionary, whi
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
+from fastapi.routing import APIRoute
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from pydantic import BaseModel
+from starlette.routing import Route
 
 from ground_service.access.scopes import check_scope
 from ground_service.access.security import caller_of
@@ -24,14 +28,13 @@ from ground_service.evaluation.performance.store import get_monthly_report
 from ground_service.evaluation.store import get_report
 from ground_service.evaluation.surface import albedo_picture
 from ground_service.ground import Ground
-from ground_service.http.common import Key
-from ground_service.missions.model import Approval
+from ground_service.http.common import API_PREFIX, Key
+from ground_service.missions.model import Approval, StationConnection, StationLink
 from ground_service.passes.series import STATE_VALUES
-from ground_service.regression.service import report_of
+from ground_service.regression.store import get_report as get_regression_report
 from tmtc.arguments import FUNCTION_ARGUMENTS
 from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.onboard_parameters import PARAMETERS, Parameter
-from tmtc.schema import Field, PacketDefinition
+from tmtc.onboard_parameters import PARAMETERS
 
 _HERE = Path(__file__).parent
 _STATIC = _HERE / "static"
@@ -52,16 +55,20 @@ MEDIA = {
     ".json": "application/json",
     ".png": "image/png",
     ".jpg": "image/jpeg",
+    ".md": "text/plain; charset=utf-8",
+    ".ttf": "font/ttf",
+    ".woff": "font/woff",
 }
-"""Media types of static files and of the documentation, by ending."""
+"""Media types of static files, of the documentation and of Open MCT, by ending."""
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
     """A page: its address, its template and script, its area and its name in the navigation ('' for none).
 
-    `section` is the page whose name the navigation marks as current; "" for its own. `needs` is the lowest role that
-    can use the page; "" for every role.
+    A page without a template or script of its own is that of a list. `lists` is the path of its list in the API if it
+    is not that of the page, `forms` are the models of what it enters. `section` is the page whose name the navigation
+    marks as current; "" for its own. `needs` is the lowest role that can use the page; "" for every role.
     """
 
     path: str
@@ -71,6 +78,8 @@ class Page:
     entry: str = ""
     section: str = ""
     needs: str = ""
+    lists: str = ""
+    forms: tuple[type[BaseModel], ...] = ()
 
 
 DISPLAYS = Page("/mct", "mct", "Telemetry displays", "Payload", "Displays")
@@ -80,18 +89,33 @@ PAGES = (
     Page("/", "shift", "Shift", "Shift", "Shift"),
     Page("/planner", "planner", "Planner", "Plan", "Planner"),
     Page("/missions", "missions", "Missions", "Plan", "Missions"),
-    Page("/missions/{revision}", "mission", "Mission", "Plan", section="missions"),
-    Page("/automation", "automation", "Automation", "Plan", "Automation"),
+    Page(
+        "/missions/{revision}",
+        "mission",
+        "Mission",
+        "Plan",
+        section="missions",
+        forms=(StationConnection, StationLink),
+    ),
+    Page("/ephemerides", "ephemerides", "Reference ephemerides", "Plan", "Ephemerides"),
+    Page("/automation", "automation", "Automation", "Plan", "Automation", lists="/automation/actions"),
     Page("/passes", "passes", "Passes", "Passes", "Passes"),
     Page("/passes/{pass_id}", "pass", "Pass", "Passes", section="passes"),
+    Page("/ingests", "ingests", "Received files", "Passes", "Received files"),
     Page("/comparison", "comparison", "Comparison of passes", "Passes", section="passes"),
     Page("/regression", "regression", "Regression", "Passes", "Regression"),
-    Page("/landmarks", "landmarks", "Landmarks learned from flight", "Passes", "Landmarks"),
+    Page(
+        "/landmarks",
+        "landmarks",
+        "Landmarks learned from flight",
+        "Passes",
+        "Landmarks",
+    ),
     Page("/telemetry", "telemetry", "Telemetry", "Payload", "Telemetry"),
     DISPLAYS,
     Page("/events", "events", "Events", "Payload", "Events"),
     Page("/alarms", "alarms", "Alarms", "Payload", "Alarms"),
-    Page("/commands", "commands", "Commands", "Payload", "Commands"),
+    Page("/commands", "commands", "Commands", "Payload", "Commands", lists="/telecommands"),
     Page("/live", "live", "Live", "Payload", "Live"),
     Page("/status", "status", "Status of the service", "System", "Status"),
     Page("/audit", "audit", "Audit log", "System", "Audit", needs="operator"),
@@ -105,7 +129,8 @@ pages = APIRouter(include_in_schema=False)
 
 def _page_answer(page: Page) -> Any:
     def answer(request: Request) -> Response:
-        return page_response(rendered(page, provider=request.app.state.provider is not None))
+        schemas = _schemas(page, request.app.state.operations)
+        return page_response(rendered(page, schemas=schemas, provider=request.app.state.provider is not None))
 
     return answer
 
@@ -142,38 +167,30 @@ REPORT_POLICY = (
 @pages.get("/reports/{report_id}")
 def report_page(request: Request, report_id: Key) -> Response:
     """A report of a pass as a page with an address of its own."""
-    return _document(request, lambda ground: ground.files.get(_html_file(ground, report_id)))
+    return _document(request, lambda connection: get_report(connection, report_id).html_sha256)
 
 
 @pages.get("/regressions/{regression_id}")
 def regression_page(request: Request, regression_id: Key) -> Response:
     """The report of a regression as a page with an address of its own."""
-    return _document(request, lambda ground: report_of(ground, regression_id))
+    return _document(request, lambda connection: get_regression_report(connection, regression_id))
 
 
 @pages.get("/monthly-reports/{report_id}")
 def monthly_report_page(request: Request, report_id: Key) -> Response:
     """A monthly report as a page with an address of its own."""
-    return _document(
-        request, lambda ground: ground.files.get(ground.read(get_monthly_report, report_id).html_sha256)
-    )
+    return _document(request, lambda connection: get_monthly_report(connection, report_id).html_sha256)
 
 
-def _html_file(ground: Ground, report_id: str) -> str:
-    sha256 = ground.read(get_report, report_id).html_sha256
-    if sha256 is None:
-        raise NotFound(f"report {report_id} as", "html")
-    return sha256
-
-
-def _document(request: Request, read: Callable[[Ground], bytes]) -> Response:
+def _document(request: Request, file_of: Callable[[Any], str]) -> Response:
     """Return a document to a signed-in browser; others are sent to the sign-in dialog and back."""
     try:
         check_scope(request, caller_of(request, None))
     except NotAuthorised:
         return RedirectResponse(f"/?next={quote(request.url.path)}", status_code=303)
+    ground: Ground = request.app.state.ground
     headers = {"Content-Security-Policy": REPORT_POLICY}
-    return Response(read(request.app.state.ground), media_type="text/html; charset=utf-8", headers=headers)
+    return Response(ground.files.get(ground.read(file_of)), media_type=MEDIA[".html"], headers=headers)
 
 
 @pages.get("/moon.jpg")
@@ -207,13 +224,17 @@ def _version() -> str:
 
 
 @lru_cache(maxsize=2 * len(PAGES) + 1)
-def rendered(page: Page, template: str = "", openmct: str = "", *, provider: bool = False) -> str:
+def rendered(
+    page: Page, template: str = "", openmct: str = "", schemas: str = "{}", *, provider: bool = False
+) -> str:
     """Return the HTML of a page.
 
     Parameters
     ----------
     template
         Name of the template; by default that of the page.
+    schemas
+        JSON of the schemas of its lists and forms.
     openmct
         Version of Open MCT.
     provider
@@ -221,9 +242,11 @@ def rendered(page: Page, template: str = "", openmct: str = "", *, provider: boo
     """
     return (
         _environment()
-        .get_template(f"{template or page.name}.html")
+        .select_template([f"{template or page.name}.html", "list.html"])
         .render(
             page=page,
+            script=page.name if f"{page.name}.js" in files_of(_STATIC) else "list",
+            schemas=schemas,
             openmct=openmct,
             provider=provider,
             help=bool(files_of(HELP)),
@@ -239,6 +262,21 @@ def rendered(page: Page, template: str = "", openmct: str = "", *, provider: boo
             },
         )
     )
+
+
+def _schemas(page: Page, routes: Iterable[Route]) -> str:
+    """Return the schemas of the lists and forms of a page as JSON; those of lists as in the OpenAPI document."""
+    found: dict[str, Any] = {one.__name__: one.model_json_schema() for one in page.forms}
+    path = page.lists or page.path
+    for route in routes:
+        if not isinstance(route, APIRoute) or route.path != API_PREFIX + path or route.methods != {"GET"}:
+            continue
+        for asked in route.dependant.query_params:
+            entity = get_args(route.response_model.model_fields["items"].annotation)[0]
+            filters: Any = asked.field_info.annotation
+            items = entity.model_json_schema(mode="serialization")
+            found[path] = {"filters": filters.model_json_schema(), "items": items}
+    return json.dumps(found).replace("<", "\\u003c")
 
 
 def sign_in_page(*, next_page: str = "/", refusal: str = "") -> str:
@@ -264,48 +302,19 @@ def _environment() -> Environment:
 @cache
 def _dictionary() -> dict[str, Any]:
     """What pages need to know of the dictionary: telecommands to enter, parameters to look at."""
+    second = Approval().needs_second_person
     return {
         "version": DICTIONARY.version,
         "hash": DICTIONARY.hash,
-        "telecommands": [_telecommand(definition) for definition in DICTIONARY.telecommands],
-        "functions": {name: list(map(_field, fields)) for name, fields in FUNCTION_ARGUMENTS.items()},
-        "onboard_parameters": [_onboard_parameter(one) for one in PARAMETERS],
-        "parameters": [_field(field) for packet in STRUCTURES.values() for field in packet.fields[1:]],
+        "telecommands": [asdict(one) | {"critical": second(one.name)} for one in DICTIONARY.telecommands],
+        "functions": {name: list(map(asdict, fields)) for name, fields in FUNCTION_ARGUMENTS.items()},
+        "onboard_parameters": [
+            asdict(one) | {"description": one.meaning, "type": "u32" if one.whole else "f64", "labels": {}}
+            for one in PARAMETERS
+        ],
+        "parameters": [asdict(field) for packet in STRUCTURES.values() for field in packet.fields[1:]],
         "estimators": list(DICTIONARY.labels("navigation_state", "estimator").values()),
     }
-
-
-def _telecommand(definition: PacketDefinition) -> dict[str, Any]:
-    return {
-        "name": definition.name,
-        "description": definition.description,
-        "service": definition.service,
-        "subtype": definition.subtype,
-        "critical": Approval().needs_second_person(definition.name),
-        "fields": [_field(field) for field in definition.fields],
-        "repeats": [_field(field) for field in definition.group.fields] if definition.group else [],
-        "group": definition.group.name if definition.group else None,
-        "count": definition.group.count if definition.group else None,
-    }
-
-
-def _field(field: Field) -> dict[str, Any]:
-    return {
-        "name": field.name,
-        "description": field.description,
-        "unit": field.unit,
-        "type": field.type,
-        "size": field.size,
-        "labels": dict(field.labels),
-        "minimum": field.minimum,
-        "maximum": field.maximum,
-        "warning": field.warning,
-        "alarm": field.alarm,
-    }
-
-
-def _onboard_parameter(one: Parameter) -> dict[str, Any]:
-    return asdict(one) | {"description": one.meaning, "type": "u32" if one.whole else "f64", "labels": {}}
 
 
 @lru_cache(maxsize=2)

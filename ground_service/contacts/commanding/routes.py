@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Query, Response
 
-from ground_service.access.idempotency import once
+from ground_service.access.idempotency import added_once, once
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding import store
@@ -41,7 +41,7 @@ def enter_telecommand(
 ) -> Telecommand:
     """Queue a telecommand; its name and arguments must agree with the dictionary."""
 
-    def enter() -> dict[str, Any]:
+    def enter() -> Telecommand:
         command_id = commanding.enter_command(
             ground,
             given.name,
@@ -51,17 +51,9 @@ def enter_telecommand(
             timeout_s=given.timeout_s,
             actor=caller.name,
         )
-        return commanding.get_command(ground, command_id).telecommand.model_dump(mode="json")
+        return commanding.get_command(ground, command_id).telecommand
 
-    answer = once(
-        ground,
-        actor=caller.name,
-        operation="telecommand",
-        key=idempotency_key,
-        request=given.model_dump(mode="json"),
-        work=enter,
-    )
-    return Telecommand.model_validate(answer)
+    return added_once(ground, Telecommand, caller.name, idempotency_key, given, enter)
 
 
 @telecommands.get("/telecommands/{command_id}")

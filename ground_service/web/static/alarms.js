@@ -1,7 +1,8 @@
 import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
 import { chart } from "./charts.js";
-import { acting, byId, dictionary, element, figure, isoText, limitText, notice, pager, parameterName, plural, seconds, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
+import { list } from "./lists.js";
+import { acting, byId, dictionary, element, figure, isoText, limitText, loading, notice, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
 import { seriesOf } from "./parameters.js";
 
 const OPEN = ["raised", "acknowledged", "shelved"];
@@ -28,9 +29,9 @@ async function evidence(alarm) {
   }
   const limits = about && [about.warning && `warning ${limitText(about.warning)}`, about.alarm && `alarm ${limitText(about.alarm)}`].filter(Boolean).join(", ");
   return [
-    element("p", {}, about ? `${about.description}: ${limits} ${unitText(alarm.unit)}. ` : `Event ${alarm.name.replaceAll("_", " ")}. `, `${plural(alarm.count, "packet")} from ${timeText(alarm.first)} to ${timeText(alarm.last)}. `, pass ? element("a", { href: `/passes/${pass.id}` }, `Pass ${pass.name}`) : "No pass has this time.", " ", element("a", { href: `/events?${query}` }, "Events around it")),
+    element("p", {}, about ? `${about.description}: ${limits} ${unitText(alarm.unit)}. ` : `Event ${words(alarm.name)}. `, `${plural(alarm.count, "packet")} from ${timeText(alarm.first)} to ${timeText(alarm.last)}. `, pass ? element("a", { href: `/passes/${pass.id}` }, `Pass ${pass.name}`) : "No pass has this time.", " ", element("a", { href: `/events?${query}` }, "Events around it")),
     place,
-    table("Event reports", [["Time", (row) => timeText(row.time)], ["Event", (row) => row.name.replaceAll("_", " ")], ["Detail", (row) => row.detail]], items, "No event report around it."),
+    table("Event reports", ["time", ["Event", (row) => words(row.name)], "detail"], items, "No event report around it."),
   ];
 }
 
@@ -40,15 +41,7 @@ async function showDetail(id) {
   state({ alarm: id });
   byId("detail-title").textContent = `Alarm ${id}: ${nameOf(alarm)}`;
   show("procedure", alarm.procedure ?? "The mission description states no procedure for this alarm (procedures).");
-  show(
-    "history",
-    table(
-      "History",
-      [["Time", (row) => timeText(row.time)], ["By", (row) => row.actor], ["Change", (row) => row.change], ["Comment", (row) => row.comment]],
-      alarm.history,
-      "None.",
-    ),
-  );
+  showTable("history", "History", ["time", ["By", "actor"], "change", "comment"], alarm.history, "None.");
   show("detail", await evidence(alarm));
 }
 
@@ -89,31 +82,30 @@ function actions(alarm) {
   );
 }
 
-const reload = pager(async (limit, offset) => {
-  const chosen = byId("state").value;
-  const page = await get("alarms", { limit, offset, state: chosen === "open" ? OPEN : chosen || null, severity: byId("severity").value || null });
-  show(
-    "alarms",
-    table(
-      "Alarms",
-      [
-        ["", (row) => (row.state === "raised" ? element("input", { type: "checkbox", value: row.id, checked: picked.has(row.id), onchange: pick, "data-needs": "operator", "aria-label": `choose alarm ${row.id}` }) : "")],
-        ["Alarm", nameOf, "keep"],
-        ["", actions],
-        ["Severity", (row) => stateMark(row.severity)],
-        ["State", (row) => stateMark(row.state)],
-        ["Condition", (row) => `${row.active ? "continues" : "has ended"}${row.acknowledged_by ? `, acknowledged by ${row.acknowledged_by}, ${timeText(row.acknowledged)}` : ""}`],
-        ["Count", (row) => figure(row.count), "num"],
-        ["Last value", (row) => (row.value === null ? "" : `${figure(row.value)} ${unitText(row.unit)}, limits ${row.limits}`)],
-        ["First", (row) => timeText(row.first)],
-        ["Last", (row) => timeText(row.last)],
-        ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
-      ],
-      page.items,
-      "No alarms.",
-    ),
-  );
-  return page;
+function restoreFilters() {
+  for (const [id, usual] of [["state", "open"], ["severity", ""]]) byId(id).value = stated(id) === "any" ? "" : (stated(id) ?? usual);
+}
+
+const chosenBox = (row) => element("input", { type: "checkbox", value: row.id, checked: picked.has(row.id), onchange: pick, "data-needs": "operator", "aria-label": `choose alarm ${row.id}` });
+const reload = list("/alarms", {
+  place: "alarms",
+  columns: [
+    ["", (row) => (row.state === "raised" ? chosenBox(row) : "")],
+    ["Alarm", nameOf, "keep"],
+    ["", actions],
+    "severity",
+    "state",
+    ["Condition", (row) => `${row.active ? "continues" : "has ended"}${row.acknowledged_by ? `, acknowledged by ${row.acknowledged_by}, ${timeText(row.acknowledged)}` : ""}`],
+    "count",
+    ["Last value", (row) => (row.value === null ? "" : `${figure(row.value)} ${unitText(row.unit)}, limits ${row.limits}`)],
+    "first",
+    "last",
+    ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
+  ],
+  query: () => ({ state: byId("state").value === "open" ? OPEN : byId("state").value || null, severity: byId("severity").value || null }),
+  empty: "No alarms.",
+  ready: Promise.resolve().then(restoreFilters),
+  concerns: (message) => message.kind === "alarm",
 });
 
 for (const name of ["state", "severity"]) {
@@ -122,9 +114,5 @@ for (const name of ["state", "severity"]) {
     await reload.first();
   }));
 }
-watch((message) => message.kind === "alarm" && reload().catch(trouble), reload);
-byId("state").value = stated("state") === "any" ? "" : (stated("state") ?? "open");
-byId("severity").value = stated("severity") === "any" ? "" : (stated("severity") ?? "");
-reload().catch((error) => error.status === 401 || trouble(error));
 byId("acknowledge").addEventListener("click", acting(acknowledgeChosen));
-if (stated("alarm")) showDetail(stated("alarm")).catch((error) => error.status === 401 || trouble(error));
+if (stated("alarm")) loading(() => showDetail(stated("alarm")));

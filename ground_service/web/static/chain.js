@@ -1,6 +1,6 @@
 // Chain of a planned window: the steps that it has reached, the one that it waits for, and what continues it.
 import { get, send } from "./api.js";
-import { confirmed, figure, lengthText, missionNow, notice, seconds, table, timeText } from "./page.js";
+import { confirmed, figure, lengthText, missionNow, notice, seconds, table, timeText, words } from "./page.js";
 
 export const STEPS = ["requested", "approved", "released", "sent", "accepted", "executed", "received", "reported"];
 const VERIFIED = ["accepted", "started", "completed"];
@@ -73,7 +73,7 @@ export function uplinkOf(craft, links, contact) {
   return able.find((one) => one.name === contact?.link) ?? able.find((one) => one.state !== "failed") ?? able[0] ?? null;
 }
 
-const named = (one) => `${one.name.replaceAll("_", " ")}${one.text ? `: ${one.text}` : ""}`;
+const named = (one) => `${words(one.name)}${one.text ? `: ${one.text}` : ""}`;
 
 // Telecommands of a window with their times, before their release.
 export const sequenceTable = (planned) =>

@@ -1,23 +1,27 @@
 import { bind } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, dictionary, element, figure, notice, pager, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+import { control } from "./forms.js";
+import { list } from "./lists.js";
+import { acting, byId, dictionary, element, figure, loading, notice, show, showTable, timeText, words } from "./page.js";
 
-const words = (name) => name.replaceAll("_", " ");
 const definition = Object.fromEntries(dictionary.telecommands.map((one) => [one.name, one]));
 const STAGES = ["accepted", "started", "completed"];
 
 // A field of the dictionary as an input with its unit, range and names.
 function input(field) {
-  const id = `argument-${field.name}`;
   const labels = Object.values(field.labels);
   const range = field.minimum !== null && field.maximum !== null ? `${figure(field.minimum)} to ${figure(field.maximum)}` : null;
-  const about = [field.description, field.unit && `[${field.unit}]`, range].filter(Boolean).join(", ");
-  const made = labels.length
-    ? element("select", { id, name: field.name }, labels.map((label) => element("option", { value: label }, words(label))))
-    : element("input", { id, name: field.name, type: "number", step: field.type[0] === "f" ? "any" : "1", min: field.minimum ?? (field.type[0] === "u" ? 0 : null), max: field.maximum, value: field.default ?? Math.max(0, field.minimum ?? 0), required: true });
   const unit = field.unit.replaceAll("/", "_");
   const name = field.name.replace(/_id$/, "").replace(unit && new RegExp(`_${unit}$`), "");
-  return element("label", { title: about }, `${words(name)}${field.unit ? `, ${field.unit}` : ""}${range ? ` (${range})` : ""}`, made);
+  return control({
+    id: `argument-${field.name}`,
+    name: field.name,
+    label: `${words(name)}${field.unit ? `, ${field.unit}` : ""}${range ? ` (${range})` : ""}`,
+    title: [field.description, field.unit && `[${field.unit}]`, range].filter(Boolean).join(", "),
+    ...(labels.length
+      ? { options: labels.map((label) => [label, words(label)]) }
+      : { type: "number", step: field.type[0] === "f" ? "any" : "1", min: field.minimum ?? (field.type[0] === "u" ? 0 : null), max: field.maximum, value: field.default ?? Math.max(0, field.minimum ?? 0), required: true }),
+  });
 }
 
 // Fields to enter: a function has its own in place of numbers, and a parameter its unit and range.
@@ -27,16 +31,16 @@ function fieldsOf(chosen, value) {
   const own = { parameter_id: { labels: Object.fromEntries(parameters.map((one) => [one.number, one.name])) }, ...(chosen.fields.some((one) => one.name === "parameter_id") && { value: parameter }) };
   const functions = chosen.fields.find((one) => one.name === "function_id");
   if (functions) return [functions, ...(dictionary.functions[value ?? functions.labels[1]] ?? [])];
-  return chosen.fields.filter((field) => field.name !== chosen.count).map((field) => ({ ...field, ...own[field.name], name: field.name }));
+  return chosen.fields.filter((field) => field.name !== chosen.group?.count).map((field) => ({ ...field, ...own[field.name], name: field.name }));
 }
 
 function showArguments(value = null) {
   const chosen = definition[byId("name").value];
   byId("description").textContent = `${chosen.description.replace(/\.?$/, ".")} Service ${chosen.service}, subtype ${chosen.subtype}.${chosen.critical ? " Critical: somebody else has to release it." : ""}`;
   const inputs = fieldsOf(chosen, value).map(input);
-  if (chosen.repeats.length) {
+  if (chosen.group) {
     inputs.push(
-      element("label", { title: "One item a line, values in order, separated by spaces" }, `${words(chosen.group)}: ${chosen.repeats.map((field) => field.name).join(" ")}`, element("textarea", { id: "argument-items", rows: 3 })),
+      element("label", { title: "One item a line, values in order, separated by spaces" }, `${words(chosen.group.name)}: ${chosen.group.fields.map((field) => field.name).join(" ")}`, element("textarea", { id: "argument-items", rows: 3 })),
     );
   }
   show("arguments", inputs.length ? inputs : element("p", { class: "hint" }, "No arguments."));
@@ -48,11 +52,11 @@ function showArguments(value = null) {
 
 function argumentsOf(chosen) {
   const given = Object.fromEntries([...byId("arguments").querySelectorAll("select, input")].map((one) => [one.name, one.type === "number" ? one.valueAsNumber : one.value]));
-  if (chosen.repeats.length) {
+  if (chosen.group) {
     const lines = byId("argument-items").value.split("\n").filter((line) => line.trim());
-    given[chosen.group] = lines.map((line) => {
+    given[chosen.group.name] = lines.map((line) => {
       const values = line.trim().split(/\s+/);
-      return Object.fromEntries(chosen.repeats.map((field, index) => [field.name, Number(values[index])]));
+      return Object.fromEntries(chosen.group.fields.map((field, index) => [field.name, Number(values[index])]));
     });
   }
   return given;
@@ -95,24 +99,23 @@ async function loadLinks() {
       await loadLinks();
     });
   await loadReceivers(items);
-  show(
+  const sendNow = (row) => element("button", { type: "button", "data-needs": "operator", disabled: row.unsent === 0, onclick: sending(row) }, "Send now");
+  showTable(
     "links",
-    table(
-      "Links",
-      [
-        ["Link", (row) => row.name],
-        ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
-        ["Station", (row) => row.station ?? "not stated"],
-        ["State", (row) => stateMark(row.state)],
-        ["Reason", (row) => row.reason ?? ""],
-        ["Last reception", (row) => (row.heard ? timeText(row.heard) : "none")],
-        ["Sends", (row) => (row.send === "automatic" ? "in each contact" : "on request")],
-        ["Waiting", (row) => String(row.unsent), "num"],
-        ["", (row) => element("button", { type: "button", "data-needs": "operator", disabled: row.unsent === 0, onclick: sending(row) }, "Send now")],
-      ],
-      items,
-      "No mission description in force declares a link. Without one, linna command uplink writes the octets to a file.",
-    ),
+    "Links",
+    [
+      ["Link", "name", "keep"],
+      ["", sendNow],
+      ["Waiting", "unsent"],
+      "state",
+      ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
+      ["Station", (row) => row.station ?? "not stated"],
+      "reason",
+      ["Last reception", (row) => (row.heard ? timeText(row.heard) : "none")],
+      ["Sends", (row) => (row.send === "automatic" ? "in each contact" : "on request")],
+    ],
+    items,
+    "No mission description in force declares a link. Without one, linna command uplink writes the octets to a file.",
   );
 }
 
@@ -122,46 +125,27 @@ async function loadReceivers(links) {
   const spacecraft = [...new Map(links.map((one) => [`${one.spacecraft_id} ${one.instance}`, one])).values()];
   const answers = await Promise.all(spacecraft.map((one) => get(`spacecraft/${one.spacecraft_id}/uplink`, { instance: one.instance }).catch(() => null)));
   const channels = answers.filter(Boolean).flatMap((one) => one.channels.map((channel) => ({ ...channel, spacecraft: `${one.spacecraft_id}, ${one.instance}` })));
-  show(
-    "receivers",
-    table(
-      "Receivers",
-      [
-        ["Spacecraft", (row) => row.spacecraft],
-        ["Channel", (row) => String(row.virtual_channel), "num"],
-        ["State", (row) => FLAGS.filter((flag) => row[flag]).map(words).join(", ") || "ready"],
-        ["Next frame", (row) => String(row.report_value), "num"],
-        ["Frames seen", (row) => String(row.frames), "num"],
-        ["Received", (row) => timeText(row.received)],
-      ],
-      channels,
-      "No telemetry with the state of a telecommand receiver.",
-    ),
-  );
+  const flags = (row) => FLAGS.filter((flag) => row[flag]).map(words).join(", ") || "ready";
+  const columns = ["spacecraft", ["Channel", "virtual_channel"], ["State", flags], ["Next frame", "report_value"], ["Frames seen", "frames"], "received"];
+  showTable("receivers", "Receivers", columns, channels, "No telemetry with the state of a telecommand receiver.");
 }
 
-const load = pager(async (limit, offset) => {
-  const page = await get("telecommands", { limit, offset, state: byId("state").value || null });
-  show(
-    "commands",
-    table(
-      "Telecommands",
-      [
-        ["No", (row) => String(row.id), "num"],
-        ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
-        ["State", (row) => stateMark(row.state)],
-        ["Verification", lights],
-        ["Arguments", (row) => row.text],
-        ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
-        ["Decided", (row) => (row.decided_by ? `${timeText(row.decided)} by ${row.decided_by}` : "")],
-        ["Sent", (row) => (row.sent ? timeText(row.sent) : "")],
-        ["", deeds],
-      ],
-      page.items,
-      byId("state").value ? "No telecommand in this state." : "No telecommand yet.",
-    ),
-  );
-  return page;
+const load = list("/telecommands", {
+  place: "commands",
+  columns: [
+    "id",
+    ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
+    "state",
+    ["", deeds],
+    ["Verification", lights],
+    ["Arguments", "text"],
+    ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
+    ["Decided", (row) => (row.decided_by ? `${timeText(row.decided)} by ${row.decided_by}` : "")],
+    "sent",
+  ],
+  query: () => ({ state: byId("state").value || null }),
+  empty: () => (byId("state").value ? "No telecommand in this state." : "No telecommand yet."),
+  concerns: () => true,
 });
 
 show("name", dictionary.telecommands.map((one) => element("option", { value: one.name }, words(one.name))));
@@ -186,10 +170,4 @@ byId("enter").addEventListener(
   }),
 );
 
-let pending = null;
-watch(() => {
-  clearTimeout(pending);
-  pending = setTimeout(() => Promise.all([load(), loadLinks()]).catch(trouble), 300);
-}, () => Promise.all([load(), loadLinks()]));
-loadLinks().catch((error) => error.status === 401 || trouble(error));
-load().catch((error) => error.status === 401 || trouble(error));
+loading(loadLinks, () => true);

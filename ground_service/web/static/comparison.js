@@ -2,7 +2,7 @@
 import { bind, restore, statedAll } from "./address.js";
 import { get } from "./api.js";
 import { chart, columns } from "./charts.js";
-import { acting, byId, element, figure, lengthText, seconds, show, stateMark, table, timeText, trouble } from "./page.js";
+import { acting, byId, element, figure, lengthText, loading, seconds, show, stateMark, table, timeText } from "./page.js";
 
 const asked = [...new Set(statedAll("pass"))];
 let compared = [];
@@ -46,7 +46,7 @@ function sideBySide(caption, rows) {
   return table(
     caption,
     [
-      ["Figure", (row) => row.name],
+      ["Figure", "name"],
       ...compared.map((one, index) => [heading(one), (row) => row.cells[index]]),
       ...(compared.length === 2 ? [["Difference", (row) => row.change, "num"]] : []),
     ],
@@ -152,4 +152,4 @@ async function load() {
   showRequirements();
 }
 
-load().catch((error) => error.status === 401 || trouble(error));
+loading(load);

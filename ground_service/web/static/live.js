@@ -1,7 +1,7 @@
 // A payload flown live: what its camera sees, what it finds, where it believes to be.
 import { chart, solutionStyle } from "./charts.js";
 import { dot, legendItem, moonMap, track } from "./moon.js";
-import { byId, element, figure, notice, show, timeText } from "./page.js";
+import { byId, element, figure, notice, show, timeText, words } from "./page.js";
 
 const KEPT = 600;
 const REFRESH_MS = 250; // pictures come as fast as they can; numbers, map and charts are read by eye
@@ -57,7 +57,7 @@ function take(message) {
   if (message.kind !== "frame" && message.kind !== "turn") return;
   say(message.paused ? "paused" : "running");
   for (const event of message.events) {
-    log(`${timeText(message.utc)} ${event.severity}: ${event.event.replaceAll("_", " ")}${event.text ? `: ${event.text}` : ""}`);
+    log(`${timeText(message.utc)} ${event.severity}: ${words(event.event)}${event.text ? `: ${event.text}` : ""}`);
   }
   if (message.kind === "frame") drawFrame(message);
 }
@@ -73,7 +73,7 @@ function drawFrame(message) {
   };
   if (message.image_jpeg) picture.src = `data:image/jpeg;base64,${message.image_jpeg}`;
   for (const [name, one] of Object.entries(message.estimates ?? {})) {
-    if (one.reset_trigger && one.reset_trigger !== "none") log(`${timeText(message.utc)} ${name}: reset, ${one.reset_trigger.replaceAll("_", " ")}`);
+    if (one.reset_trigger && one.reset_trigger !== "none") log(`${timeText(message.utc)} ${name}: reset, ${words(one.reset_trigger)}`);
   }
   waiting.push(message);
   refreshing ??= setTimeout(refresh, REFRESH_MS);

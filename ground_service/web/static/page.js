@@ -5,7 +5,10 @@ import { parameterName, unitText } from "./units.js";
 
 export { parameterName, unitText };
 
-export const dictionary = JSON.parse(document.getElementById("dictionary").textContent);
+// Labels are pairs of code and name in the dictionary.
+const embedded = (id) => JSON.parse(document.getElementById(id).textContent, (key, value) => (key === "labels" && Array.isArray(value) ? Object.fromEntries(value) : value));
+export const dictionary = embedded("dictionary");
+export const schemas = embedded("schemas"); // of what the page lists and enters
 
 export const byId = (id) => document.getElementById(id);
 
@@ -68,12 +71,43 @@ export function show(id, ...children) {
   giveBack(place, kept);
 }
 
-// columns: [heading, row => text or node, "num" for right-aligned numbers]
-export function table(caption, columns, rows, empty) {
+// A value of an entity by the name of its field, as every table shows it.
+const LINKS = { pass_id: "/passes/", window_id: "/planner?window=", revision: "/missions/" };
+const STATES = ["state", "severity", "verdict", "outcome"];
+const MOST = 160; // characters of an object
+
+export const words = (name) => name.replaceAll("_", " ");
+
+export function textOf(value) {
+  if (Array.isArray(value)) return value.map(textOf).join(", ");
+  if (typeof value === "object" && value !== null) return Object.entries(value).map(([key, one]) => `${words(key)} ${textOf(one)}`).join(", ");
+  return typeof value === "boolean" ? (value ? "yes" : "no") : String(value);
+}
+
+export function shown(name, value) {
+  if (value === null || value === undefined) return "";
+  const hash = /(^|_)(sha256|revision|digest)$/.test(name) ? element("code", { title: value }, value.slice(0, 12)) : null;
+  if (LINKS[name]) return element("a", { href: LINKS[name] + value }, hash ?? String(value));
+  if (hash) return hash;
+  if (STATES.includes(name)) return stateMark(value);
+  if (typeof value === "number") return /(^|_)id$|^number$/.test(name) ? String(value) : figure(value);
+  if (/^\d{4}-\d\d-\d\dT[\d:.]+Z$/.test(value)) return timeText(value);
+  const text = textOf(value);
+  return typeof value === "object" && text.length > MOST ? element("span", { title: text.slice(0, 2000) }, `${text.slice(0, MOST - 1)}…`) : text;
+}
+
+// Columns: the name of a field, or [heading, name of a field or row => text or node, "num" for right-aligned numbers].
+export function table(caption, given, rows, empty) {
   if (!rows.length) return element("p", { class: "hint" }, empty);
-  const head = columns.map(([heading, , kind]) => element("th", { scope: "col", class: kind }, heading));
+  const columns = given.map((one) => {
+    const [heading, cell, kind] = typeof one === "string" ? [labelled(one), one] : one;
+    const named = typeof cell === "string";
+    const numeric = named && rows.some((row) => typeof row[cell] === "number") ? "num" : null;
+    return { heading, cell: named ? (row) => shown(cell, row[cell]) : cell, kind: kind ?? numeric };
+  });
+  const head = columns.map(({ heading, kind }) => element("th", { scope: "col", class: kind }, heading));
   const body = rows.map((row) =>
-    element("tr", { "data-row": row.id ?? row.name ?? row.start }, columns.map(([, cell, kind]) => element("td", { class: kind }, cell(row) ?? ""))),
+    element("tr", { "data-row": row.id ?? row.name ?? row.start }, columns.map(({ cell, kind }) => element("td", { class: kind }, cell(row) ?? ""))),
   );
   return element(
     "div",
@@ -88,6 +122,8 @@ export function table(caption, columns, rows, empty) {
     ),
   );
 }
+
+export const showTable = (place, ...given) => show(place, table(...given));
 
 export function notice(text, kind = "good") {
   const shown = element(
@@ -153,6 +189,16 @@ export function figure(value, digits = 3) {
   if (Number.isInteger(value)) return value.toLocaleString("en").replaceAll(",", " ");
   if (Math.abs(value) < 1e-4) return powerOfTen(value, digits);
   return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", " ") : String(+value.toPrecision(digits));
+}
+
+// Names end in their unit: "Median error, m" for median_error_m.
+const UNITS = { m: "m", km: "km", s: "s", ms: "ms", deg: "°", px: "px", percent: "%", mib: "MiB", c: "°C", bps: "bit/s", days: "days", octets: "octets" };
+const NAMES = { id: "No", number: "No", sha256: "Hash" };
+export function labelled(name) {
+  if (NAMES[name]) return NAMES[name];
+  const [, stem, unit] = name.replace(/_id$/, "").match(/^(.+)_([a-z]+)$/) ?? [];
+  const text = (UNITS[unit] ? `${stem}, ${UNITS[unit]}` : name.replace(/_id$/, "")).replaceAll("_", " ");
+  return text[0].toUpperCase() + text.slice(1);
 }
 
 export const plural = (count, noun) => `${figure(count)} ${noun}${count === 1 ? "" : "s"}`;
@@ -287,6 +333,22 @@ export function watch(onMessage, again = null, { values = false } = {}) {
   watchers.push(onMessage);
   valuesWatched ||= values;
   if (again) readers.push(again);
+}
+
+// A task some time after the last of several messages.
+export function later(task, concerns = () => true, afterMs = 400) {
+  let pending = null;
+  return (message) => {
+    if (!concerns(message)) return;
+    clearTimeout(pending);
+    pending = setTimeout(() => task().catch(trouble), afterMs);
+  };
+}
+
+// What fills a page: now, and again after messages that concern it.
+export function loading(load, concerns = null) {
+  if (concerns) watch(later(load, concerns), load);
+  load().catch((error) => error.status === 401 || trouble(error));
 }
 
 // The session of the user; pages that differ by role wait for it.

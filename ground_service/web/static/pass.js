@@ -3,11 +3,10 @@ import { finished, get, request, send } from "./api.js";
 import { chart, columns, solutionStyle } from "./charts.js";
 import { craterRims, layerItem, moonMap, terrain, track } from "./moon.js";
 import { drawParameters } from "./parameters.js";
-import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, parameterOptions, seconds, show, stateClass, stateMark, table, timeText, trouble, unitText } from "./page.js";
+import { acting, byId, dictionary, element, figure, lengthText, loading, notice, parameterName, parameterOptions, seconds, show, showTable, stateClass, stateMark, table, timeText, unitText, words } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
-const words = (name) => name.replaceAll("_", " ");
 
 async function save(path, name, options) {
   const answer = await request(path, options);
@@ -35,19 +34,8 @@ async function showExports() {
       },
       one.name,
     );
-  show(
-    "exports",
-    table(
-      "Formats",
-      [
-        ["Format", button],
-        ["Contents", (one) => one.description + (one.available ? "" : ` (the server lacks linna[${one.extra}])`)],
-        ["States", (one) => (one.states ? "as chosen" : "")],
-      ],
-      formats,
-      "None.",
-    ),
-  );
+  const contents = (one) => one.description + (one.available ? "" : ` (the server lacks linna[${one.extra}])`);
+  showTable("exports", "Formats", [["Format", button], ["Contents", contents], ["States", (one) => (one.states ? "as chosen" : "")]], formats, "None.");
 }
 
 function showReport(report, id) {
@@ -70,8 +58,7 @@ function showReport(report, id) {
     table(
       "Requirements",
       [
-        ["Requirement", (row) => row.name],
-        ["Status", (row) => row.status],
+        ["Requirement", "name"], "status",
         ["Value", (row) => (row.value === null ? "unknown" : `${figure(row.value)} ${row.unit}`), "num"],
         ["Limit", (row) => (row.limit === null ? "–" : `${row.at_most ? "≤" : "≥"} ${figure(row.limit)} ${row.unit}`), "num"],
       ],
@@ -141,11 +128,7 @@ function showCompleteness(found) {
         ["APID", (row) => `0x${row.apid.toString(16)}`],
         ["Packets of", (row) => words(row.name)],
         ["", (row) => element("meter", { min: 0, max: 1, low: 0.99, optimum: 1, value: row.share, "aria-label": `share of ${row.name} that came` })],
-        ["Received", (row) => figure(row.packets), "num"],
-        ["Lost", (row) => figure(row.lost), "num"],
-        ["Lost at edges", (row) => figure(row.lost_at_edges), "num"],
-        ["Repeated", (row) => figure(row.duplicates), "num"],
-        ["Bad checksum", (row) => figure(row.crc_errors), "num"],
+        ["Received", "packets"], "lost", "lost_at_edges", ["Repeated", "duplicates"], ["Bad checksum", "crc_errors"],
         ["Complete", (row) => `${(100 * row.share).toFixed(2)} %`, "num"],
       ],
       rows,
@@ -164,13 +147,9 @@ function receptionTable(receptions) {
       ["Station", (row) => row.station || "not stated"],
       ["First frame", (row) => (row.first_received ? timeText(row.first_received) : "unknown")],
       ["Last frame", (row) => (row.last_received ? timeText(row.last_received) : "unknown")],
-      ["Frames", (row) => figure(row.frames), "num"],
-      ["Good", (row) => figure(row.frames_good), "num"],
-      ["Symbols corrected", (row) => figure(row.symbols_corrected), "num"],
+      "frames", ["Good", "frames_good"], "symbols_corrected",
       ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : figure(row.bit_error_rate, 2)), "num"],
-      ["Lock losses", (row) => figure(row.lock_losses), "num"],
-      ["Octets", (row) => figure(row.octets), "num"],
-      ["Outside frames", (row) => figure(row.octets_other), "num"],
+      "lock_losses", "octets", ["Outside frames", "octets_other"],
       ["Link settings", (row) => row.source + (row.ambiguous ? ", ambiguous" : "")],
     ],
     receptions,
@@ -256,20 +235,7 @@ async function showParameter() {
 let events = [];
 function showEvents() {
   const chosen = byId("only-alarms").checked ? events.filter((one) => ["medium", "high"].includes(one.severity)) : events;
-  show(
-    "events",
-    table(
-      "Events",
-      [
-        ["Time", (row) => timeText(row.time)],
-        ["Severity", (row) => stateMark(row.severity)],
-        ["Event", (row) => words(row.name)],
-        ["Detail", (row) => row.detail],
-      ],
-      chosen,
-      "None.",
-    ),
-  );
+  showTable("events", "Events", ["time", "severity", ["Event", (row) => words(row.name)], "detail"], chosen, "None.");
 }
 
 async function showLatestReport(ids) {
@@ -327,4 +293,4 @@ async function load() {
   ]);
 }
 
-load().catch((error) => error.status === 401 || trouble(error));
+loading(load);

@@ -1,6 +1,6 @@
 import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
-import { acting, byId, element, figure, isoText, lengthText, mayOperate, missionNow, notice, plural, seconds, session, show, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
 import { contactOf, release, sequenceTable, transmit, uplinkOf } from "./chain.js";
@@ -20,6 +20,7 @@ let view = [0, 1]; // seconds of UTC [from, to]
 let viewChosen = false; // else the view follows what there is to see
 let dragging = false; // what is in the hand is not drawn again
 
+const LENGTH = ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"];
 const selectable = (row) => ({ start: seconds(row.start), stop: seconds(row.stop) });
 
 function whole() {
@@ -364,9 +365,9 @@ async function search() {
     table(
       "Candidates",
       [
-        ["Start", (row) => timeText(row.start)],
-        ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"],
-        ["Frames", (row) => figure(row.frames), "num"],
+        "start",
+        LENGTH,
+        "frames",
         ["Altitude, km", (row) => `${figure(row.altitude_km.min)} to ${figure(row.altitude_km.max)}`, "num"],
         ["Sun, deg", (row) => `${figure(row.sun_elevation_deg.min)} to ${figure(row.sun_elevation_deg.max)}`, "num"],
         ["Craters a frame", (row) => (row.craters_per_frame ? `${figure(row.craters_per_frame.min)} to ${figure(row.craters_per_frame.max)}` : "–"), "num"],
@@ -378,47 +379,16 @@ async function search() {
       `${found.reason ?? "No span fulfils all constraints"}.`,
     ),
   );
-  show(
-    "rejected",
-    rejected.length
-      ? element(
-          "details",
-          {},
-          element("summary", {}, `${plural(rejected.length, "rejected span")} with reasons`),
-          table(
-            "Rejected spans",
-            [
-              ["Start", (row) => timeText(row.start)],
-              ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"],
-              ["Reason", (row) => row.reason],
-            ],
-            rejected,
-            "None.",
-          ),
-        )
-      : null,
-  );
+  const spans = () => table("Rejected spans", ["start", LENGTH, "reason"], rejected, "None.");
+  show("rejected", rejected.length ? element("details", {}, element("summary", {}, `${plural(rejected.length, "rejected span")} with reasons`), spans()) : null);
 }
 
 async function load() {
   windows = (await get("windows", { limit: 500 })).items;
   drawTimeline();
   showChosen();
-  show(
-    "windows",
-    table(
-      "Windows",
-      [
-        ["Window", (row) => element("button", { type: "button", class: "link", onclick: () => choose(row.id) }, row.name)],
-        ["Start", (row) => timeText(row.start)],
-        ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"],
-        ["State", (row) => stateMark(row.state)],
-        ["By", (row) => row.created_by],
-      ],
-      windows,
-      "No window planned: find some above.",
-    ),
-  );
+  const link = (row) => element("button", { type: "button", class: "link", onclick: () => choose(row.id) }, row.name);
+  showTable("windows", "Windows", [["Window", link], "start", LENGTH, "state", ["By", "created_by"]], windows, "No window planned: find some above.");
 }
 
 const zoom = (factor, shift = 0) => () => {
@@ -466,22 +436,7 @@ async function loadContacts() {
   show(
     "contacts",
     reasons,
-    table(
-      "Contacts",
-      [
-        ["Link", (row) => row.link],
-        ["Station", (row) => row.station],
-        ["Spacecraft", (row) => String(row.spacecraft_id), "num"],
-        ["Start", (row) => timeText(row.start)],
-        ["Stop", (row) => timeText(row.stop)],
-        ["State", (row) => stateMark(row.state)],
-        ["Telecommands", (row) => figure(row.telecommands), "num"],
-        ["Octets", (row) => figure(row.octets), "num"],
-        ["Reason", (row) => row.reason ?? ""],
-      ],
-      linked,
-      "No contact of a link in the shown time.",
-    ),
+    table("Contacts", ["link", "station", "spacecraft_id", "start", "stop", "state", "telecommands", "octets", "reason"], linked, "No contact of a link in the shown time."),
   );
 }
 byId("earlier").addEventListener("click", zoom(1, -1));
@@ -567,9 +522,5 @@ async function start() {
   await Promise.all([loadContacts(), loadConditions()]);
 }
 
-let pending = null;
-watch(() => {
-  clearTimeout(pending);
-  pending = setTimeout(() => Promise.all([load(), loadRequests(spacecraftChosen())]).then(loadConditions).catch(trouble), 400);
-});
-start().catch((error) => error.status === 401 || trouble(error));
+loading(start);
+watch(later(() => Promise.all([load(), loadRequests(spacecraftChosen())]).then(loadConditions)));

@@ -1,6 +1,6 @@
 import { keep, restore, state, stated } from "./address.js";
 import { finished, get, request, send } from "./api.js";
-import { acting, byId, element, figure, notice, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, figure, loading, notice, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
 
 const LATEST = 12;
 let open = stated("gates");
@@ -26,17 +26,39 @@ function gateRows(regression) {
   return table(
     regression.result.headline || "Gates",
     [
-      ["Gate", (row) => row.name.replaceAll("_", " ")],
-      ["Baseline", (row) => figure(row.baseline), "num"],
-      ["Candidate", (row) => figure(row.candidate), "num"],
-      ["Limit", (row) => figure(row.limit), "num"],
+      ["Gate", (row) => words(row.name)],
+      "baseline", "candidate", "limit",
       ["Pass", (row) => row.pass ?? "all"],
-      ["Outcome", (row) => stateMark(row.outcome)],
+      "outcome",
       ["Remark", remarkOf],
     ],
     OUTCOMES.flatMap((outcome) => regression.result.gates.filter((gate) => gate.outcome === outcome)),
     regression.result.passes.map((pass) => `${pass.name}: ${pass.detail || pass.state}`).join("; ") || "No gate was judged.",
   );
+}
+
+// Parts of the report: craters lost and gained, the worst tracks with what both builds detect, the first different frame.
+const PARTS = ["Craters that changed", "Passes"];
+
+async function changesOf(id) {
+  const text = await (await request(`regressions/${id}/report`)).text();
+  const place = element("div", { class: "report" });
+  const styles = [];
+  let wanted = false;
+  for (const one of new DOMParser().parseFromString(text, "text/html").querySelectorAll("main > *")) {
+    const part = one.localName === "h2" ? one.lastChild.textContent : null;
+    wanted = part ? PARTS.includes(part) : wanted;
+    if (!wanted) continue;
+    // The policy of pages permits no style attributes: each style is set on its element.
+    for (const each of one.querySelectorAll("[style]")) {
+      styles.push([each, each.getAttribute("style")]);
+      each.removeAttribute("style");
+    }
+    if (!part) Object.assign(one, { tabIndex: 0, role: "group", ariaLabel: one.querySelector("caption, figcaption")?.textContent }); // it may scroll
+    place.append(part ? element("h3", {}, part) : one);
+  }
+  for (const [each, css] of styles) each.style.cssText = css;
+  return place;
 }
 
 // Verdicts that are there, and above them the jobs that have none: on their way, or failed.
@@ -58,7 +80,7 @@ function outcomeOf({ job, verdict }) {
   const reasons = [...(needed ? [needed] : []), ...verdict.reasons];
   return [
     element("span", {}, verdict.gates ? counts : "No gate was judged."),
-    reasons.length ? element("ul", { class: "reasons" }, reasons.map((one) => element("li", {}, one.replaceAll("_", " ")))) : null,
+    reasons.length ? element("ul", { class: "reasons" }, reasons.map((one) => element("li", {}, words(one)))) : null,
   ].filter(Boolean);
 }
 
@@ -68,26 +90,24 @@ const titleOf = (row, role) => row[`${role}_title`] ?? builds.filter((one) => on
 
 async function loadRegressions() {
   const { rows, total } = await regressionRows();
-  show(
+  showTable(
     "regressions",
-    table(
       "Regressions",
       [
-        ["Entered", (row) => timeText(row.created)],
         ["Candidate", (row) => titleOf(row, "candidate")],
-        ["Baseline", (row) => titleOf(row, "baseline")],
-        ["Verdict", (row) => (row.verdict ? stateMark(row.verdict.verdict) : stateMark(row.job.state))],
+        ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates and craters"), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report")) : "")],
+        ["Verdict", (row) => stateMark(row.verdict?.verdict ?? row.job.state)],
         ["Outcome", outcomeOf],
-        ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates"), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report")) : "")],
+        ["Baseline", (row) => titleOf(row, "baseline")],
+        ["Entered", "created"],
       ],
       rows,
       "No regression has been run.",
-    ),
   );
   if (total > LATEST) byId("regressions").append(element("p", { class: "hint" }, `The ${LATEST} newest of ${figure(total)} verdicts.`));
   if (rows.some((row) => row.verdict?.id === open)) {
-    const shown = await get(`regressions/${open}`);
-    byId("regressions").append(element("h3", {}, `Gates of ${timeText(shown.created)}`), gateRows(shown));
+    const [chosen, changes] = await Promise.all([get(`regressions/${open}`), changesOf(open)]);
+    byId("regressions").append(element("h3", {}, `Gates of ${timeText(chosen.created)}`), gateRows(chosen), changes);
   }
 }
 
@@ -121,35 +141,21 @@ async function load() {
   const kept = new Set(archives.map((one) => one.pass_id));
   const without = passes.items.filter((one) => !kept.has(one.id));
   show("archives", archives.map(archiveChoice), without.map(passWithout), archives.length + without.length ? null : element("p", { class: "hint" }, "None: upload a zipped pass archive below."));
-  show(
-    "builds",
-    table(
-      "Builds",
-      [
-        ["Build", buildName],
-        ["Kind", (row) => row.kind],
-        ["Description", (row) => row.description],
-        ["Registered", (row) => `${timeText(row.registered)} by ${row.registered_by}`],
-      ],
-      builds,
-      "No build registered.",
-    ),
-  );
-  show(
+  const registered = (row) => `${timeText(row.registered)} by ${row.registered_by}`;
+  showTable("builds", "Builds", [["Build", buildName], "kind", "description", ["Registered", registered]], builds, "No build registered.");
+  showTable(
     "placebos",
-    table(
-      "Placebos",
-      [
-        ["Gate", (row) => row.metric.replaceAll("_", " ")],
-        ["Passes", (row) => row.condition || "all"],
-        ["Rejected", (row) => `${figure(row.rejected)} of ${figure(row.placebos)}`, "num"],
-        ["Allowed share", (row) => figure(row.level), "num"],
-        ["Spread", (row) => figure(row.spread), "num"],
-        ["State", (row) => stateMark(row.calibrated ? "calibrated" : "uncalibrated")],
-      ],
-      calibrations,
-      "No placebo has been run.",
-    ),
+    "Placebos",
+    [
+      ["Gate", (row) => words(row.metric)],
+      ["Passes", (row) => row.condition || "all"],
+      ["Rejected", (row) => `${figure(row.rejected)} of ${figure(row.placebos)}`, "num"],
+      ["Allowed share", "level"],
+      "spread",
+      ["State", (row) => stateMark(row.calibrated ? "calibrated" : "uncalibrated")],
+    ],
+    calibrations,
+    "No placebo has been run.",
   );
   await loadRegressions();
 }
@@ -185,4 +191,4 @@ watch((message) => {
   pending = setTimeout(() => loadRegressions().catch(trouble), 400);
 }, loadRegressions);
 for (const name of ["candidate", "baseline"]) byId(name).addEventListener("change", () => keep(name));
-load().catch((error) => error.status === 401 || trouble(error));
+loading(load);

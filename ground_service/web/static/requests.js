@@ -1,7 +1,7 @@
 // Standing requests on the planner: their windows, their last plan with its reasons, and changes of them.
 import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, element, figure, notice, show, stateMark, table, timeText } from "./page.js";
+import { acting, byId, element, figure, notice, show, showTable, table, timeText } from "./page.js";
 
 let spacecraft = null;
 
@@ -46,41 +46,28 @@ async function showPlan(id) {
     "request-plan",
     element("h3", {}, `Last plan of request ${id}`),
     element("p", { class: "hint" }, plan.planned ? `Made at ${timeText(plan.planned)}, until ${timeText(plan.until)}.${plan.reason ? ` ${plan.reason}.` : ""}` : (plan.reason ?? "Not planned yet.")),
-    table(
-      "Candidates of the plan",
-      [
-        ["Start", (row) => timeText(row.start)],
-        ["Stop", (row) => timeText(row.stop)],
-        ["Outcome", (row) => stateMark(row.outcome)],
-        ["Window", (row) => (row.window_id === null ? "" : element("a", { href: `/planner?window=${row.window_id}` }, String(row.window_id)))],
-        ["Reason", (row) => row.reason ?? ""],
-      ],
-      plan.candidates,
-      "No candidates.",
-    ),
+    table("Candidates of the plan", ["start", "stop", "outcome", "window_id", "reason"], plan.candidates, "No candidates."),
   );
 }
 
 export async function loadRequests(chosen) {
   spacecraft = chosen;
   const { items } = await get("requests", { limit: 200 });
-  show(
+  showTable(
     "requests",
-    table(
-      "Standing requests",
-      [
-        ["Request", (row) => row.name],
-        ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
-        ["State", (row) => stateMark(row.state)],
-        ["Terms", (row) => termsText(row.terms)],
-        ["Windows", (row) => windowsText(row.windows)],
-        ["Planned", (row) => (row.planned ? timeText(row.planned) : "not yet")],
-        ["By", (row) => row.created_by],
-        ["", actions],
-      ],
-      items,
-      "No standing request.",
-    ),
+    "Standing requests",
+    [
+      ["Request", "name"],
+      ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
+      "state",
+      ["Terms", (row) => termsText(row.terms)],
+      ["Windows", (row) => windowsText(row.windows)],
+      ["Planned", (row) => timeText(row.planned) || "not yet"],
+      ["By", "created_by"],
+      ["", actions],
+    ],
+    items,
+    "No standing request.",
   );
   const asked = items.find((one) => String(one.id) === stated("request"));
   if (asked) await showPlan(asked.id);

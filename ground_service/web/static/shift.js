@@ -1,7 +1,7 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
 import { chainOf, contactOf, inTime, release, transmit, uplinkOf } from "./chain.js";
-import { acting, byId, element, lengthText, missionNow, notice, parameterName, seconds, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, lengthText, loading, missionNow, notice, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "executing", "executed", "downlinked"];
 const SHOWN = 5;
@@ -12,10 +12,12 @@ const keyOf = (one) => `${one.spacecraft_id} ${one.instance}`;
 const mine = (list, craft) => list.filter((one) => one.spacecraft_id === craft.spacecraft_id && (one.instance ?? "flight") === craft.instance);
 const query = (craft) => `spacecraft/${craft.spacecraft_id}`;
 const instance = (craft) => `?instance=${encodeURIComponent(craft.instance)}`;
-const words = (name) => name.replaceAll("_", " ");
 
 const deed = (label, task, name = label) =>
   element("button", { type: "button", "data-needs": "operator", "aria-label": name, onclick: acting(async () => { await task(); await load(); }) }, label);
+
+const link = (href, text) => element("a", { href }, text);
+const further = (...parts) => element("p", { class: "hint" }, parts.filter(Boolean).flatMap((one, index) => (index ? [" · ", one] : [one])));
 
 const number = (label, value, note) =>
   element("div", {}, element("dt", {}, label), element("dd", { class: "number" }, value), element("dd", { class: "note" }, note));
@@ -77,7 +79,7 @@ function windowsOf(craft, data) {
       rows.slice(0, SHOWN),
       "No window begins within a day.",
     ),
-    hidden > 0 ? element("p", { class: "hint" }, `${hidden} more in the `, element("a", { href: "/planner" }, "planner"), ".") : null,
+    further(hidden > 0 ? `${hidden} more` : null, link("/planner", "Planner"), link("/commands", "Commands")),
   ];
 }
 
@@ -89,7 +91,7 @@ function alarmsOf(craft, data) {
     [
       ["Alarm", (row) => element("a", { href: `/alarms?alarm=${row.id}` }, alarmName(row))],
       ["Since", (row) => timeText(row.first).slice(5, 16)],
-      ["Severity", (row) => stateMark(row.severity)],
+      "severity",
       ["", acknowledge],
     ],
     open.slice(0, SHOWN),
@@ -165,13 +167,9 @@ function spacecraftOf(craft, data, newest) {
       "div",
       { class: "columns shift" },
       element("div", {}, part("Windows of the next day", ...windowsOf(craft, data))),
-      element("div", {}, part("Open alarms", alarmsOf(craft, data)), part("Last verdicts", verdictsOf(craft, data), element("a", { href: "/passes#monthly" }, "Monthly reports")), part("Handover", ...handoverOf(craft, data))),
+      element("div", {}, part("Open alarms", alarmsOf(craft, data), further(link("/alarms", "All alarms"), link("/events", "Events"), link("/telemetry", "Telemetry"))), part("Last verdicts", verdictsOf(craft, data), further(link("/passes", "All passes"), link("/passes#monthly", "Monthly reports"), link("/regression", "Builds and gates"))), part("Handover", ...handoverOf(craft, data))),
     ),
   );
-}
-
-function repeatButton(row) {
-  return deed("Repeat", () => send("POST", `jobs/${row.id}/repeat`), `Repeat ${row.kind} of ${timeText(row.created)}`);
 }
 
 function showJobs(jobs) {
@@ -179,21 +177,9 @@ function showJobs(jobs) {
   const failed = jobs.filter((job) => job.state === "failed").length;
   byId("jobs-count").textContent = `${running} under way, ${failed} of the latest failed`;
   if (failed) byId("work").open = true;
-  show(
-    "jobs",
-    table(
-      "Jobs",
-      [
-        ["Job", (row) => row.kind],
-        ["Entered", (row) => timeText(row.created)],
-        ["State", (row) => (row.state === "running" ? element("progress", { max: 1, value: row.progress, "aria-label": row.kind }) : stateMark(row.state))],
-        ["", (row) => row.error ?? ""],
-        ["", (row) => (row.state === "failed" ? repeatButton(row) : "")],
-      ],
-      jobs,
-      "None.",
-    ),
-  );
+  const progress = (row) => (row.state === "running" ? element("progress", { max: 1, value: row.progress, "aria-label": row.kind }) : stateMark(row.state));
+  const repeat = (row) => (row.state === "failed" ? deed("Repeat", () => send("POST", `jobs/${row.id}/repeat`), `Repeat ${row.kind} of ${timeText(row.created)}`) : "");
+  showTable("jobs", "Jobs", [["Job", "kind"], ["Entered", "created"], ["State", progress], ["", "error"], ["", repeat]], jobs, "None.");
 }
 
 let pressEnded = null;
@@ -251,15 +237,8 @@ byId("upload").addEventListener(
   }),
 );
 
-let pending = null;
 watch((message) => {
-  const text = Object.entries(message.payload)
-    .map(([key, value]) => `${words(key)} ${typeof value === "object" ? JSON.stringify(value) : value}`)
-    .join(", ");
-  byId("feed").prepend(element("li", { value: message.sequence }, `${timeText(message.time)} ${message.kind}: ${text}`));
+  byId("feed").prepend(element("li", { value: message.sequence }, `${timeText(message.time)} ${message.kind}: ${textOf(message.payload)}`));
   while (byId("feed").children.length > 50) byId("feed").lastChild.remove();
-  clearTimeout(pending);
-  pending = setTimeout(() => load().catch(trouble), 400);
-}, load);
-
-load().catch((error) => error.status === 401 || trouble(error));
+});
+loading(load, () => true);

@@ -1,5 +1,5 @@
 import { get } from "./api.js";
-import { byId, element, lengthText, plural, show, table, timeText, trouble } from "./page.js";
+import { byId, element, lengthText, loading, plural, show, showTable, timeText } from "./page.js";
 
 const PERIOD_MS = 15000;
 const gibibytes = (octets) => `${(octets / 2 ** 30).toFixed(1)} GiB`;
@@ -31,30 +31,15 @@ function draw(status, raised) {
     ["Newest backup", status.backup_age_s === null ? "unknown" : `${lengthText(status.backup_age_s)} ago`],
     ["Recurring work is done by", status.scheduler ?? "no process"],
   ];
-  show("figures", table("Figures", [["Figure", (row) => row[0]], ["Value", (row) => row[1]]], rows, ""));
-  show(
-    "correlations",
-    table(
-      "Time correlations",
-      [
-        ["Spacecraft", (row) => String(row.spacecraft_id), "num"],
-        ["Instance", (row) => row.instance],
-        ["Made", (row) => `${lengthText(row.age_s)} ago`],
-      ],
-      status.correlations,
-      "No time correlation.",
-    ),
-  );
+  showTable("figures", "Figures", [["Figure", "0"], ["Value", "1"]], rows, "");
+  const made = (row) => `${lengthText(row.age_s)} ago`;
+  showTable("correlations", "Time correlations", ["spacecraft_id", "instance", ["Made", made]], status.correlations, "No time correlation.");
 }
 
 async function load() {
-  try {
-    const [status, raised] = await Promise.all([get("status"), get("alarms", { state: "raised", limit: 1 })]);
-    draw(status, raised.total);
-  } catch (error) {
-    if (error.status !== 401) trouble(error);
-  }
+  const [status, raised] = await Promise.all([get("status"), get("alarms", { state: "raised", limit: 1 })]);
+  draw(status, raised.total);
 }
 
-load();
-setInterval(load, PERIOD_MS);
+loading(load);
+setInterval(() => loading(load), PERIOD_MS);

@@ -2,7 +2,7 @@ import { bind, restore, state, stated, statedAll } from "./address.js";
 import { get } from "./api.js";
 import { drawParameters } from "./parameters.js";
 import { showLive } from "./values.js";
-import { acting, byId, element, parameterName, parameterOptions, show, timeText, trouble } from "./page.js";
+import { acting, byId, element, loading, parameterName, parameterOptions, show, timeText } from "./page.js";
 
 let drawn = []; // [{pass, names}] of the charts, in their order
 const known = new Map(); // parameters by pass
@@ -100,4 +100,4 @@ byId("clear").addEventListener("click", () => {
   keepCharts();
 });
 showLive();
-load().catch((error) => error.status === 401 || trouble(error));
+loading(load);

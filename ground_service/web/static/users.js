@@ -1,5 +1,5 @@
 import { get, send } from "./api.js";
-import { acting, byId, element, notice, show, stateMark, table, timeText, trouble } from "./page.js";
+import { acting, byId, element, loading, notice, show, showTable, timeText } from "./page.js";
 
 const ROLES = ["viewer", "operator", "admin"];
 
@@ -27,48 +27,36 @@ function showToken(made) {
   );
 }
 
+// A change of a user or token: it is told, and the lists are read again even if it was refused.
+const changing = (task, told) => async () => {
+  try {
+    await task();
+    notice(told());
+  } finally {
+    await load();
+  }
+};
+
 function roleChoice(user) {
   const choice = element("select", { "aria-label": `role of ${user.name}` }, ROLES.map((role) => element("option", {}, role)));
   choice.value = user.role;
-  choice.addEventListener(
-    "change",
-    acting(async () => {
-      try {
-        await send("PATCH", `users/${encodeURIComponent(user.name)}`, { role: choice.value });
-        notice(`${user.name} is ${choice.value} now.`);
-      } finally {
-        await load();
-      }
-    }),
-  );
+  const change = () => send("PATCH", `users/${encodeURIComponent(user.name)}`, { role: choice.value });
+  choice.addEventListener("change", acting(changing(change, () => `${user.name} is ${choice.value} now.`)));
   return choice;
 }
 
 function userActions(user) {
   const path = `users/${encodeURIComponent(user.name)}`;
-  const next = user.state === "active" ? "disabled" : "active";
-  const verb = user.state === "active" ? "Disable" : "Enable";
+  const [verb, next] = user.state === "active" ? ["Disable", "disabled"] : ["Enable", "active"];
+  const newToken = async () => {
+    showToken(await send("POST", `${path}/tokens`, { days_valid: daysValid() }));
+    await load();
+  };
   return element(
     "span",
-    {},
-    button(
-      verb,
-      async () => {
-        await send("PATCH", path, { state: next });
-        notice(`${user.name} is ${next} now.`);
-        await load();
-      },
-      `${verb} ${user.name}`,
-    ),
-    " ",
-    button(
-      "New token",
-      async () => {
-        showToken(await send("POST", `${path}/tokens`, { days_valid: daysValid() }));
-        await load();
-      },
-      `New token for ${user.name}`,
-    ),
+    { class: "actions" },
+    button(verb, changing(() => send("PATCH", path, { state: next }), () => `${user.name} is ${next} now.`), `${verb} ${user.name}`),
+    button("New token", newToken, `New token for ${user.name}`),
   );
 }
 
@@ -79,15 +67,8 @@ function kindOf(token) {
 
 function tokenAction(token) {
   if (token.state !== "active") return "";
-  return button(
-    "Revoke",
-    async () => {
-      await send("DELETE", `tokens/${token.id}`);
-      notice(`Token ${token.id} of ${token.user} is revoked.`);
-      await load();
-    },
-    `Revoke token ${token.id} of ${token.user}`,
-  );
+  const revoke = changing(() => send("DELETE", `tokens/${token.id}`), () => `Token ${token.id} of ${token.user} is revoked.`);
+  return button("Revoke", revoke, `Revoke token ${token.id} of ${token.user}`);
 }
 
 async function load() {
@@ -95,42 +76,22 @@ async function load() {
   byId("refused").hidden = role === "admin";
   if (role !== "admin") return;
   const [users, tokens] = await Promise.all([get("users"), get("tokens")]);
-  show(
+  const origin = (row) => (row.provider ? element("span", { class: "breakable" }, row.provider) : "this service");
+  showTable(
     "users",
-    table(
-      "Users",
-      [
-        ["Name", (row) => row.name],
-        ["Role", (row) => (row.provider ? row.role : roleChoice(row))],
-        ["Missions", missionsText],
-        ["From", (row) => (row.provider ? element("span", { class: "breakable" }, row.provider) : "this service")],
-        ["State", (row) => stateMark(row.state)],
-        ["Since", (row) => timeText(row.created)],
-        ["Actions", userActions],
-      ],
-      users.items,
-      "No user: everybody on this machine is an administrator. The first user should be an administrator.",
-    ),
+    "Users",
+    ["name", ["Role", (row) => (row.provider ? row.role : roleChoice(row))], ["Missions", missionsText], ["From", origin], "state", ["Since", "created"], ["Actions", userActions]],
+    users.items,
+    "No user: everybody on this machine is an administrator. The first user should be an administrator.",
   );
-  show(
+  const never = (field) => (row) => timeText(row[field]) || "never";
+  const hint = (row) => element("code", {}, `${row.hint}…`);
+  showTable(
     "tokens",
-    table(
-      "Tokens",
-      [
-        ["No", (row) => String(row.id), "num"],
-        ["User", (row) => row.user],
-        ["Kind", kindOf],
-        ["Missions", missionsText],
-        ["Start", (row) => element("code", {}, `${row.hint}…`)],
-        ["State", (row) => stateMark(row.state)],
-        ["Created", (row) => timeText(row.created)],
-        ["Expires", (row) => (row.expires ? timeText(row.expires) : "never")],
-        ["Last use", (row) => (row.used ? timeText(row.used) : "never")],
-        ["Actions", tokenAction],
-      ],
-      tokens.items,
-      "No token.",
-    ),
+    "Tokens",
+    ["id", "user", ["Kind", kindOf], ["Missions", missionsText], ["Start", hint], "state", "created", ["Expires", never("expires")], ["Last use", never("used")], ["Actions", tokenAction]],
+    tokens.items,
+    "No token.",
   );
 }
 
@@ -143,4 +104,4 @@ byId("add").addEventListener(
     await load();
   }),
 );
-load().catch((error) => error.status === 401 || trouble(error));
+loading(load);

@@ -2,7 +2,7 @@
 import { bind, restore } from "./address.js";
 import { get } from "./api.js";
 import { merged } from "./newest.js";
-import { acting, byId, element, lengthText, parameterName, show, stateMark, svg, table, timeText, trouble, unitText, watch } from "./page.js";
+import { acting, byId, element, lengthText, parameterName, show, stateMark, svg, table, trouble, unitText, watch, words } from "./page.js";
 
 const KEPT = 60; // values of the recent course
 const STALE_S = 120; // older values are marked
@@ -48,7 +48,7 @@ function draw() {
         ["Limits", (row) => (row.limit_state === "none" ? "" : [stateMark(row.limit_state), ` ${row.limits}`])],
         ["Trend", spark],
         ["Age", age],
-        ["Spacecraft time", (row) => timeText(row.time)],
+        ["Spacecraft time", "time"],
       ],
       chosen,
       "No telemetry of this spacecraft has been received.",
@@ -70,7 +70,7 @@ async function refresh() {
   values.forEach(note);
   const packet = byId("packet").value;
   const packets = [...new Set(values.map((one) => one.packet))];
-  show("packet", packets.map((one) => element("option", { value: one }, one.replaceAll("_", " "))));
+  show("packet", packets.map((one) => element("option", { value: one }, words(one))));
   if (packets.includes(packet)) byId("packet").value = packet;
   else restore("packet");
   draw();

@@ -5,9 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from ground_service.planning.dry_run import DryRun, fly
+from ground_service.ground import Ground
+from ground_service.http.model import Paging
+from ground_service.missions.ephemerides.service import add_ephemeris
+from ground_service.missions.store import list_missions
+from ground_service.planning import standing
+from ground_service.planning.dry_run import NO_EPHEMERIS, DryRun, fly, rehearsed
+from ground_service.planning.request_model import StandingRequestIn
 from lunar.datafolder import DataFolder
-from tests.ground_service.conftest import START, save_circle
+from tests.ground_service.conftest import START, Clock, save_circle
 from tests.ground_service.planning.test_standing import AUTOMATIC, LINKS, MISSION
 
 UPLOADS = '[uploads]\ntables = ["orientation"]\n'
@@ -91,3 +97,24 @@ def test_windows_that_persons_approve_are_approved_and_released_by_two(flown) ->
     found = flown(UPLOADS + LINKS)
     assert found.faults == ()
     assert [one.decided_by for one in found.windows] == ["dry run, second person"] * 2
+
+
+def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
+    ground: Ground, oem: Path, mission_time: Clock
+) -> None:
+    def rehearse(extra: str = "") -> tuple[int, tuple[str, ...]]:
+        text = MISSION.format(extra=AUTOMATIC + LINKS + extra).encode()
+        found = rehearsed(ground, text)
+        return len(found.windows), found.faults
+
+    mission_time.utc_ns = START
+    assert rehearse() == (0, (NO_EPHEMERIS,))
+    add_ephemeris(ground, ground.files.put_file(oem), name="reference", precedence=0, actor="ann")
+    assert rehearse() == (10, ())
+    added = standing.add_request(ground, StandingRequestIn.model_validate(REQUEST), actor="ann")
+    assert rehearse() == (2, ())
+    count, (reason,) = rehearse("[resources]\nstorage_mib = 0.01\n")
+    assert count == 0 and "request.json: expected windows that can be planned, found" in reason
+    assert ground.read(list_missions, Paging()).total == 0
+    standing.delete_request(ground, added.id, actor="ann")
+    assert rehearse() == (10, ())

@@ -7,6 +7,7 @@ import zipfile
 from playwright.sync_api import expect
 
 from ground_service.regression.archives import pack_archive
+from tests.ground_service.regression.test_regressions import with_detections
 from tests.ground_service.web.conftest import wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -89,7 +90,7 @@ def test_a_telephone_scrolls_wide_tables_rather_than_break_words(page):
         expect(page.locator("tbody tr:visible").first).to_be_visible()
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, path
     settled(page, "/missions")
-    cell = page.locator("#revisions tbody td").first
+    cell = page.locator("#items tbody td").first
     assert cell.locator("a").bounding_box()["height"] < 30.0  # one line
 
 
@@ -241,7 +242,7 @@ def test_a_mission_description_is_shown_and_changed_on_its_page(page):
     entered = page.request.post("/api/v1/missions", data=MISSION, headers={"Content-Type": "text/plain"})
     assert entered.status == 201
     settled(page, "/missions")
-    row = page.locator("#revisions tbody tr").first
+    row = page.locator("#items tbody tr").first
     expect(row).to_contain_text("shown")
     expect(row).to_contain_text(entered.json()["revision"][:12])
     expect(page.locator("#range")).to_contain_text("1 to 2 of 2")
@@ -268,6 +269,43 @@ def test_a_mission_description_is_shown_and_changed_on_its_page(page):
     page.goto("/missions/new")
     editor.fill('name = "')
     expect(page.locator("#faults")).to_contain_text("mission.toml: expected TOML")
+
+
+def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_run(page):
+    page.goto("/missions/new")
+    editor, part = page.get_by_label("mission.toml"), page.locator("#part")
+    editor.fill(f"{MISSION}[link.stations.here] # the mast\nlatitude_deg = 10.0\nlongitude_deg = 60.0\n")
+    page.get_by_role("button", name="Change station here").click()
+    part.get_by_label("Longitude, °").fill("")
+    part.get_by_label("Latitude, °").fill("-10.5")
+    part.get_by_role("button", name="Write into the text").click()
+    expect(page.locator("#faults")).to_contain_text("latitude_deg and longitude_deg together")
+    assert editor.input_value().endswith("[link.stations.here] # the mast\nlatitude_deg = -10.5\n")
+    page.get_by_role("button", name="Change station here").click()
+    part.get_by_label("Longitude, °").fill("61")
+    part.get_by_label("Name").fill("New here")
+    part.get_by_role("button", name="Write into the text").click()
+    page.get_by_role("button", name="Add a link").click()
+    part.get_by_label("Name").fill("mast")
+    part.get_by_label("Kind").select_option("tcp")
+    part.get_by_label("Station").select_option("New here")
+    part.get_by_label("Uplink").fill("127.0.0.1:9")
+    part.get_by_role("button", name="Write into the text").click()
+    expect(page.locator("#faults")).to_contain_text('+[link.stations."New here"]')
+    assert editor.input_value().endswith(
+        '[link.stations."New here"]\nlatitude_deg = -10.5\nlongitude_deg = 61\n\n[[links]]\nname = "mast"\n'
+        'kind = "tcp"\nstation = "New here"\nuplink = "127.0.0.1:9"\n'
+    )
+    flight = page.locator("#flight")
+    page.get_by_role("button", name="Dry run").click()
+    expect(flight).to_contain_text("1 window, nothing contradicts the flight")
+    expect(flight.locator("tbody tr")).to_contain_text("2029-08-07 06:")
+    page.get_by_role("button", name="Remove link mast").click()
+    assert "[[links]]" not in editor.input_value()
+    expect(page.locator("#links")).to_contain_text("None stated.")
+    page.get_by_role("button", name="Dry run").click()
+    expect(flight).to_contain_text("1 window, and what contradicts the flight")
+    expect(flight).to_contain_text("found no link with an uplink")
 
 
 def test_a_mission_description_that_is_not_entered_is_told(page):
@@ -310,7 +348,7 @@ def test_arguments_have_names_units_and_ranges(page):
     row = page.locator("#commands tbody tr").first
     expect(row).to_contain_text("function start observation, duration 900 s, cadence 15 s")
     settled(page, "/audit")
-    expect(page.locator("#entries tbody tr").first).to_contain_text(
+    expect(page.locator("#items tbody tr").first).to_contain_text(
         "arguments function start observation, duration 900 s"
     )
     settled(page, "/commands")
@@ -452,9 +490,11 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
     flown = make_flyable(frames=12, seed=61)
     pack_archive(flown.folder, tmp_path / "pass.zip")
     files = [("regression-archives", tmp_path / "pass.zip")]
-    for name, program in (("good", None), ("broken", "raise SystemExit(4)")):
-        options = {} if program is None else {"program": program}
-        build = make_build(name, {"synthetic pass 61": flown.packets}, **options)
+    found = {"synthetic pass 61": flown.packets}
+    half = with_detections(found, lambda items: {name: values[::2] for name, values in items.items()})
+    broken = {"program": "raise SystemExit(4)"}
+    for name, packets, options in (("good", found, {}), ("half", half, {}), ("broken", found, broken)):
+        build = make_build(name, packets, **options)
         files.append(("builds", zipped(build.parent, tmp_path / f"{name}.zip")))
     settled(page, "/regression")
     for kind, file in files:
@@ -462,15 +502,25 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
         page.locator("#zip").set_input_files(file)
         page.get_by_role("button", name="Upload").click()
         expect(page.locator("#notices .good")).to_have_count(1 + files.index((kind, file)))
-    for candidate, verdict in (("good", "pass"), ("broken", "fail")):
+    for candidate, verdict in (("good", "pass"), ("half", "fail"), ("broken", "fail")):
         for select, build in (("#candidate", candidate), ("#baseline", "good")):
             option = page.locator(f"{select} option", has_text=build)
             page.locator(select).select_option(option.get_attribute("value"))
         page.get_by_role("button", name="Run", exact=True).click()
         latest = page.locator("#regressions tbody tr").first
-        expect(latest).to_contain_text(verdict)
-    page.locator("#regressions").get_by_role("button", name="Gates").nth(1).click()
+        expect(latest).to_contain_text(candidate)
+        expect(latest.locator(f".state.{verdict}")).to_be_visible()
+    page.locator("#regressions").get_by_role("button", name="Gates and craters").nth(1).click()
     expect(page.locator("#regressions table").nth(1)).to_contain_text("recall")
+    changed = page.locator("#regressions .report")
+    expect(changed).to_contain_text("tracks of craters lost")
+    lost = changed.locator("table").first.locator("tbody tr td:nth-child(6)").all_inner_texts()
+    assert lost == sorted(lost, key=int, reverse=True) and int(lost[0]) > 0
+    expect(changed.locator("#fig-changed image")).to_have_count(2 * len(lost))
+    shape = changed.locator("#fig-changed [style]").first
+    assert shape.evaluate("(one) => getComputedStyle(one).fill") == "none"
+    expect(changed.locator("table").nth(1).locator("tbody td:nth-child(3)")).to_have_text("0")
+    expect(changed.locator("table").nth(1)).to_contain_text("first different frame")
     with page.expect_popup() as opened:
         page.locator("#regressions").get_by_role("link", name="Report").first.click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()

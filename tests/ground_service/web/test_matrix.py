@@ -40,14 +40,19 @@ Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
 
-EVERY_LOOK: Looks = tuple(itertools.product(("light", "dark"), FONTS, (1280, 820, 390)))
-FEW_LOOKS: Looks = (("light", "DejaVu", 820), ("light", "Arial", 1280), ("dark", "Arial", 390))
-"""Each scheme, font and width once; the last width is that of the keyboard."""
+EVERY_LOOK: Looks = tuple(itertools.product(("light", "dark"), FONTS, (1280, 768, 390)))
+FEW_LOOKS: Looks = (
+    ("light", "Arial", 1280),
+    ("dark", "Arial", 768),
+    ("light", "DejaVu", 390),
+    ("dark", "Arial", 390),
+)
+"""Each scheme, font and width at least once; the last width is that of the keyboard."""
 
 LOOKS = pytest.mark.parametrize(
     "looks", [FEW_LOOKS, pytest.param(EVERY_LOOK, marks=pytest.mark.campaign)], ids=["few", "every"]
 )
-AXE_WIDTHS = (1280, 390)
+AXE_WIDTHS = (1280, 768, 390)
 LONG_LOG = """() => {
   const feed = document.getElementById("feed");
   for (let k = 0; feed && k < 60; k++)
@@ -316,6 +321,29 @@ def test_a_page_with_data_has_no_fault(
     found.find(page, looks)
     page.close()
     record(rows, path, "with", found)
+
+
+@pytest.mark.parametrize(
+    ("path", "needed"),
+    [
+        ("/", "td button:has-text('Acknowledge')"),
+        ("/", "td a:has-text('Report')"),
+        ("/alarms", "td button:has-text('Acknowledge')"),
+        ("/commands", "td button:has-text('Send now')"),
+        ("/passes", "#passes a:has-text('open')"),
+        ("/passes", "#passes td.num"),
+    ],
+)
+def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(
+    administrator: BrowserContext, path: str, needed: str
+) -> None:
+    page = new_page(administrator)
+    page.set_viewport_size({"width": 390, "height": 844})
+    settled(page, path)
+    answered(page)
+    box = page.locator(needed).first.bounding_box()
+    page.close()
+    assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= 390
 
 
 @LOOKS

@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -222,6 +222,33 @@ def shift(
     spacecraft.close()
 
 
+COUNT_CLICKS = "addEventListener('click', () => (sessionStorage.n = 1 + Number(sessionStorage.n ?? 0)), true)"
+
+
+def go(page: Page, *links: str) -> None:
+    """Follow links by their visible texts."""
+    for text in links:
+        page.get_by_role("link", name=text, exact=True).first.click()
+
+
+@contextmanager
+def telemetry(spacecraft: Spacecraft) -> Iterator[None]:
+    """Keep a contact open: telemetry comes more often than its silence ends it."""
+    over = threading.Event()
+
+    def send() -> None:
+        while not over.wait(0.5):
+            spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=21.5)
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    try:
+        yield
+    finally:
+        over.set()
+        sending.join()
+
+
 def dismiss_notices(page: Page) -> None:
     """Remove the notices, which are not part of a picture."""
     page.evaluate("document.querySelectorAll('#notices .notice').forEach((one) => one.remove())")
@@ -232,6 +259,7 @@ def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
     """The operator's browser; the test fails if a script fails or the console shows an error."""
     context = patient(browser.new_context(base_url=shift.url, viewport={"width": 1280, "height": 800}))
     page = context.new_page()
+    page.add_init_script(COUNT_CLICKS)
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     yield page
@@ -250,13 +278,13 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     expect(page.locator("#user")).to_have_text("ann, operator")
 
     # The mission in force.
-    page.goto("/missions")
+    go(page, "Planner", "Missions")
     page.get_by_role("link", name="selenita").click()
     page.locator("#sections summary", has_text="approval").click()
     expect(page.locator("#sections")).to_contain_text("manual")
 
     # A standing request becomes windows in mission time and in daylight.
-    page.goto("/planner")
+    go(page, "Planner")
     expect(page.locator("#daylight")).to_contain_text("Sun above the horizon")
     page.get_by_text("Add a standing request").click()
     page.locator("#request-name").fill("low Sun")
@@ -277,7 +305,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
 
     # Nothing is released while the spacecraft is on hold, not even by the planner.
     spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=21.5)
-    page.goto("/")
+    go(page, "Shift")
     craft = page.get_by_role("region", name="Spacecraft 76 flight")
     craft.get_by_label("Reason of the hold").fill("antenna is being repaired")
     craft.get_by_role("button", name="Hold").click()
@@ -294,9 +322,10 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     window.get_by_role("button", name=re.compile("^Release")).click()
     page.get_by_role("dialog", name=re.compile("^Release")).get_by_role("button", name="Release").click()
     expect(window).to_contain_text("waits for transmission")
-    page.goto("/commands")
+    go(page, "Commands")
+    expect(page.get_by_role("button", name="Send now").first).to_be_enabled()
     pictures.take(page, "links", "section[aria-labelledby=links-title]")
-    page.goto("/")
+    go(page, "Shift")
     window.get_by_role("button", name=re.compile("^Send")).click()
     question = page.get_by_role(
         "dialog", name=re.compile(r"^Send \d+ telecommands over (madrid|canberra) now\?$")
@@ -305,7 +334,19 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     question.get_by_role("button", name="Send").click()
     expect(window.locator(".chain .now")).to_have_text("executed")  # all telecommands are verified
     expect(window).to_contain_text("begins in")
-    page.goto("/commands")
+
+    # In a contact, five clicks lead from the search to telecommands that are sent.
+    go(page, "Planner")
+    before = int(page.evaluate("sessionStorage.n"))
+    with telemetry(spacecraft):
+        page.get_by_role("button", name="Search").click()
+        page.locator("#candidates").get_by_role("button", name="Plan").last.click()
+        page.locator("#selected").get_by_role("button", name="Approve").click()
+        page.locator("#selected").get_by_role("button", name="Uplink").click()
+        page.get_by_role("button", name="Release and send").click()
+        expect(page.locator("#notices")).to_contain_text("sends what is released")
+    assert int(page.evaluate("sessionStorage.n")) - before == 5
+    go(page, "Shift", "Commands")
     # The planner uplinks approved windows that begin soon: the page has the name that the service recorded.
     recorded = json.loads(page.request.get("/api/v1/telecommands?limit=100").body())["items"]
     (decider,) = {one["decided_by"] for one in recorded if one["name"] == "insert_activity"}
@@ -320,7 +361,8 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     pictures.take(page, "commands", "section[aria-labelledby=queue-title]")
 
     # Live telemetry.
-    page.goto("/telemetry?spacecraft=76+flight&packet=housekeeping")
+    go(page, "Shift", "Telemetry")
+    page.get_by_label("Packet").select_option("housekeeping")
     value = page.locator("#live tr", has_text="temperature")
     expect(value).to_contain_text("21.5 °C")
     spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=70.25)
@@ -336,7 +378,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
 
     # An alarm.
     spacecraft.report("event_high", event_id=20, frame_number=7)
-    page.goto("/alarms")
+    go(page, "Shift", "All alarms")
     name = page.locator("td.keep", has_text=re.compile("^temperature$"))
     expect(page.locator("#alarms tbody tr").filter(has=name)).to_contain_text(re.compile(r"70\.[23] °C"))
     alarm = page.locator("#alarms tbody tr", has_text="camera fault")
@@ -346,10 +388,11 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     pictures.take(page, "alarms")
 
     # Its event, with words.
-    page.goto("/events?severity=high")
+    go(page, "Shift", "Events")
+    page.get_by_label("Severity").select_option("high")
     expect(page.locator("#events tbody tr", has_text="camera fault")).to_contain_text("frame 7")
     pictures.take(page, "events")
-    page.goto("/")
+    go(page, "Shift")
 
     # The report of a pass.
     craft.get_by_role("link", name="Monthly reports").click()
@@ -370,14 +413,16 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     assert re.search(r"/reports/[0-9a-f]{32}$", opened.value.url)
     pictures.take(opened.value, "report-page")
     opened.value.close()
-    page.goto("/passes?search=synthetic")
+    go(page, "Shift", "All passes")
+    page.get_by_label("Search").fill("synthetic")
+    page.get_by_role("button", name="Search").click()
     row = page.locator("#passes tbody tr", has_text="synthetic pass")
     expect(row.get_by_role("link", name="open")).to_be_visible()
     expect(row.locator(".state").first).not_to_be_empty()
     pictures.take(page, "passes")
 
     # A regression with its verdict.
-    page.goto("/regression")
+    go(page, "Shift", "Builds and gates")
     for select, build in (("#candidate", "broken"), ("#baseline", "good")):
         option = page.locator(f"{select} option", has_text=build)
         page.locator(select).select_option(option.get_attribute("value"))
@@ -389,7 +434,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift, tmp_path: Path)
     pictures.take(page, "regression")
 
     # Hand over: one page shows windows, alarms, verdicts and the note.
-    page.goto("/")
+    go(page, "Shift")
     craft.get_by_label("Note for the next shift").fill("Camera fault acknowledged; watch the temperature.")
     craft.get_by_role("button", name="Keep the note").click()
     expect(craft).to_contain_text("by ann")
