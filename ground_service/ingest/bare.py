@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from ground_service.ingest.fragments import Fragment
-from ground_service.ingest.frames import Section
+from ground_service.ingest.frames import Known, Section
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from ground_service.ingest.quality import Found
 from lunar.arrays import IntArray, OctetArray
@@ -56,17 +56,21 @@ class PacketReader:
         """Read only packets from an octet on, up to which another reader has read."""
         self._new = max(self._new[0], end), self._new[1]
 
-    def exclude(self, before: OctetArray, after: OctetArray) -> None:
-        """Exclude the packets that the octets before and after the piece give by themselves."""
-        section, at = self.section, self.section.first - before.size
-        earlier = _cut(before, self._form, begins=self._is_start and at == section.start)
-        later = _cut(after, self._form, begins=False)
-        stops = np.concatenate([earlier.offsets + earlier.lengths, earlier.idle[:, 1]])
-        starts = later.offsets[later.crc_ok]
-        self._new = (
-            at + int(stops.max()) if stops.size else section.start,
-            section.last + int(starts[0]) if starts.size else section.stop,
-        )
+    def exclude(self, before: Iterable[Known], after: Iterable[Known]) -> None:
+        """Exclude the packets that the octets before and after the piece, nearest first, give by themselves."""
+        start, stop = self._new
+        for at, octets in before:
+            cut = _cut(octets, self._form, begins=self._is_start and at == self.section.start)
+            ends = np.concatenate([cut.offsets + cut.lengths, cut.idle[:, 1]])
+            if ends.size:
+                start = at + int(ends.max())
+                break
+        for at, octets in after:
+            cut = _cut(octets, self._form, begins=False)
+            if cut.crc_ok.any():
+                stop = at + int(cut.offsets[cut.crc_ok][0])
+                break
+        self._new = start, stop
 
     def take_fragments(self) -> list[Fragment]:
         """Return no fragments: packets without frames have no count by which parts could be found."""

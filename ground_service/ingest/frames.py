@@ -41,6 +41,9 @@ REACH_OCTETS = (CONTEXT_CADUS + 2) * CADU_MAX_OCTETS
 FOREIGN_FRAMES = 2
 """Number of frames from which a spacecraft is accepted in a stream of frames without code or checksum."""
 
+Known = tuple[int, OctetArray]
+"""Octets of earlier pieces and their place in the run."""
+
 FormOf = Callable[[int], PacketForm]
 """Returns the form of the packets of a spacecraft."""
 
@@ -160,14 +163,18 @@ class FrameReader:
         """Read only frames from an octet on, up to which another reader has read."""
         self._new = max(self._new[0], 8 * end), self._new[1]
 
-    def exclude(self, before: OctetArray, after: OctetArray) -> None:
-        """Exclude the valid frames that the octets before and after the piece give by themselves."""
-        section = self.section
-        earlier, later = self._valid_starts(before), self._valid_starts(after)
-        self._new = (
-            8 * section.start + int(earlier[-1]) + 8 * self._length if earlier.size else 8 * section.start,
-            8 * section.last + int(later[0]) if later.size else 8 * section.stop,
-        )
+    def exclude(self, before: Iterable[Known], after: Iterable[Known]) -> None:
+        """Exclude the valid frames that the octets before and after the piece, nearest first, give by themselves."""
+        first, last = self._new
+        for at, octets in before:
+            if (starts := self._valid_starts(octets)).size:
+                first = 8 * (at + self._length) + int(starts[-1])
+                break
+        for at, octets in after:
+            if (starts := self._valid_starts(octets)).size:
+                last = 8 * at + int(starts[0])
+                break
+        self._new = first, last
 
     def batches(self, windows: Iterable[tuple[OctetArray, bool]]) -> Iterator[PacketBatch]:
         """Yield the packets of the section; `windows` are its octets, each with whether it is the last one."""

@@ -200,7 +200,7 @@ class Reading:
                     self._store_early(held, fragments)
                 held = batch
             fragments += reader.take_fragments()
-            end = reader.end
+            end = max(end, reader.end)
         if not self.piece.stream and not self.found.frames and not self.found.packets:
             self._refuse(
                 "no valid frame or packet"
@@ -306,13 +306,18 @@ class Reading:
                 self.expected.form,
                 spacecraft_id=piece.spacecraft_id,
             )
-        if section.start < section.first or section.last < section.stop:
-            start, stop = section.start, section.stop
-            if section.settings is None:
-                # packets do not prove themselves: earlier pieces were read without the octets that are new beyond them
-                start = max(start, 0, *(one for _, one in run.new if one <= section.first))
-                stop = min(stop, run.octets, *(one for one, _ in run.new if one >= section.last))
-            reader.exclude(run.read(start, section.first), run.read(section.last, stop))
+        # earlier pieces were read without the octets that are new between them
+        edges = [0, *(edge for one in run.new for edge in one), run.octets]
+        known = [
+            (max(start, section.start), min(stop, section.stop))
+            for start, stop in zip(edges[::2], edges[1::2], strict=True)
+        ]
+        before = [one for one in known[::-1] if one[0] < one[1] <= section.first]
+        after = [one for one in known if section.last <= one[0] < one[1]]
+        reader.exclude(
+            ((start, run.read(start, stop)) for start, stop in before),
+            ((start, run.read(start, stop)) for start, stop in after),
+        )
         return reader
 
     def _form_of(self, spacecraft: int) -> PacketForm:

@@ -58,6 +58,10 @@ def test_a_packet_that_ends_with_the_last_frame_of_its_channel_is_completed(one_
     assert one_process.difference(case_of(121, ("channels",) * 13)) == ""
 
 
+def test_frames_that_a_piece_did_not_show_are_read_with_a_later_one_around_it(one_process: Archive) -> None:
+    assert one_process.difference(case_of(229, ("damaged",) * 13)) == ""
+
+
 def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
     one_process: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
