@@ -37,6 +37,7 @@ from ground_service.toml import parse_table, read_table
 
 CURRENT = "current"
 BUILD_FILE = "build.toml"
+CURRENT_FILE = b'schema_version = 1\nname = "current"\n'
 BUILD_FILE_LIMIT_OCTETS = 1 << 20
 FLIGHT_COMMAND = (
     "{python}", "-m", "linna", "replay", "{archive}", "--build", "{build}", "--out", "{out}", "--recorded-only",
@@ -280,9 +281,8 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
     folder = _folder_of(ground, build.digest)
     if not folder.exists():
         check_parameters(build, runner=ground.runner, private=(ground.home,))
-    text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
     try:
-        packed = _packed(text, {name: build.folder / name for name, _ in build.files})
+        packed = packed_build(build)
     except OSError as error:
         raise storage_error(error, build.folder) from None
     stored = ground.files.put_octets(packed)
@@ -310,13 +310,14 @@ def _folder_of(ground: Ground, digest: str) -> Path:
     return ground.home / "regression" / "builds" / digest
 
 
-def _packed(text: bytes, files: Mapping[str, Path]) -> bytes:
+def packed_build(build: Build) -> bytes:
     """Return a zip file with the build file and the files of a build; the same files give the same octets."""
     octets = io.BytesIO()
     with zipfile.ZipFile(octets, "w") as packed:
+        text = build.file.read_bytes() if build.file.is_file() else CURRENT_FILE
         packed.writestr(zipfile.ZipInfo(BUILD_FILE), text, zipfile.ZIP_DEFLATED)
-        for name, path in sorted(files.items()):
-            entry = zipfile.ZipInfo(name)
+        for name, _ in build.files:
+            path, entry = build.folder / name, zipfile.ZipInfo(name)
             entry.external_attr = (_PROGRAM if path.stat().st_mode & stat.S_IXUSR else _PLAIN) << 16
             packed.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
     return octets.getvalue()
@@ -451,10 +452,6 @@ def _current() -> Build:
     )
 
 
-def _current_text() -> str:
-    return 'schema_version = 1\nname = "current"\n'
-
-
 def _read(path: Path) -> dict[str, Any]:
     try:
         octets = path.read_bytes()
@@ -470,11 +467,10 @@ def _read(path: Path) -> dict[str, Any]:
 def _file_hash(build_file: Path, name: str) -> str:
     path = build_file.parent / name
     inside = not Path(name).is_absolute() and path.resolve().is_relative_to(build_file.parent.resolve())
-    if not inside:
-        raise InvalidInput(str(build_file), name, "a file in the folder of the build file", "one elsewhere")
-    if not path.is_file():
-        raise InvalidInput(str(build_file), name, "a file in the folder of the build file", "nothing there")
-    return _hash_of(path)
+    if inside and path.is_file():
+        return _hash_of(path)
+    found = "nothing there" if inside else "one elsewhere"
+    raise InvalidInput(str(build_file), name, "a file in the folder of the build file", found)
 
 
 def _hash_of(path: Path) -> str:

@@ -294,7 +294,10 @@ def changed_craters(judged: Sequence[PassVerdict]) -> ChangedCraters:
         here, before = (one.detections.cell[~one.detections.true] for one in (new, old))
         cells.append(np.setdiff1d(here, before))
     latitude, longitude, changes = np.concatenate(tracks, axis=1)
-    return ChangedCraters(latitude, longitude, changes, *cell_places_deg(np.concatenate(cells)))
+    false_latitude, false_longitude = cell_places_deg(np.concatenate(cells))
+    west = longitude[:1].sum() - 180.0  # a pass over 0 or 180 degrees is one strip
+    longitude, false_longitude = ((one - west) % 360.0 + west for one in (longitude, false_longitude))
+    return ChangedCraters(latitude, longitude, changes, false_latitude, false_longitude)
 
 
 def _side(

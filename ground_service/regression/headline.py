@@ -39,7 +39,7 @@ def _reason(outcome: RegressionOutcome) -> str:
     gates = [gate for gate in outcome.gates if not gate.waived and gate.outcome not in (INFORMS, NOT_JUDGED)]
     lost = [one for one in outcome.passes if one.state == "candidate failed"]
     if lost:
-        more = f" and on {len(lost) - 1} further passes" if len(lost) > 1 else ""
+        more = f" and on {len(lost) - 1} more" if len(lost) > 1 else ""
         return f"{lost[0].detail}, on {lost[0].name}{more}"
     failed = [gate for gate in gates if gate.outcome == FAIL]
     if exact := [gate for gate in failed if gate.name in EXACT_METRICS]:

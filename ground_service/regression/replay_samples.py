@@ -43,6 +43,7 @@ from tmtc.errors import TmtcError
 from tmtc.schema import Dictionary, Table
 
 FRAME_TIMES = "frame_times.csv"
+NAVIGATION_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "sigma_rtn_m", "nis", "matched")
 LOW_KM, LOW_SUN_DEG = 25.0, 20.0
 """Altitude and elevation of the Sun that divide the passes into conditions."""
 
@@ -212,16 +213,8 @@ def condition_of(context: PassContext) -> str:
 
 def _frames(context: PassContext, *received: Any) -> PassFrames:
     """Return the frames of a pass with what was received."""
-    arguments: tuple[Any, ...] = (
-        context.frame_ticks,
-        context.frame_utc_ns,
-        *received,
-        context.reference,
-        context.catalogue,
-        context.camera,
-        context.orientation,
-        context.viewing,
-    )
+    known = (context.reference, context.catalogue, context.camera, context.orientation, context.viewing)
+    arguments: tuple[Any, ...] = (context.frame_ticks, context.frame_utc_ns, *received, *known)
     return pass_frames(*arguments)
 
 
@@ -314,19 +307,9 @@ def _navigation(table: Table | None, context: PassContext) -> dict[str, Navigati
         chosen = chosen[np.unique(row[chosen], return_index=True)[1]]
         if len(chosen) == 0:
             continue
-        columns = {key: values[chosen] for key, values in table.columns.items()}
-        samples[name] = NavigationSamples(
-            name,
-            row[chosen],
-            context.frame_utc_ns[row[chosen]],
-            columns["latitude_deg"],
-            columns["longitude_deg"],
-            columns["altitude_m"],
-            columns["sigma_rtn_m"],
-            columns["nis"],
-            columns["matched"],
-            (),
-        )
+        columns = {key: table.columns[key][chosen] for key in NAVIGATION_COLUMNS}
+        utc_ns = context.frame_utc_ns[row[chosen]]
+        samples[name] = NavigationSamples(name, row[chosen], utc_ns, **columns, outcome=())
     return samples
 
 

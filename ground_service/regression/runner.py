@@ -368,7 +368,9 @@ def _awaited(exchange: Path, identity: str, run_s: float) -> Path:
         now = time.monotonic()
         if alive(exchange):
             quiet_since = now
-        elif now - quiet_since > SILENT_S or not (started or _ever_heard_of(exchange)):
+        elif now - quiet_since > SILENT_S or not (
+            started or os.path.lexists(exchange / ALIVE) or any((exchange / "running").iterdir())
+        ):
             raise SandboxRefused(f"runner exchange {exchange}: expected a runner, found none that responds")
         if started is None and running.exists():
             started = now
@@ -384,10 +386,6 @@ def alive(exchange: Path) -> bool:
         return time.time() - os.lstat(exchange / ALIVE).st_mtime < SILENT_S
     except OSError:
         return False
-
-
-def _ever_heard_of(exchange: Path) -> bool:
-    return os.path.lexists(exchange / ALIVE) or any((exchange / "running").iterdir())
 
 
 def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> dict[str, Any]:

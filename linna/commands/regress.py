@@ -6,7 +6,6 @@ import argparse
 import os
 import tempfile
 import time
-import zipfile
 from collections.abc import Callable, Container
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,8 @@ from linna.output import emit, finish, log, progress
 from linna.parser import option
 
 PROGRESS_STEP = 0.05
+LISTED = 16
+"""Digits of an identity in lists; commands accept them."""
 
 if TYPE_CHECKING:
     from ground_service.client import Client
@@ -210,11 +211,13 @@ def _suite(arguments: argparse.Namespace) -> int:
 
     scenarios = suite_scenarios(arguments.scenario, frames=arguments.frames, seeds=arguments.seeds)
     if arguments.out is None:
-        frames = [round(one.window.duration_s / one.camera.frame_interval_s) for one in scenarios]
-        names = [one.name.removeprefix("suite-") for one in scenarios]
-        rows = [{"scenario": name, "frames": n} for name, n in zip(names, frames, strict=True)]
-        lines = [f"{row['scenario']}: about {row['frames']} frames" for row in rows]
-        found = detectable(load_policy().policy, sum(frames), len(frames))
+        frames = {
+            one.name.removeprefix("suite-"): round(one.window.duration_s / one.camera.frame_interval_s)
+            for one in scenarios
+        }
+        rows = [{"scenario": name, "frames": count} for name, count in frames.items()]
+        lines = [f"{name}: about {count} frames" for name, count in frames.items()]
+        found = detectable(load_policy().policy, sum(frames.values()), len(frames))
         lines.append(power_text(found))
         return emit(arguments, {"passes": rows, "detectable": found}, text="\n".join(lines))
     written = write_suite(
@@ -270,9 +273,7 @@ def _kept(service: Client, given: list[str]) -> list[str]:
     """
     from ground_service.errors import InvalidInput
 
-    kept = service.list_kept_archives()
-    known = {key: one.digest for one in kept for key in (one.digest, str(one.pass_id or ""))}
-    digests: list[str] = []
+    known, digests = _known(service), list[str]()
     for item in given:
         path = Path(item)
         if path.exists():
@@ -288,6 +289,14 @@ def _kept(service: Client, given: list[str]) -> list[str]:
                 "nothing there",
             )
     return digests
+
+
+def _known(service: Client) -> dict[str, str]:
+    """Return the identities of the kept archives by identity, by its beginning as it is listed, and by pass."""
+    kept = list(service.list_kept_archives())
+    return {
+        key: one.digest for one in kept for key in (one.digest, one.digest[:LISTED], str(one.pass_id or ""))
+    }
 
 
 def _upload(service: Client, path: Path, known: Container[str]) -> str:
@@ -329,17 +338,18 @@ def _archive(arguments: argparse.Namespace) -> int:
         return emit(arguments, {"archive": str(arguments.out)}, text=f"archive: {arguments.out}")
     removed: list[str] = []
     with ground_client(arguments) as service:
+        identity = _known(service).get(arguments.target, arguments.target)
         if arguments.action == "add" and _is_pass(arguments.target):
             service.keep_pass_archive(int(arguments.target))
         elif arguments.action == "add":
             _upload(service, Path(arguments.target), ())
         elif arguments.action == "render":
             target = arguments.target
-            digest = service.keep_pass_archive(int(target)).digest if _is_pass(target) else target
+            digest = service.keep_pass_archive(int(target)).digest if _is_pass(target) else identity
             log("rendering the missing frames ...")
             service.wait(service.render_kept_archive(digest).id)
         elif arguments.action in ("pin", "unpin"):
-            service.change_kept_archive(arguments.target, pinned=arguments.action == "pin")
+            service.change_kept_archive(identity, pinned=arguments.action == "pin")
         elif arguments.action == "prune":
             removed = service.delete_kept_archives(unused_days=arguments.unused_days).removed
         kept = service.list_kept_archives()
@@ -347,7 +357,7 @@ def _archive(arguments: argparse.Namespace) -> int:
         "digest", "name", "frames", "frames_stored", "state", "reason", "octets", "pinned", "pass_id",
     }  # fmt: skip
     lines = [
-        f"{one.digest[:16]}  {one.frames_stored:5} of {one.frames:5} frames  {one.octets / 1e6:8.1f} MB  {one.name}"
+        f"{one.digest[:LISTED]}  {one.frames_stored:5} of {one.frames:5} frames  {one.octets / 1e6:8.1f} MB  {one.name}"
         f"{'' if one.pass_id is None else f'  pass {one.pass_id}'}{'  pinned' if one.pinned else ''}"
         f"{'' if one.state == 'complete' else f'  {one.state}'}{f': {one.reason}' if one.reason else ''}"
         for one in kept
@@ -384,17 +394,14 @@ def _build(arguments: argparse.Namespace) -> int:
 
 def _registered(service: Client, given: str) -> Build:
     """Register a build file, or the flight code of the service ("current")."""
-    from ground_service.regression.builds import BUILD_FILE, CURRENT, load_build
+    from ground_service.regression.builds import CURRENT, load_build, packed_build
 
     if given == CURRENT:
         return service.add_current_build()
     build = load_build(given)
     with tempfile.TemporaryDirectory() as scratch:
         packed = Path(scratch) / "build.zip"
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as zipped:
-            zipped.write(build.file, BUILD_FILE)
-            for name, _ in build.files:
-                zipped.write(build.folder / name, name)
+        packed.write_bytes(packed_build(build))
         return service.add_build(packed)
 
 

@@ -14,6 +14,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,10 @@ from payload_emulator.session.world import (
     frame_utc_ns,
     open_world,
 )
+from payload_emulator.sim.board.faults import parse_fault
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import decode
+from tmtc.downlink import DownlinkDecode, decode
 from tmtc.errors import TmtcError
 from tmtc.onboard_parameters import find_parameter
 from tmtc.schema import Table
@@ -91,7 +93,8 @@ def reconstruct(
         raise RecordError(
             f"{archive}: expected a world with rendered images, found camera.images = 'reduced'"
         )
-    telemetry = _telemetry(archive)
+    received = _received(archive)
+    telemetry = received.tables(DICTIONARY)
     reports = image_reports(telemetry.get("image_report"))
     if not reports:
         raise RecordError(f"{archive}: expected image reports in telemetry, found none")
@@ -115,7 +118,7 @@ def reconstruct(
     inputs = with_telecommands(steps, telecommands)
     save_record(out, inputs, loaded.parameters, loaded.tables)
     save_frame_times(out, np.array(times, dtype=np.int64))
-    save_attitudes(out, inputs, onboard_attitudes(_packets(archive)))
+    save_attitudes(out, inputs, onboard_attitudes(received.cut.packets(received.buffer)))
     manifest |= _described(world, loaded, scenario)
     manifest["files"] = file_entries(out)
     (out / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
@@ -158,9 +161,18 @@ def with_telecommands(steps: Mapping[int, StepInput], telecommands: bytes) -> li
 
 
 def _exposures(world: World, reports: Sequence[ImageReport]) -> Iterator[tuple[ImageReport, Exposure]]:
-    bench = InstrumentBench(world)
+    """Yield the exposure of each report; where the clock has jumped, at the time that telemetry confirms."""
+    bench, faults = InstrumentBench(world), map(parse_fault, world.scenario.faults.events)
+    jumps_s = [one.size for one in sorted(faults, key=lambda one: one.at_s) if one.kind == "clock_jump"]
+    errors_s = list(accumulate(jumps_s, initial=0.0))
     for report in reports:
-        exposure = expose(world, frame_utc_ns(world, report.ticks))
+        for error_s in tuple(errors_s):
+            ticks = report.ticks - round(error_s * TICKS_PER_SECOND)
+            exposure = expose(world, frame_utc_ns(world, ticks))
+            found = image_report(exposure.image, np.zeros(0), {})
+            if found["image_crc"] == report.values["image_crc"]:
+                break
+            errors_s = errors_s[1:] or errors_s
         samples = bench.sample(exposure.utc_ns, exposure.camera_from_mcmf)
         yield report, replace(exposure, instruments=samples)
 
@@ -224,10 +236,10 @@ def _check_loads(archive: Path, table: Table | None, loaded: LoadedPayload, tele
                 )
 
 
-def _telemetry(archive: Path) -> dict[str, Table]:
+def _received(archive: Path) -> DownlinkDecode:
     octets = _octets(archive, DOWNLINK, "received packets")
     try:
-        return decode(octets, dictionary=DICTIONARY).tables(DICTIONARY)
+        return decode(octets, dictionary=DICTIONARY)
     except TmtcError as error:
         raise RecordError(
             f"{archive / DOWNLINK}: expected packets of the dictionary, found {error}"
@@ -235,21 +247,10 @@ def _telemetry(archive: Path) -> dict[str, Table]:
 
 
 def _octets(archive: Path, name: str, what: str) -> bytes:
-    try:
-        octets = (archive / name).read_bytes()
-    except FileNotFoundError:
-        octets = b""
-    if not octets:
-        raise RecordError(f"{archive / name}: expected {what}, found none")
+    path = archive / name
+    if not path.is_file() or not (octets := path.read_bytes()):
+        raise RecordError(f"{path}: expected {what}, found none")
     return octets
-
-
-def _packets(archive: Path) -> Iterator[bytes]:
-    octets, start = (archive / DOWNLINK).read_bytes(), 0
-    while start < len(octets):
-        length = 7 + int.from_bytes(octets[start + 4 : start + 6], "big")
-        yield octets[start : start + length]
-        start += length
 
 
 def _described(world: World, loaded: LoadedPayload, scenario: Scenario) -> dict[str, Any]:

@@ -39,6 +39,7 @@ def detectable(policy: GatePolicy, frames: int, passes: int) -> list[dict[str, A
 
 
 def power_text(found: Sequence[dict[str, Any]]) -> str:
-    """Return the losses that all passes together detect, as one line."""
+    """Return the frames and minutes of all passes together and the losses that they detect, as one line."""
     told = ", ".join(f"{one['metric']} {one['change']:.2g}" for one in found)
-    return f"all passes together find with a power of {POWER:g} a loss of: {told}"
+    cost = "{frames} frames, {minutes} minutes of a core for the candidate".format(**found[0])
+    return f"all passes together ({cost}) find with a power of {POWER:g} a loss of: {told}"

@@ -23,7 +23,7 @@ from ground_service.regression.gates.core import (
     judge,
     verdict_of,
 )
-from ground_service.regression.gates.policy import load_policy
+from ground_service.regression.gates.policy import load_policy, read_policy
 from ground_service.regression.gates.power import detectable, power_text
 from ground_service.regression.gates.samples import (
     CraterRows,
@@ -36,6 +36,13 @@ from ground_service.regression.gates.samples import (
 from ground_service.regression.gates.sequence import informative_order, is_clear, planned_looks
 
 POLICY = load_policy().policy
+NARROW = read_policy(
+    b"""schema_version = 3
+    version = "1"
+    fail = { level = 0.01, reason = "usual" }
+    gate = [{ metric = "detector.recall", weight = 1.0, margin = 0.1, reason = "usual" }]""",
+    "narrow",
+).policy
 FRAMES = 49
 RUNS = 60
 
@@ -323,6 +330,9 @@ def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name: str, fault: Any
     assert by_name(gates)[name].reason == (told if name in COSTS else f"pass 0: {told}")
     # It is one of both builds' if the baseline has it too.
     assert name not in failed(judge(after, after, POLICY))
+    # Faults of the telemetry fail under a policy that names other gates only.
+    assert failed(judge(before, after, NARROW)) <= failed(gates)
+    assert (name in failed(judge(before, after, NARROW))) == name.startswith("telemetry.")
 
 
 def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_passes_on() -> None:
@@ -434,6 +444,16 @@ def test_exact_gates_tolerate_what_the_policy_says() -> None:
     assert "navigation.wrong_fixes" in failed(judge(before, {"pass 0": wrong(before["pass 0"], 1)}, POLICY))
     five = suite(0, 5)
     assert failed(judge(five, {**five, "pass 0": wrong(five["pass 0"], 2)}, POLICY)) == set()
+    # With a wrong reference the fixes of both builds are wrong: 9 of them vary by 2.33 times their root, which is 7.
+    for count, others, names in (
+        (16, 0, []),
+        (19, 0, ["navigation.wrong_fixes"]),
+        (16, 1, ["navigation.wrong_fixes"]),
+    ):
+        after = {name: wrong(one, others) for name, one in five.items()} | {
+            "pass 0": wrong(five["pass 0"], count)
+        }
+        assert failed(judge({**five, "pass 0": wrong(five["pass 0"], 9)}, after, POLICY)) == set(names)
     more = {"pass 0": replace(before["pass 0"], memory_mib=312.0)}
     assert failed(judge(before, more, POLICY)) == set()
 
@@ -540,6 +560,6 @@ def test_what_the_frames_can_detect_is_stated_before_a_run() -> None:
     assert [one["metric"] for one in few] == weighted[:-1]  # position errors need ten passes
     assert all(a["change"] > b["change"] for a, b in zip(few, many, strict=True))
     assert power_text(few).startswith(
-        "all passes together find with a power of 0.8 a loss of: detector.recall 0."
+        "all passes together (80 frames, 0.4 minutes of a core for the candidate) find with a power of 0.8 a loss of: "
     )
     assert detectable(POLICY, 0, 0) == []

@@ -40,6 +40,7 @@ from ground_service.regression.documents import (
 )
 from ground_service.regression.gates.core import GatePolicy
 from ground_service.regression.gates.policy import load_policy
+from ground_service.regression.gates.samples import cell_places_deg
 from ground_service.regression.model import TELEMETRY_ONLY, ArchiveRecord, KeptReplay
 from ground_service.regression.outcome import RegressionOutcome
 from ground_service.regression.placebo import run_placebo
@@ -389,17 +390,22 @@ def test_a_crash_is_one_failure_in_junit(judge, passes) -> None:
 
 def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, packets: Packets) -> None:
     def thinned(items: dict[str, Any]) -> dict[str, Any]:
-        return {name: values[::2] for name, values in items.items()}
+        kept = {name: values[::2] for name, values in items.items()}
+        return kept | {"v_px": np.append(511.0 - kept["v_px"][:1], kept["v_px"][1:])}  # and one is elsewhere
 
     outcome = judge(with_detections(packets, thinned))
     page = regression_html(home, outcome, "0" * 32)
     assert page == regression_html(home, outcome, "0" * 32)
-    report = regression_report(home, outcome, "0" * 32)
+    with pytest.MonkeyPatch.context() as patched:
+        place = "ground_service.regression.documents.cell_places_deg"
+        patched.setattr(place, lambda cell: np.subtract(cell_places_deg(cell), [[0.0], [360.0]]))
+        report = regression_report(home, outcome, "0" * 32)
     hits = [
         [getattr(one, f"{side}_read").frames.craters.hit.sum() for one in outcome.passes]
         for side in ("baseline", "candidate")
     ]
     assert report.craters is not None and report.craters.change.sum() == sum(hits[1]) - sum(hits[0]) < 0
+    assert np.ptp(np.append(report.craters.longitude_deg, report.craters.false_longitude_deg)) < 20.0
     tracks = report.changed_tracks
     assert len(tracks) == 10 and [-one.lost for one in tracks] == sorted(-one.lost for one in tracks)
     for one in tracks:

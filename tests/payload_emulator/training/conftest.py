@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +15,22 @@ from payload_emulator.training.data.finishing import write_index
 SIZE = 512
 
 
-def draw_blobs(rng: np.random.Generator, u, v, diameter) -> np.ndarray:
-    """Gray image (512, 512) with a crater-like blob (lit below, dark above: Sun at the top) at each centre."""
+def draw_blobs(rng: np.random.Generator, u, v, diameter, pits=()) -> np.ndarray:
+    """Gray image (512, 512) of blobs like craters (lit below: Sun at the top) and pits, dark spots of 40 px."""
     row, column = np.mgrid[0:SIZE, 0:SIZE].astype(np.float64)
     image = 110.0 + 4.0 * rng.standard_normal((SIZE, SIZE))
     for x, y, d in zip(u, v, diameter, strict=True):
         dx, dy = (column - x) / (0.5 * d), (row - y) / (0.5 * d)
         image += 90.0 * dy * np.exp(-1.5 * (dx * dx + dy * dy))
+    for x, y in pits:
+        image -= 60.0 * np.exp(-1.5 * ((column - x) ** 2 + (row - y) ** 2) / 20.0**2)
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int = 3) -> store.Dataset:
-    """A data set of blobs in the project's own format, 30 km up over a plain."""
+def write_blob_dataset(
+    folder: Path, frames_per_split: dict[str, int], seed: int = 3, pits: Sequence[tuple[float, float]] = ()
+) -> store.Dataset:
+    """A data set of blobs in the project's own format, 30 km up over a plain; pits have no labels."""
     sources = tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split)
     recipe = Recipe("blobs", seed, sources)
     for name in ("images", "metadata", "shards"):
@@ -44,7 +49,7 @@ def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int
             far = np.array([i == 0 or np.hypot(u[:i] - u[i], v[:i] - v[i]).min() > 60 for i in range(n)])
             u, v = u[far], v[far]
             d = rng.uniform(26.0, 50.0, u.size)
-            store.write_frame(folder / "images" / f"{number:06d}.png", draw_blobs(rng, u, v, d))
+            store.write_frame(folder / "images" / f"{number:06d}.png", draw_blobs(rng, u, v, d, pits))
             store.write_json(folder / "metadata" / f"{number:06d}.json", {"frame": number})
             rows.append(number)
             craters.append(

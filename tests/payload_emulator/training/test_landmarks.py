@@ -34,12 +34,6 @@ def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks)
     assert with_landmarks(blob_dataset, away, landmarks).craters["u_px"].size == 0
 
 
-def test_a_file_of_landmarks_is_read_with_its_counts(landmarks):
-    assert len(landmarks) == 1
-    assert landmarks.latitude_rad == pytest.approx(np.radians((255.5 - 150.0) * 203.0 / 30_323), abs=1e-8)
-    assert (landmarks.sightings[0], landmarks.looks[0], landmarks.score[0]) == (4, 5, 0.8)
-
-
 def test_a_file_that_holds_no_landmarks_is_refused(tmp_path):
     path = tmp_path / "l.csv"
     path.write_text("a,b\n1,2\n")

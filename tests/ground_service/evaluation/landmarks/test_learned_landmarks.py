@@ -386,7 +386,8 @@ def test_labels_are_what_training_reads(tmp_path: Path) -> None:
     (tmp_path / "labels.csv").write_text(format_labels([_landmark(1), _landmark(2, "rejected")]))
     labels = load_landmarks(tmp_path / "labels.csv")
     assert np.degrees(labels.latitude_rad).tolist() == [11.0]
-    assert labels.diameter_m.tolist() == [8000.0] and labels.sightings.tolist() == [5]
+    assert labels.diameter_m.tolist() == [8000.0]
+    assert (labels.sightings[0], labels.looks[0], labels.score[0]) == (5, 8, 0.71)
 
 
 def test_an_upload_puts_the_table_together_again_on_board() -> None:
