@@ -7,8 +7,9 @@ together, wherever the frames were received.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 from tmtc.crc import CRC_LENGTH, crc16
@@ -45,6 +46,11 @@ class Fragment:
     stream: str = ""
 
     @property
+    def zone(self) -> int:
+        """Return the octets of a whole frame."""
+        return self.channel[3] - self.channel[2]
+
+    @property
     def fit(self) -> int:
         """Return the number of octets that the other fragments must have, or that these fill; -1 if unknown."""
         if not self.begins:
@@ -54,26 +60,29 @@ class Fragment:
 
     def precedes(self, other: Fragment) -> bool:
         """Return whether the next frame of the channel in the same recording is the first one of another fragment."""
-        zone = self.channel[3] - self.channel[2]
         # within 256 frames, equal counts mean that no frame of the channel is missing
-        near = self.last < other.first < self.last + COUNTS * zone
+        near = self.last < other.first < self.last + COUNTS * self.zone
         return bool(self.stream) and self.stream == other.stream and near and self.next_count == other.count
 
 
-Lookup = Callable[[Fragment, int], Iterable[Fragment]]
-"""Returns the fragments before or behind a fragment by count, of which a beginning or an end has the given `fit`."""
+Lookup = Callable[[Fragment, Mapping[int, int]], Iterable[Fragment]]
+"""Returns the fragments that reach to, or begin at, frames of the channel with these counts, and that fit (`fits`)."""
+
+
+def fits(fragment: Fragment, octets: int) -> bool:
+    """Return whether a beginning lacks, or an end has, a number of octets; others and unknown numbers always fit."""
+    return fragment.begins == fragment.ends or UNKNOWN in (octets, fragment.fit) or fragment.fit == octets
 
 
 def complete(
     fragment: Fragment, before: Lookup, behind: Lookup, form: PacketForm
-) -> tuple[list[Fragment], bytes] | None:
+) -> tuple[tuple[Fragment, ...], bytes] | None:
     """Return the fragments and octets of the packet that a fragment belongs to; None if a part is missing.
 
-    The fragments of packets without a checksum must adjoin in one recording.
+    Fragments of different recordings can share frames; those of packets without a checksum must adjoin in one.
     """
     for begin in _beginnings(fragment, before):
-        for path in _paths(begin, behind):
-            octets = b"".join(one.octets for one in path)
+        for path, octets in _paths(begin, behind):
             if len(octets) != packet_length(octets):
                 continue
             apid = int.from_bytes(octets[:2], "big") & 0x7FF
@@ -89,31 +98,44 @@ def complete(
 
 def _beginnings(fragment: Fragment, before: Lookup) -> Iterator[Fragment]:
     """Yield the beginnings of packets that may lead to a fragment."""
-    waiting = [(fragment, 0)]
+    zone = fragment.zone
+    waiting = [(fragment, len(fragment.octets))]
     for _ in range(MOST_TRIED):
         if not waiting:
             return
         one, held = waiting.pop()
         if one.begins:
             yield one
-        elif (held := held + len(one.octets)) < PACKET_MAX_LENGTH:
-            waiting += [(other, held) for other in before(one, held if fragment.ends else UNKNOWN)]
+        elif held < PACKET_MAX_LENGTH:
+            lacking = _counted(one.count, 1, (len(one.octets) - 1) // zone, held, -zone)
+            for other in before(one, lacking if fragment.ends else dict.fromkeys(lacking, UNKNOWN)):
+                new = len(other.octets) - (other.next_count - one.count) % COUNTS * zone
+                if new > 0:
+                    waiting.append((other, held + new))
 
 
-def _paths(begin: Fragment, behind: Lookup) -> Iterator[list[Fragment]]:
-    """Yield sequences of fragments from the beginning of a packet to its end."""
-    waiting = [[begin]]
+def _paths(begin: Fragment, behind: Lookup) -> Iterator[tuple[tuple[Fragment, ...], bytes]]:
+    """Yield sequences of fragments from the beginning of a packet to its end, and their octets."""
+    zone = begin.zone
+    waiting: list[tuple[tuple[Fragment, ...], bytes]] = [((begin,), begin.octets)]
     for _ in range(MOST_TRIED):
         if not waiting:
             return
-        path = waiting.pop()
-        octets = b"".join(one.octets for one in path)
-        length = packet_length(octets)
+        path, octets = waiting.pop()
+        length, count = packet_length(octets), path[-1].next_count
         if path[-1].ends or len(octets) == length:  # it can end with a frame that nothing follows
-            yield path
+            yield path, octets
         elif len(octets) < PACKET_MAX_LENGTH and (length == UNKNOWN or len(octets) < length):
-            fit = UNKNOWN if length == UNKNOWN else length - len(octets)
-            waiting += [[*path, one] for one in behind(path[-1], fit) if one not in path]
+            lacking = _counted(count, -1, (len(octets) - 1) // zone, length - len(octets), zone)
+            for other in behind(path[-1], lacking if length != UNKNOWN else dict.fromkeys(lacking, UNKNOWN)):
+                shared = (count - other.count) % COUNTS * zone
+                if other not in path and octets[len(octets) - shared :] == other.octets[:shared]:
+                    waiting.append(((*path, other), octets + other.octets[shared:]))
+
+
+def _counted(count: int, step: int, shared: int, octets: int, zone: int) -> dict[int, int]:
+    """Return the octets that others have, by the count at which they meet, if they share up to so many frames."""
+    return {(count + step * k) % COUNTS: octets + k * zone for k in range(min(shared + 1, COUNTS))}
 
 
 def join(
@@ -129,11 +151,13 @@ def join(
             lasts.setdefault((one.channel, one.next_count), []).append(one)
     used: set[Fragment] = set()
 
-    def among(known: list[Fragment], fit: int) -> list[Fragment]:
-        whole = [
-            one for one in known if one.begins == one.ends or UNKNOWN in (fit, one.fit) or one.fit == fit
-        ]
-        return [one for one in whole if one not in used]
+    def among(
+        known: dict[tuple[Channel, int], list[Fragment]], one: Fragment, counts: Mapping[int, int]
+    ) -> list[Fragment]:
+        there = {
+            other: octets for count, octets in counts.items() for other in known.get((one.channel, count), ())
+        }
+        return [other for other, octets in there.items() if other not in used and fits(other, octets)]
 
     packets = []
     for one in fragments:
@@ -141,8 +165,8 @@ def join(
             continue
         found = complete(
             one,
-            lambda other, fit: among(lasts.get((other.channel, other.count), []), fit),
-            lambda other, fit: among(firsts.get((other.channel, other.next_count), []), fit),
+            partial(among, lasts),
+            partial(among, firsts),
             form_of(one.channel[0]),
         )
         if found is not None:

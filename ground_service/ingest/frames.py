@@ -201,6 +201,7 @@ class FrameReader:
         sync = self._synchronise(stream)
         truncated = 8 * (base + sync.truncated[sync.truncated >= context])
         sync = sync.take(np.flatnonzero(sync.offsets >= context))
+        self._add_times(stream, sync.offsets, base)
         starts = sync.start_bits + 8 * base
         first, last = self._new
         new = np.flatnonzero((starts >= first) & (starts + 8 * self._length <= last))
@@ -217,12 +218,18 @@ class FrameReader:
         self._held, self._context = stream[kept_from:].copy(), end - kept_from
         self._position = base + stream.size
 
+    def _add_times(self, stream: OctetArray, offsets: IntArray, base: int) -> None:
+        """Note the times of records of which the piece has a part: an earlier piece may have the frame, but no time."""
+        record, section = self._record, self.section
+        first = section.first - base - self._length - record.trailer_octets
+        mine = (offsets > first) & (offsets - record.header_octets < section.last - base)
+        self.found.add_times(record.times_utc_ns(stream, offsets[mine]))
+
     def _frames(self, stream: OctetArray, sync: cadu.CaduSync, base: int) -> Iterator[PacketBatch]:
         """Yield the batches of frames that are read now."""
         offset, found, record = sync.offsets + base, self.found, self._record
         frames = read_frames(stream, sync, self.settings)
         block = FrameBlock(self.settings, offset, frames, record.times_utc_ns(stream, sync.offsets))
-        found.add_times(record.times_utc_ns(stream, sync.offsets))
         good = block.good
         self._count_errors(block, int(sync.marker_errors[good].sum()))
         found.frames_inverted += int(np.count_nonzero(sync.inverted))

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import Connection, and_, bindparam, delete, func, insert, select, true, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from ground_service.ingest.fragments import UNKNOWN, Fragment
+from ground_service.ingest.fragments import UNKNOWN, Fragment, fits
 from ground_service.store.counters import hold
 from ground_service.store.repository import (
     FRAGMENTS,
@@ -229,20 +229,24 @@ def add_fragments(connection: Connection, vehicle: int, fragments: Iterable[Frag
         connection.execute(statement, sorted(rows, key=lambda row: row["digest"]))
 
 
-def fragments_behind(connection: Connection, vehicle: int, fragment: Fragment, fit: int) -> list[Fragment]:
-    """Return fragments that follow one by count, newest first; an end has `fit` octets, if known."""
-    wanted = FRAGMENTS.c.ends == 0 if fit != UNKNOWN else true()
-    if fit != UNKNOWN:
-        wanted |= FRAGMENTS.c.fit == fit
-    return _fragments(connection, vehicle, fragment, FRAGMENTS.c.count == fragment.next_count, wanted)
+def fragments_behind(
+    connection: Connection, vehicle: int, fragment: Fragment, counts: Mapping[int, int]
+) -> list[Fragment]:
+    """Return fragments that begin at the counts of a channel, newest first; an end has the stated octets."""
+    others = (FRAGMENTS.c.ends == 0) | FRAGMENTS.c.fit.in_(list(counts.values()))
+    wanted = true() if UNKNOWN in counts.values() else others
+    found = _fragments(connection, vehicle, fragment, FRAGMENTS.c.count.in_(list(counts)), wanted)
+    return [one for one in found if fits(one, counts[one.count])]
 
 
-def fragments_before(connection: Connection, vehicle: int, fragment: Fragment, fit: int) -> list[Fragment]:
-    """Return fragments that one follows by count, newest first; a beginning lacks `fit` octets, if known."""
-    wanted = FRAGMENTS.c.begins == 0 if fit != UNKNOWN else true()
-    if fit != UNKNOWN:
-        wanted |= FRAGMENTS.c.fit.in_((fit, UNKNOWN))
-    return _fragments(connection, vehicle, fragment, FRAGMENTS.c.next_count == fragment.count, wanted)
+def fragments_before(
+    connection: Connection, vehicle: int, fragment: Fragment, counts: Mapping[int, int]
+) -> list[Fragment]:
+    """Return fragments that reach to the counts of a channel, newest first; a beginning lacks the stated octets."""
+    others = (FRAGMENTS.c.begins == 0) | FRAGMENTS.c.fit.in_([*counts.values(), UNKNOWN])
+    wanted = true() if UNKNOWN in counts.values() else others
+    found = _fragments(connection, vehicle, fragment, FRAGMENTS.c.next_count.in_(list(counts)), wanted)
+    return [one for one in found if fits(one, counts[one.next_count])]
 
 
 def remove_fragments(connection: Connection, vehicle: int, fragments: Iterable[Fragment]) -> None:

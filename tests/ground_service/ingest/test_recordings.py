@@ -62,6 +62,13 @@ def test_frames_that_a_piece_did_not_show_are_read_with_a_later_one_around_it(on
     assert one_process.difference(case_of(229, ("damaged",) * 13)) == ""
 
 
+@pytest.mark.parametrize(("number", "kind"), [(227, "stations"), (305, "stations"), (384, "records")])
+def test_parts_that_share_frames_and_headers_cut_from_their_frames_are_used(
+    one_process: Archive, number: int, kind: str
+) -> None:
+    assert one_process.difference(case_of(number, (kind,) * 13)) == ""
+
+
 def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
     one_process: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
