@@ -144,29 +144,19 @@ class ContactStarted(Event):
     start_utc_ns: int
 
 
-class ContactEnded(Event):
+class ContactEnded(ContactStarted):
     """A contact has ended, and the telemetry received in it is in the archive."""
 
     event_kind = "contact ended"
-    contact_id: int
-    link: str
-    station: str
-    vehicle_id: int
-    start_utc_ns: int
     stop_utc_ns: int
     octets: int
     telecommands: int
 
 
-class ContactMissed(Event):
+class ContactMissed(ContactStarted):
     """No telemetry was received in a predicted contact."""
 
     event_kind = "contact missed"
-    contact_id: int
-    link: str
-    station: str
-    vehicle_id: int
-    start_utc_ns: int
     stop_utc_ns: int
     reason: str
 

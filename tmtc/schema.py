@@ -349,17 +349,9 @@ class Dictionary:
         compiled = self._identify_one(octets, header.service, header.subtype)
         values, raw = compiled.values(octets)
         return DecodedPacket(
-            compiled.definition.name,
-            primary.apid,
-            header.service,
-            header.subtype,
-            primary.sequence_count,
-            header.ticks,
-            header.message_counter,
-            header.destination,
-            values,
-            raw,
-        )
+            compiled.definition.name, primary.apid, header.service, header.subtype, primary.sequence_count,
+            header.ticks, header.message_counter, header.destination, values, raw,
+        )  # fmt: skip
 
     def unpack_command(self, octets: bytes) -> DecodedCommand:
         """One telecommand packet with its headers and engineering values."""
@@ -368,15 +360,9 @@ class Dictionary:
         compiled = self._identify_one(octets, header.service, header.subtype)
         values, _ = compiled.values(octets)
         return DecodedCommand(
-            compiled.definition.name,
-            primary.apid,
-            header.service,
-            header.subtype,
-            primary.sequence_count,
-            header.acknowledgements,
-            header.source,
-            values,
-        )
+            compiled.definition.name, primary.apid, header.service, header.subtype, primary.sequence_count,
+            header.acknowledgements, header.source, values,
+        )  # fmt: skip
 
     def identify(self, buffer: Octets, cut: PacketPlaces) -> IntArray:
         """Index into `telemetry` of every packet of `cut`, negative where there is none.

@@ -194,7 +194,8 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     refusal = _refusal(inputs)
     if inputs.reference is None or refusal:
         missing["error"] = missing["reference"] = refusal
-        navigation = _without_reference(inputs)
+        track = reference_states(None, None, _sample_times(inputs))
+        navigation = tuple(_estimates(inputs, track, np.full(len(track.utc_ns), np.nan)))
     else:
         reference, navigation = _navigation(inputs, inputs.reference, provenance, remarks)
         if not any(one.kind == "baseline" for one in navigation):
@@ -324,25 +325,14 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         "experiment_level": report.experiment_level,
         "requirements": [
             {
-                "key": one.key,
-                "name": one.name,
-                "value": one.value,
-                "limit": one.limit,
+                **_named(one, "key", "name", "value", "limit"),
                 "relation": "<=" if one.at_most else ">=",
-                "unit": one.unit,
-                "margin": one.margin,
-                "status": one.status,
-                "note": one.note,
-                "question": one.question,
+                **_named(one, "unit", "margin", "status", "note", "question"),
             }
             for one in report.requirements
         ],
         "error_budget": {
-            s.name: {
-                "observed_rms_m": s.error_budget.observed_rms_m,
-                "reference_rms_m": s.error_budget.reference_rms_m,
-                "estimate_rms_m": s.error_budget.estimate_rms_m,
-            }
+            s.name: _named(s.error_budget, "observed_rms_m", "reference_rms_m", "estimate_rms_m")
             for s in report.navigation
             if s.error_budget is not None
         },
@@ -352,9 +342,13 @@ def summary_of(report: PassReport) -> dict[str, Any]:
     }
 
 
-def _figures(statistics: NavigationStatistics) -> dict[str, float]:
+def _named(value: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(value, name) for name in names}
+
+
+def _figures(statistics: NavigationStatistics) -> dict[str, Any]:
     names = ("median_3d_m", "p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "drift_percent", "end_of_pass_m")
-    return {name: getattr(statistics, name) for name in names}
+    return _named(statistics, *names)
 
 
 def _navigation(
@@ -388,13 +382,6 @@ def _navigation(
         TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
         tuple(series),
     )
-
-
-def _without_reference(inputs: PassInputs) -> tuple[NavigationSeries, ...]:
-    """What the estimators reported, with no error of any of it."""
-    track = reference_states(None, None, _sample_times(inputs))
-    path_m = np.full(len(track.utc_ns), np.nan)
-    return tuple(_estimates(inputs, track, path_m))
 
 
 def _estimates(inputs: PassInputs, track: ReferenceStates, path_m: FloatArray) -> list[NavigationSeries]:
@@ -437,7 +424,7 @@ def _path(track: ReferenceStates) -> FloatArray:
 def _estimate_series(
     inputs: PassInputs, samples: NavigationSamples, track: ReferenceStates, path_m: FloatArray
 ) -> NavigationSeries:
-    outcomes = _outcomes_of(inputs, samples.estimator)
+    outcomes = next((one for one in inputs.outcomes if one.estimator == samples.estimator), None)
     rows = np.searchsorted(track.utc_ns, samples.utc_ns)
     error = error_of_places_rtn_m(
         track.at_rows(rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m
@@ -851,10 +838,6 @@ def _anchor_reads(outcomes: tuple[OutcomeSamples, ...]) -> tuple[AnchorRead, ...
             for i in rose
         ]
     return tuple(sorted(reads, key=lambda read: (read.utc_ns, read.estimator)))
-
-
-def _outcomes_of(inputs: PassInputs, estimator: str) -> OutcomeSamples | None:
-    return next((samples for samples in inputs.outcomes if samples.estimator == estimator), None)
 
 
 def _headline(

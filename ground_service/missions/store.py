@@ -99,7 +99,7 @@ def detail(connection: Connection, mission_id: int) -> MissionDetail:
 def list_missions(connection: Connection, asked: Paging) -> PageOf[MissionRevision]:
     """List the revisions of mission descriptions, newest first."""
     rows, total = repository.newest(connection, MISSIONS, asked)
-    return asked.page((_revision(row, _document(row)) for row in rows), total)
+    return asked.page((MissionRevision(**_columns(row, _document(row))) for row in rows), total)
 
 
 def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) -> dict[int, Link]:
@@ -255,10 +255,6 @@ def _document(row: repository.Row) -> Mission:
 @lru_cache(maxsize=32)
 def _parsed(text: str, source: str) -> Mission:
     return parse_mission(text, source)
-
-
-def _revision(row: repository.Row, document: Mission) -> MissionRevision:
-    return MissionRevision(**_columns(row, document))
 
 
 def _detail(row: repository.Row) -> MissionDetail:

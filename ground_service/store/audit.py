@@ -73,7 +73,9 @@ def entry_sha256(previous_sha256: str, number: int, note: Note) -> str:
         note.target,
         plain_detail(note.detail),
     ]
-    return hashlib.sha256(_canonical(content).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    ).hexdigest()
 
 
 def plain_detail(detail: Mapping[str, Any]) -> dict[str, Any]:
@@ -224,10 +226,6 @@ def missing_guards(connection: Connection) -> list[str]:
     )
     found = {str(row[0]) for row in connection.execute(text(query))}
     return [name for name in GUARD_NAMES if name not in found]
-
-
-def _canonical(content: Any) -> str:
-    return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:

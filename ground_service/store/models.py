@@ -80,9 +80,13 @@ def optionals(kind: Any, *names: str) -> tuple[Column[Any], ...]:
     return tuple(optional(name, kind) for name in names)
 
 
-FILES = Table(
+def table(name: str, *parts: Any, **options: Any) -> Table:
+    """Return a table of this schema."""
+    return Table(name, METADATA, *parts, **options)
+
+
+FILES = table(
     "files",
-    METADATA,
     key("sha256", String(64)),
     column("kind", String(32)),
     column("name", Text),
@@ -90,10 +94,8 @@ FILES = Table(
 )
 """A file of the archive, stored once under the SHA-256 of its octets."""
 
-
-VEHICLES = Table(
+VEHICLES = table(
     "vehicles",
-    METADATA,
     key("id", Integer),
     column("ccsds_id", Integer),
     column("instance", String(96)),
@@ -108,10 +110,8 @@ first. While a newer one decodes them again, `redecoded_to` is the last packet t
 the last that it has to do.
 """
 
-
-INGESTS = Table(
+INGESTS = table(
     "ingests",
-    METADATA,
     key("id", BigKey),
     optional("vehicle_id", ForeignKey("vehicles.id"), index=True),
     column("file_sha256", ForeignKey("files.sha256"), index=True),
@@ -129,10 +129,8 @@ INGESTS = Table(
 `first_ticks` and `last_ticks` are the earliest and the latest on-board time of its packets; NULL: unknown.
 """
 
-
-PACKETS = Table(
+PACKETS = table(
     "packets",
-    METADATA,
     key("id", BigKey),
     column("vehicle_id", Integer),
     *columns(SmallInteger, "apid", "sequence_count"),
@@ -143,10 +141,8 @@ PACKETS = Table(
 )
 """A space packet, immutable, once per vehicle by content."""
 
-
-PIECES = Table(
+PIECES = table(
     "pieces",
-    METADATA,
     key("ingest_id", ForeignKey("ingests.id"), autoincrement=False),
     column("scope", String(128)),
     optional("spacecraft_id", Integer),
@@ -174,10 +170,8 @@ packets that the ingest added to the archive, `packets_joined` those of them tha
 `samples_stored` their samples, over all attempts of the ingest.
 """
 
-
-GOOD_LINKS = Table(
+GOOD_LINKS = table(
     "good_links",
-    METADATA,
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("station", String(64)),
@@ -188,10 +182,8 @@ GOOD_LINKS = Table(
 )
 """Link settings under which a spacecraft was received by a station; the newest row is used first."""
 
-
-FRAGMENTS = Table(
+FRAGMENTS = table(
     "fragments",
-    METADATA,
     key("id", BigKey),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("channel", String(24)),
@@ -217,9 +209,8 @@ def samples(name: str, *columns: Column[Any]) -> Table:
     Packets and samples carry no foreign keys: they are written in bulk, in one transaction with what they
     point to, and a check per row would cost more than the row.
     """
-    return Table(
+    return table(
         name,
-        METADATA,
         key("vehicle_id", Integer, autoincrement=False),
         key("dictionary_version", SmallInteger, autoincrement=False),
         key("ticks", BigInteger, autoincrement=False),
@@ -254,17 +245,15 @@ DETECTIONS = image_samples(
 )
 """Detections of one image; `items` packed as `store.codec.DETECTION_ITEM`."""
 
-
 NAVIGATION_STATES = image_samples(
     "navigation_states",
     *columns(SmallInteger, "estimator", "outcome"),
     *optionals(Double, "latitude_deg", "longitude_deg", "altitude_m"),
-    *optionals(Float, "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s", "sigma_r_m"),
-    *optionals(Float, "sigma_t_m", "sigma_n_m", "nis"),
+    *optionals(Float, "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s", "sigma_r_m", "sigma_t_m"),
+    *optionals(Float, "sigma_n_m", "nis"),
     column("matched", SmallInteger),
 )
 """State of one on-board estimator."""
-
 
 FRAME_OUTCOMES = image_samples(
     "frame_outcomes",
@@ -276,7 +265,6 @@ FRAME_OUTCOMES = image_samples(
 )
 """What one estimator made of one image."""
 
-
 EVENTS = samples(
     "events",
     column("severity", SmallInteger),
@@ -286,14 +274,12 @@ EVENTS = samples(
 )
 """An event report; `ticks` is the packet's time, `severity` 1 (info) to 4 (high)."""
 
-
 TIME_REPORTS = samples(
     "time_reports",
     column("reported_ticks", BigInteger),
     column("rate_exponent", SmallInteger),
 )
 """A time report; `ticks` is the packet's time."""
-
 
 VERIFICATIONS = samples(
     "verifications",
@@ -303,7 +289,6 @@ VERIFICATIONS = samples(
     optional("failure_code", Integer),
 )
 """A telecommand verification report (service 1); `ticks` is the packet's time."""
-
 
 FILTER_STATES = image_samples(
     "filter_states",
@@ -316,7 +301,6 @@ FILTER_STATES = image_samples(
 are those of the NIS of the frame, None if the packet does not contain it (dictionary version 2).
 """
 
-
 IDENTIFICATIONS = image_samples(
     "identifications",
     column("count", SmallInteger),
@@ -326,7 +310,6 @@ IDENTIFICATIONS = image_samples(
 
 `items` packs pairs of detection (uint16) and crater (uint32), little-endian.
 """
-
 
 SAMPLE_TABLES = (
     HOUSEKEEPING,
@@ -341,9 +324,8 @@ SAMPLE_TABLES = (
 )
 
 
-PACKET_DEFINITIONS = Table(
+PACKET_DEFINITIONS = table(
     "packet_definitions",
-    METADATA,
     key("id", Integer),
     column("digest", String(64), unique=True),
     column("mission_id", ForeignKey("missions.id")),
@@ -353,10 +335,8 @@ PACKET_DEFINITIONS = Table(
 `mission_id` is a revision that states them.
 """
 
-
-PACKET_DECODINGS = Table(
+PACKET_DECODINGS = table(
     "packet_decodings",
-    METADATA,
     key("vehicle_id", ForeignKey("vehicles.id")),
     key("definition_id", ForeignKey("packet_definitions.id")),
     column("decoded_to", BigInteger),
@@ -371,10 +351,8 @@ earlier definition are read. `counts` contains numbers of packets by APID and ou
 `read_again_to` have to be read again, because the definition declares packets without a checksum; NULL: none.
 """
 
-
-PARAMETER_SAMPLES = Table(
+PARAMETER_SAMPLES = table(
     "parameter_samples",
-    METADATA,
     key("vehicle_id", Integer, autoincrement=False),
     key("definition_id", Integer, autoincrement=False),
     key("container", SmallInteger, autoincrement=False),
@@ -389,10 +367,8 @@ PARAMETER_SAMPLES = Table(
 of `tmtc.xtce.series.packet_layouts`; `ticks` is the time in its secondary header.
 """
 
-
-ROLLUPS = Table(
+ROLLUPS = table(
     "rollups",
-    METADATA,
     key("vehicle_id", Integer, autoincrement=False),
     key("dictionary_version", SmallInteger, autoincrement=False),
     key("kind", SmallInteger, autoincrement=False),
@@ -405,10 +381,8 @@ ROLLUPS = Table(
 )
 """Samples of one kind aggregated over a bucket of on-board time; see `store.rollups`."""
 
-
-CORRELATIONS = Table(
+CORRELATIONS = table(
     "correlations",
-    METADATA,
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id"), index=True),
     column("method", String(32)),
@@ -426,10 +400,8 @@ CORRELATIONS = Table(
 ``utc_ns = reference_utc_ns + (ticks - reference_ticks) * nanoseconds per tick * (1 + drift_ppb * 1e-9)``
 """
 
-
-RECEPTIONS = Table(
+RECEPTIONS = table(
     "receptions",
-    METADATA,
     key("vehicle_id", ForeignKey("vehicles.id")),
     key("ticks", BigInteger),
     key("sequence_count", SmallInteger),
@@ -442,10 +414,8 @@ The report is the packet of time reports with these `ticks` in its header and th
 only the Earth is known; of several times at one station the first counts, as later ones are played back.
 """
 
-
-EPHEMERIDES = Table(
+EPHEMERIDES = table(
     "ephemerides",
-    METADATA,
     key("id", Integer),
     column("file_sha256", ForeignKey("files.sha256")),
     *columns(Text, "name", "object_name"),
@@ -457,10 +427,8 @@ EPHEMERIDES = Table(
 )
 """A reference ephemeris; the later uploaded of equal precedence wins where two cover a time."""
 
-
-MISSIONS = Table(
+MISSIONS = table(
     "missions",
-    METADATA,
     key("id", Integer),
     column("revision", String(64), unique=True),
     column("name", Text),
@@ -471,10 +439,8 @@ MISSIONS = Table(
 )
 """Revision of a mission description, identified by the hash of its stated values and never changed."""
 
-
-PASSES = Table(
+PASSES = table(
     "passes",
-    METADATA,
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("name", Text),
@@ -494,10 +460,8 @@ PASSES = Table(
 table; NULL if unknown.
 """
 
-
-MONTHLY_REPORTS = Table(
+MONTHLY_REPORTS = table(
     "monthly_reports",
-    METADATA,
     key("id", String(32)),
     column("spacecraft_id", Integer, index=True),
     column("instance", String(96)),
@@ -511,20 +475,16 @@ MONTHLY_REPORTS = Table(
 )
 """A report of a month of a spacecraft in one instance; the id is the hash of its content."""
 
-
-PASS_FRAMES = Table(
+PASS_FRAMES = table(
     "pass_frames",
-    METADATA,
     key("pass_id", ForeignKey("passes.id")),
     key("frame_number", BigInteger),
     column("file_sha256", ForeignKey("files.sha256")),
 )
 """An image kept with a pass, for the galleries of its report."""
 
-
-JOBS = Table(
+JOBS = table(
     "jobs",
-    METADATA,
     key("id", String(32)),
     column("kind", String(32)),
     column("state", String(16), index=True),
@@ -539,10 +499,8 @@ JOBS = Table(
 )
 """A piece of background work, visible from queued to its end; `traceparent` is the step that entered it."""
 
-
-REPORTS = Table(
+REPORTS = table(
     "reports",
-    METADATA,
     key("id", String(32)),
     column("pass_id", ForeignKey("passes.id"), index=True),
     column("html_sha256", ForeignKey("files.sha256")),
@@ -562,10 +520,8 @@ caused a re-evaluation of the pass, `previous_id` the report before it, and `cha
 a report on request.
 """
 
-
-USERS = Table(
+USERS = table(
     "users",
-    METADATA,
     key("id", Integer),
     column("name", String(64), unique=True),
     *columns(String(16), "role", "state"),
@@ -580,10 +536,8 @@ USERS = Table(
 `issuer` and `subject` identify a user of an OpenID provider; NULL for users that were added here.
 """
 
-
-TOKENS = Table(
+TOKENS = table(
     "tokens",
-    METADATA,
     key("id", Integer),
     column("user_id", ForeignKey("users.id"), index=True),
     column("token_sha256", String(64), unique=True),
@@ -601,10 +555,8 @@ session has the token that it was started with in `parent_id`, and is valid only
 session that an OpenID provider started has the provider's session in `provider_session`, empty if it states none.
 """
 
-
-AUDIT = Table(
+AUDIT = table(
     "audit",
-    METADATA,
     key("id", BigInteger, autoincrement=False),
     column("utc_ns", BigInteger, index=True),
     column("actor", String(64)),
@@ -615,20 +567,16 @@ AUDIT = Table(
 )
 """Action of a user; entries are only appended, numbered from 1 without gaps (see `store.audit`)."""
 
-
-AUDIT_HEAD = Table(
+AUDIT_HEAD = table(
     "audit_head",
-    METADATA,
     key("id", Integer, autoincrement=False),
     column("number", BigInteger),
     column("sha256", String(64)),
 )
 """Number and hash of the newest audit entry: one row, locked while entries are appended."""
 
-
-EVENT_LOG = Table(
+EVENT_LOG = table(
     "event_log",
-    METADATA,
     key("id", BigKey),
     column("utc_ns", BigInteger),
     column("kind", String(32)),
@@ -636,10 +584,8 @@ EVENT_LOG = Table(
 )
 """Event of the log; `id` is its number, from 1 without gaps."""
 
-
-ALARMS = Table(
+ALARMS = table(
     "alarms",
-    METADATA,
     key("id", BigKey),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("source", String(16)),
@@ -663,10 +609,8 @@ ALARMS = Table(
 A cause (`source` and `name`) has at most one open alarm. `active`: the newest telemetry has the condition.
 """
 
-
-ALARM_CHANGES = Table(
+ALARM_CHANGES = table(
     "alarm_changes",
-    METADATA,
     key("id", BigKey),
     column("alarm_id", ForeignKey("alarms.id"), index=True),
     column("utc_ns", BigInteger),
@@ -676,19 +620,15 @@ ALARM_CHANGES = Table(
 )
 """Change in the life of an alarm."""
 
-
-ALARM_POSITIONS = Table(
+ALARM_POSITIONS = table(
     "alarm_positions",
-    METADATA,
     key("vehicle_id", ForeignKey("vehicles.id"), autoincrement=False),
     column("packet_id", BigInteger),
 )
 """Last packet of a vehicle that has been examined for alarms."""
 
-
-DISPLAY_OBJECTS = Table(
+DISPLAY_OBJECTS = table(
     "display_objects",
-    METADATA,
     key("key", String(64)),
     *columns(Text, "name", "type"),
     column("version", Integer),
@@ -701,19 +641,15 @@ DISPLAY_OBJECTS = Table(
 )
 """Object of the telemetry displays as JSON; `version` counts its changes."""
 
-
-EVENT_POSITIONS = Table(
+EVENT_POSITIONS = table(
     "event_positions",
-    METADATA,
     key("consumer", String(32)),
     column("number", BigInteger),
 )
 """Number of the last event that a consumer has handled."""
 
-
-ANSWERS = Table(
+ANSWERS = table(
     "answers",
-    METADATA,
     key("key", String(64)),
     column("request", String(64)),
     optional("answer", JSON),
@@ -721,10 +657,8 @@ ANSWERS = Table(
 )
 """What was answered under an idempotency key; NULL while the work is being done."""
 
-
-TELECOMMANDS = Table(
+TELECOMMANDS = table(
     "telecommands",
-    METADATA,
     key("id", BigKey),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("name", String(64)),
@@ -752,10 +686,8 @@ TELECOMMANDS = Table(
 One that is inside another (an activity of the on-board schedule) names that one in `carrier_id`.
 """
 
-
-HANDOVERS = Table(
+HANDOVERS = table(
     "handovers",
-    METADATA,
     key("vehicle_id", ForeignKey("vehicles.id"), autoincrement=False),
     column("note", Text),
     optional("noted_by", String(64)),
@@ -766,10 +698,8 @@ HANDOVERS = Table(
 )
 """Note of the last shift about a vehicle; while `held_by` is given, none of its telecommands is released or sent."""
 
-
-LINKS = Table(
+LINKS = table(
     "links",
-    METADATA,
     key("name", String(64)),
     column("ccsds_id", Integer),
     column("instance", String(96)),
@@ -787,20 +717,16 @@ LINKS = Table(
 reception, `considered_utc_ns` the mission time up to which predicted contacts were compared with receptions.
 """
 
-
-LEASES = Table(
+LEASES = table(
     "leases",
-    METADATA,
     key("name", String(64)),
     optional("owner", String(96)),
     column("lease_utc_ns", BigInteger),
 )
 """Right of one process among many to do recurring work, until `lease_utc_ns` by the clock of the database."""
 
-
-CONTACTS = Table(
+CONTACTS = table(
     "contacts",
-    METADATA,
     key("id", BigKey),
     *columns(String(64), "link", "station"),
     column("vehicle_id", ForeignKey("vehicles.id")),
@@ -814,10 +740,8 @@ CONTACTS = Table(
 )
 """Contact over a link: open, ended or missed; times are mission time."""
 
-
-TRANSMISSIONS = Table(
+TRANSMISSIONS = table(
     "transmissions",
-    METADATA,
     key("id", BigKey),
     column("link", String(64), index=True),
     column("vehicle_id", ForeignKey("vehicles.id")),
@@ -830,19 +754,15 @@ TRANSMISSIONS = Table(
 )
 """Octets of telecommands for one link; `transmitted_utc_ns` (mission time) is NULL until they are on the wire."""
 
-
-COMMAND_COUNTERS = Table(
+COMMAND_COUNTERS = table(
     "command_counters",
-    METADATA,
     key("vehicle_id", ForeignKey("vehicles.id")),
     column("telecommands", BigInteger),
 )
 """Number of telecommand sequence counts assigned for a vehicle; locked during commanding."""
 
-
-WINDOWS = Table(
+WINDOWS = table(
     "windows",
-    METADATA,
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("name", Text),
@@ -873,10 +793,8 @@ or changed it last, `decided_by` made the decision. `closed`: it is processed al
 `uploads` is what its telecommands load on board.
 """
 
-
-STANDING_REQUESTS = Table(
+STANDING_REQUESTS = table(
     "standing_requests",
-    METADATA,
     key("id", Integer),
     column("vehicle_id", ForeignKey("vehicles.id")),
     column("name", Text),
@@ -893,10 +811,8 @@ STANDING_REQUESTS = Table(
 )
 """Standing request with its last plan; `plans` counts plans, so that one of several processes stores each."""
 
-
-AUTOMATION_ACTIONS = Table(
+AUTOMATION_ACTIONS = table(
     "automation_actions",
-    METADATA,
     key("id", Integer),
     column("event_number", BigInteger),
     column("trigger", String(32)),
@@ -923,10 +839,8 @@ AUTOMATION_ACTIONS = Table(
 `attempts` have failed; `next_attempt_utc_ns`: it is queued again from this time on.
 """
 
-
-LANDMARKS = Table(
+LANDMARKS = table(
     "landmarks",
-    METADATA,
     key("id", Integer),
     column("spacecraft_id", Integer),
     column("state", String(16)),
@@ -947,10 +861,8 @@ LANDMARKS = Table(
 rejected.
 """
 
-
-BUILDS = Table(
+BUILDS = table(
     "builds",
-    METADATA,
     key("digest", String(64)),
     *columns(Text, "name", "version", "description"),
     column("kind", String(16)),
@@ -967,10 +879,8 @@ BUILDS = Table(
 are only in the folder of the service.
 """
 
-
-REGRESSION_ARCHIVES = Table(
+REGRESSION_ARCHIVES = table(
     "regression_archives",
-    METADATA,
     key("digest", String(64)),
     column("name", Text),
     column("manifest_sha256", String(64)),
@@ -985,10 +895,8 @@ REGRESSION_ARCHIVES = Table(
 )
 """A pass archive kept for replays; `digest` is the SHA-256 of the manifest that it was kept with."""
 
-
-REPLAYS = Table(
+REPLAYS = table(
     "replays",
-    METADATA,
     key("id", String(64)),
     column("archive_digest", String(64), index=True),
     column("build_digest", String(64), index=True),
@@ -1001,10 +909,8 @@ REPLAYS = Table(
 )
 """Result of one build on one archive; `id` is the hash of both identities."""
 
-
-REGRESSIONS = Table(
+REGRESSIONS = table(
     "regressions",
-    METADATA,
     key("id", String(32)),
     *columns(String(64), "baseline_digest", "candidate_digest"),
     column("verdict", String(16)),

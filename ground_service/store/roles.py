@@ -32,15 +32,7 @@ class PowerfulRole(StoreError):
 
 
 def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
-    """Yield SQL that grants a role the privileges that the service needs and revokes all others.
-
-    Parameters
-    ----------
-    role
-        Name of an existing role.
-    tables
-        Names of all tables of the schema.
-    """
+    """Yield SQL that grants a role the privileges on all tables that the service needs and revokes all others."""
     name = quoted(role)
     yield from _without_rights(name)
     for table in sorted(tables):
@@ -54,15 +46,7 @@ def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
 
 
 def backup_statements(role: str, tables: list[str]) -> Iterator[str]:
-    """Yield SQL that lets a role read every table and nothing else, for backups.
-
-    Parameters
-    ----------
-    role
-        Name of an existing role.
-    tables
-        Names of all tables of the schema.
-    """
+    """Yield SQL that lets a role read every table and nothing else, for backups."""
     name = quoted(role)
     yield from _without_rights(name)
     yield f"REVOKE ALL ON ALL SEQUENCES IN SCHEMA public FROM {name}"
@@ -105,17 +89,13 @@ def _grant(database: Database, role: str, statements_of: Callable[[str, list[str
         owner = connection.execute(text("SELECT current_user")).scalar_one()
         if owner == role:
             raise DatabaseUnavailable(database.label, f"expected another role than the owner {role}")
-        known = connection.execute(
-            text("SELECT 1 FROM pg_roles WHERE rolname = :name"), {"name": role}
-        ).scalar()
-        if known is None:
+        query = text("SELECT 1 FROM pg_roles WHERE rolname = :name")
+        if connection.execute(query, {"name": role}).scalar() is None:
             raise DatabaseUnavailable(
                 database.label,
                 f"expected the role {role}, found none; CREATE ROLE {quoted(role)} LOGIN PASSWORD ...",
             )
-        tables = connection.execute(
-            text("SELECT tablename FROM pg_tables WHERE schemaname = 'public'")
-        ).scalars()
+        tables = connection.scalars(text("SELECT tablename FROM pg_tables WHERE schemaname = 'public'"))
         for statement in statements_of(role, list(tables)):
             connection.execute(text(statement))
 

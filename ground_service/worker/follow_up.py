@@ -61,6 +61,9 @@ WAIT_S = 0.05
 Work = tuple[str, int]
 """Name of the work and the id of the vehicle, pass or window that it is for."""
 
+Following = Callable[[Ground, LoggedEvent], Iterator[Work]]
+"""Function that returns the work after an event."""
+
 Start = Callable[[str], object]
 """Function that runs a job, or has it run."""
 
@@ -80,12 +83,9 @@ def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
             )
 
 
-def _after_receptions(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    yield "recorrelate", ReceptionsEntered.of(logged).vehicle_id
-
-
-def _after_correlation(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    yield "advance windows", CorrelationChanged.of(logged).vehicle_id
+def _of_vehicle(work: str) -> Following:
+    """Return work for the vehicle of an event, and for no other: its plan does not depend on the others' contacts."""
+    return lambda _ground, logged: iter([(work, int(logged.payload["vehicle_id"]))])
 
 
 def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -99,14 +99,6 @@ def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
         yield "re-evaluate", pass_id
     for vehicle in planned_with(ground, event.id):
         yield "plan", vehicle
-
-
-def _after_uplink(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    yield "advance windows", CommandsSent.of(logged).vehicle_id
-
-
-def _after_report(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    yield "advance windows", PassEvaluated.of(logged).vehicle_id
 
 
 def _after_mission(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -132,28 +124,19 @@ def _after_window(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
             yield "plan", ground.read(get_record, event.id).vehicle_id
 
 
-def _after_contact(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    # The plan of another spacecraft does not depend on this contact.
-    yield "plan", int(logged.payload["vehicle_id"])
-
-
-def _after_request(_ground: Ground, _logged: LoggedEvent) -> Iterator[Work]:
-    yield "plan", 0
-
-
-FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
+FOLLOWING: Mapping[str, Following] = {
     TelemetryReceived.event_kind: _after_telemetry,
-    ReceptionsEntered.event_kind: _after_receptions,
-    CorrelationChanged.event_kind: _after_correlation,
+    ReceptionsEntered.event_kind: _of_vehicle("recorrelate"),
+    CorrelationChanged.event_kind: _of_vehicle("advance windows"),
     EphemerisAdded.event_kind: _after_ephemeris,
-    CommandsSent.event_kind: _after_uplink,
-    PassEvaluated.event_kind: _after_report,
+    CommandsSent.event_kind: _of_vehicle("advance windows"),
+    PassEvaluated.event_kind: _of_vehicle("advance windows"),
     MissionAdded.event_kind: _after_mission,
     AutomationChanged.event_kind: _after_decision,
     WindowChanged.event_kind: _after_window,
-    ContactEnded.event_kind: _after_contact,
-    ContactMissed.event_kind: _after_contact,
-    RequestChanged.event_kind: _after_request,
+    ContactEnded.event_kind: _of_vehicle("plan"),
+    ContactMissed.event_kind: _of_vehicle("plan"),
+    RequestChanged.event_kind: lambda _ground, _logged: iter([("plan", 0)]),
 }
 """The work that keeps derived data up to date after an event, by its kind."""
 
@@ -206,18 +189,14 @@ def _match_rules(ground: Ground, number: int, _event: int) -> None:
     record_actions(ground, event)
 
 
-def _act(ground: Ground, number: int, event: int) -> str:
-    """Add the job of the actions of event `number`; `event` recorded or decided one of them."""
-    with ground.database.writing() as connection:
-        identity = _job_id("automation", number, event)
-        return add_job(connection, "automation", {"event": number}, job_id=identity)
+def _add_job_of_event(kind: str) -> Callable[[Ground, int, int], str]:
+    """Return a function that adds the job of event `number` because of another event, which it caused."""
 
+    def add(ground: Ground, number: int, event: int) -> str:
+        with ground.database.writing() as connection:
+            return add_job(connection, kind, {"event": number}, job_id=_job_id(kind, number, event))
 
-def _notify(ground: Ground, number: int, event: int) -> str:
-    """Add the job of the notifications of event `number` that are due."""
-    with ground.database.writing() as connection:
-        identity = _job_id("notification", number, event)
-        return add_job(connection, "notification", {"event": number}, job_id=identity)
+    return add
 
 
 def _plan(ground: Ground, vehicle: int, event: int) -> str | None:
@@ -236,8 +215,8 @@ DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "re-evaluate": _reevaluate,
     "decode": _decode,
     "match rules": _match_rules,
-    "act": _act,
-    "notify": _notify,
+    "act": _add_job_of_event("automation"),
+    "notify": _add_job_of_event("notification"),
     "plan": _plan,
 }
 """Functions of the work in the order in which they run; each returns the id of a job to start, or None."""

@@ -25,9 +25,12 @@ import numpy as np
 import pytest
 from sqlalchemy import create_engine, text
 
+from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.ground import Ground, open_ground
+from ground_service.missions.ephemerides.service import add_ephemeris
+from ground_service.passes.service import define_pass
 from ground_service.settings import Settings
 from ground_service.store import database as databases
 from ground_service.store.database import Database, open_database, prepare_database, schema_revisions
@@ -69,6 +72,15 @@ def client(tmp_path: Path) -> Iterator[TestClient]:
     """An empty service without users that does its jobs in the requests."""
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
         yield opened
+
+
+@pytest.fixture
+def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
+    """An empty service with one user of each role, and the headers of each."""
+    with TestClient(create_app(Settings(home=tmp_path / "guarded"), inline_jobs=True)) as opened:
+        ground = opened.app.state.ground
+        tokens = {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
+        yield opened, {role: {"Authorization": f"Bearer {token}"} for role, token in tokens.items()}
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -320,6 +332,28 @@ def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     (folder / "manifest.json").write_text(json.dumps({**manifest, "files": files}))
 
 
+def enter_files(folder: Path, **changed: Any) -> None:
+    """Enter the files of a pass archive in its manifest again, and change other keys of it."""
+    write_manifest(folder, json.loads((folder / "manifest.json").read_text()) | changed)
+
+
+def add_reference(ground: Ground, path: Path) -> int:
+    """Add a reference ephemeris."""
+    return add_ephemeris(ground, ground.files.put_file(path), name="reference").id
+
+
+def event_packet(ticks: int, count: int, event: str | int = "mode_changed", frame: int = 0) -> bytes:
+    """Return the packet of an event report without values."""
+    values = {"event_id": event, "frame_number": frame, "value_1": 0.0, "value_2": 0.0}
+    return DICTIONARY.pack("event_info", values, ticks=ticks, sequence_count=count)
+
+
+def define_pass_of(ground: Ground, made: Any) -> int:
+    """Define a pass of the spacecraft from a second before the first frame to a second after the last one."""
+    start, stop = int(made.utc_ns[0]) - NS, int(made.utc_ns[-1]) + NS
+    return define_pass(ground, name="p", start_utc_ns=start, stop_utc_ns=stop, spacecraft_id=SPACECRAFT)
+
+
 def _housekeeping(k: int) -> dict[str, Any]:
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values.update(
@@ -377,8 +411,6 @@ def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., Flyab
     def make(frames: int = 12, seed: int = 1, **options: Any) -> FlyablePass:
         made = make_pass(frames=frames, seed=seed, **options)
         folder = made.folder
-        manifest = json.loads((folder / "manifest.json").read_text())
-        manifest["pass_name"] = f"synthetic pass {seed}"
         (folder / "payload").mkdir()
         (folder / "frames").mkdir()
         buffer = io.BytesIO()
@@ -397,8 +429,7 @@ def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., Flyab
         (folder / "payload/inputs.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         (folder / "payload/parameters.toml").write_text("")
         (folder / "payload/dictionary.json").write_text(format_dictionary(DICTIONARY))
-        del manifest["files"]
-        write_manifest(folder, manifest)
+        enter_files(folder, pass_name=f"synthetic pass {seed}")
         return FlyablePass(folder, made.packets)
 
     return make

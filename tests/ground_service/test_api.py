@@ -11,16 +11,18 @@ from typing import Any
 
 import pytest
 
-from ground_service.access.service import add_user
 from ground_service.app import create_app
+from ground_service.ground import Ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
-from lunar.timescales import parse_utc
-from tests.serving import TestClient, wait_for
+from tests.serving import TestClient
 from tmtc.downlink import DownlinkEncoder
 from tmtc.frames import Clcw, pack_clcw
 
 V1 = "/api/v1"
+
+
+Guarded = tuple[TestClient, dict[str, dict[str, str]]]
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +32,6 @@ def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Ite
     with TestClient(create_app(settings, inline_jobs=True)) as opened:
         import_archive(opened.app.state.ground, synthetic_pass.folder)
         yield opened
-
-
-@pytest.fixture
-def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, str]]]:
-    """An empty service with one user of each role, and their tokens."""
-    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
-        ground = opened.app.state.ground
-        yield opened, {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
 
 
 def is_problem(response: Any, status: int) -> bool:
@@ -283,12 +277,10 @@ EXCEPTIONS = {
 }
 
 
-def test_every_operation_asks_for_its_role(guarded: tuple[TestClient, dict[str, str]]) -> None:
-    client, tokens = guarded
+def test_every_operation_asks_for_its_role(guarded: Guarded) -> None:
+    client, heads = guarded
     ranks = ["viewer", "operator", "admin"]
-    described = client.get(
-        f"{V1}/openapi.json", headers={"Authorization": f"Bearer {tokens['viewer']}"}
-    ).json()
+    described = client.get(f"{V1}/openapi.json", headers=heads["viewer"]).json()
     operations = {(m.upper(), p.removeprefix(V1)) for p, verbs in described["paths"].items() for m in verbs}
     operations.remove(("POST", "/session"))  # whose token is in the body
     assert len(operations) > 60 and operations >= set(EXCEPTIONS)
@@ -298,9 +290,7 @@ def test_every_operation_asks_for_its_role(guarded: tuple[TestClient, dict[str, 
         assert is_problem(client.request(method, V1 + path), 401), path
         assert is_problem(client.request(method, V1 + path, headers={"Authorization": "Bearer x"}), 401), path
         for role in ranks:
-            status = client.request(
-                method, V1 + path, headers={"Authorization": f"Bearer {tokens[role]}"}
-            ).status_code
+            status = client.request(method, V1 + path, headers=heads[role]).status_code
             if ranks.index(role) < ranks.index(lowest):
                 assert status == 403, (path, role)
             else:
@@ -364,16 +354,17 @@ def test_a_socket_opens_whose_server_announces_the_client_late(client: TestClien
     assert client.portal.call(opened)["type"] == "websocket.accept"
 
 
-def test_watching_needs_a_token_where_there_are_users(guarded: tuple[TestClient, dict[str, str]]) -> None:
+def test_watching_needs_a_token_where_there_are_users(guarded: Guarded) -> None:
     from starlette.websockets import WebSocketDisconnect
 
-    client, tokens = guarded
+    client, heads = guarded
+    token = heads["viewer"]["Authorization"].removeprefix("Bearer ")
     for headers in ({}, {"Authorization": "Bearer wrong"}):
         with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers=headers):
             pass
-    with client.websocket_connect(f"{V1}/live", headers={"Authorization": f"Bearer {tokens['viewer']}"}):
+    with client.websocket_connect(f"{V1}/live", headers=heads["viewer"]):
         pass
-    with client.websocket_connect(f"{V1}/live", subprotocols=["bearer", tokens["viewer"]]) as socket:
+    with client.websocket_connect(f"{V1}/live", subprotocols=["bearer", token]) as socket:
         assert socket.accepted_subprotocol == "bearer"
 
 
@@ -408,27 +399,11 @@ def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) ->
         assert "expected JSON of ordinary depth" in answer.json()["detail"]
 
 
-def test_a_night_that_was_slept_through_is_made_up_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from ground_service.worker import scheduler
-    from ground_service.worker.upkeep import nightly_job_id
-
-    noon = parse_utc("2029-08-07T12:00:00Z")
-    monkeypatch.setattr(scheduler, "CATCH_UP_S", -1.0)
-    monkeypatch.setattr(scheduler, "TICK_S", 0.05)
-    monkeypatch.setattr(scheduler, "utc_now_ns", lambda: noon)
-    with TestClient(create_app(Settings(home=tmp_path))) as opened:
-        path = f"{V1}/jobs/{nightly_job_id(noon)}"
-        wait_for(lambda: opened.get(path).status_code != 404, "the nightly job")
-        assert opened.get(path).json()["kind"] == "nightly"
-
-
 def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(
-    guarded: tuple[TestClient, dict[str, str]],
+    guarded: Guarded,
 ) -> None:
-    client, tokens = guarded
-    operator = {"Authorization": f"Bearer {tokens['operator']}", "Idempotency-Key": "k1"}
+    client, heads = guarded
+    operator = heads["operator"] | {"Idempotency-Key": "k1"}
     ping = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}
 
     def post(path: str, headers: dict[str, str], **body: Any) -> Any:
@@ -440,7 +415,7 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(
     assert client.get(f"{V1}/telecommands", headers=operator).json()["total"] == 1
     # A key belongs to one request of one caller.
     assert is_problem(post("/telecommands", operator, json={**ping, "timeout_s": 7}), 409)
-    other = {"Authorization": f"Bearer {tokens['admin']}", "Idempotency-Key": "k1"}
+    other = heads["admin"] | {"Idempotency-Key": "k1"}
     assert post("/telecommands", other, json=ping).json()["id"] == 2
     # What was refused may be asked for again.
     wrong = {**operator, "Idempotency-Key": "k2"}
@@ -456,22 +431,20 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(
     assert post("/uplink", {**operator, "Idempotency-Key": "later"}, **query).content == b""
 
 
-def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(tmp_path: Path) -> None:
+def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground: Ground) -> None:
     from ground_service.access.idempotency import once
     from ground_service.errors import Conflict, DatabaseUnavailable
-    from ground_service.ground import open_ground
 
-    def ask(ground: Any, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def ask(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return once(ground, actor="ann", operation="window", key="k", request={"a": 1}, work=work)
 
     def cut_off() -> dict[str, Any]:
         raise DatabaseUnavailable("db", "gone")
 
-    with open_ground(tmp_path) as ground:
-        with pytest.raises(DatabaseUnavailable):
-            ask(ground, cut_off)
-        with pytest.raises(Conflict, match="begun and its end is not known"):
-            ask(ground, lambda: {"id": 1})
+    with pytest.raises(DatabaseUnavailable):
+        ask(cut_off)
+    with pytest.raises(Conflict, match="begun and its end is not known"):
+        ask(lambda: {"id": 1})
 
 
 def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client: TestClient) -> None:

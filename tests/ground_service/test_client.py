@@ -34,7 +34,7 @@ from ground_service.ground import open_ground
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service import client_generator
-from tmtc.dictionary import DICTIONARY
+from tests.ground_service.conftest import event_packet
 from tmtc.downlink import encode_cadus
 
 EPHEMERIS = {
@@ -419,13 +419,7 @@ def test_a_client_that_is_not_closed_lets_python_end(tmp_path: Path) -> None:
 
 def test_lists_in_one_response_are_lists_of_entities(tmp_path: Path) -> None:
     with local_client(open_ground(tmp_path / "home"), "ann") as ground:
-        packet = DICTIONARY.pack(
-            "event_info",
-            {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
-            ticks=1,
-            sequence_count=0,
-        )
-        ground.ingest_file(encode_cadus([packet], spacecraft_id=76))
+        ground.ingest_file(encode_cadus([event_packet(1, 0)], spacecraft_id=76))
         assert [(one.spacecraft_id, one.instance) for one in ground.list_spacecraft()] == [(76, "flight")]
         assert {one.spacecraft_id for one in ground.list_automation_rules()} == {None}
         assert "oem" in [one.name for one in ground.list_export_formats()]
@@ -437,15 +431,8 @@ def test_the_example_of_the_documentation_runs(
     text = (Path(__file__).parents[2] / "docs" / "client.md").read_text()
     example = text.split("```python\n")[1].split("```")[0]
     assert len(example.strip().splitlines()) <= 15
-    packets = [
-        DICTIONARY.pack(
-            "event_info",
-            {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
-            ticks=int(ticks_from_utc_ns(parse_utc("2029-08-07T06:01:00Z"))) + number,
-            sequence_count=number,
-        )
-        for number in range(5)
-    ]
+    first = int(ticks_from_utc_ns(parse_utc("2029-08-07T06:01:00Z")))
+    packets = [event_packet(first + number, number, event="boot") for number in range(5)]
     downlink = tmp_path / "downlink.cadu"
     downlink.write_bytes(encode_cadus(packets, spacecraft_id=76))
     with local_client(open_ground(tmp_path / "home"), "ann") as ground:

@@ -7,13 +7,9 @@ import pytest
 
 from linna import cli
 from lunar.catalogue import PAPER_CLASS_COUNTS
-from lunar.ephemeris import ephemeris_from_states
-from lunar.frames import IauOrientation
 from lunar.messages.oem import save_oem
 from lunar.messages.stk import format_stk
-from lunar.timescales import NS, parse_utc
-
-START = parse_utc("2029-08-07T00:00:00")
+from tests.lunar.orbits import polar_orbit
 
 
 @pytest.fixture(autouse=True)
@@ -23,20 +19,10 @@ def no_data(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "nothing"))
 
 
-def orbit(hours=48.0, step_s=60.0, radius_m=1_768_180.0):
-    pole = IauOrientation().mcmf_from_icrf(9.34e8)[2]
-    node = np.cross([0.0, 0.0, 1.0], pole) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], pole))
-    elapsed = np.arange(0.0, hours * 3600.0 + 1.0, step_s)
-    angle = (elapsed * 2 * np.pi / 6672.0)[:, None]
-    position = radius_m * (np.cos(angle) * node + np.sin(angle) * pole)
-    velocity = radius_m * 2 * np.pi / 6672.0 * (np.cos(angle) * pole - np.sin(angle) * node)
-    return ephemeris_from_states(START + np.rint(elapsed * NS).astype(np.int64), position, velocity)
-
-
 @pytest.fixture
 def oem_path(tmp_path):
     path = tmp_path / "orbit.oem"
-    save_oem(orbit(), path)
+    save_oem(polar_orbit(48.0), path)
     return path
 
 
@@ -55,7 +41,7 @@ def error_line(capsys, *arguments):
 
 def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys):
     other = tmp_path / "orbit.e"
-    other.write_text(format_stk(orbit(radius_m=1_768_190.0)))
+    other.write_text(format_stk(polar_orbit(48.0, radius_m=1_768_190.0)))
     figures = run_json(capsys, "orbit", "compare", oem_path, other)
     assert figures["samples"] == 48 * 60 + 1
     assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)

@@ -19,9 +19,8 @@ from ground_service.settings import Settings
 from linna.cli import GROUPS, run
 from linna.parser import LinnaParser
 from lunar.timescales import format_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import START, save_circle
+from tests.ground_service.conftest import START, event_packet, save_circle, write_manifest
 from tests.serving import served
-from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 NS = 1_000_000_000
@@ -35,17 +34,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def downlink(tmp_path: Path) -> Path:
     ticks = int(ticks_from_utc_ns(START + 60 * NS))
-    packets = [
-        DICTIONARY.pack(
-            "event_info",
-            {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
-            ticks=ticks + k,
-            sequence_count=k,
-        )
-        for k in range(5)
-    ]
     path = tmp_path / "downlink.cadu"
-    path.write_bytes(encode_cadus(packets, spacecraft_id=76))
+    path.write_bytes(encode_cadus([event_packet(ticks + k, k) for k in range(5)], spacecraft_id=76))
     return path
 
 
@@ -80,24 +70,17 @@ def test_a_pass_archive_is_imported_and_reported_over_the_wire(
 @pytest.fixture
 def synthetic_archive(tmp_path: Path, downlink: Path, reference: Path) -> Path:
     """The smallest pass archive there is."""
-    import hashlib
-
     folder = tmp_path / "archive"
     folder.mkdir()
-    files = {}
-    for name, path in (("downlink.cadu", downlink), ("reference.oem", reference)):
-        octets = path.read_bytes()
-        (folder / name).write_bytes(octets)
-        files[name] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+    for path in (downlink, reference):
+        (folder / path.name).write_bytes(path.read_bytes())
     manifest = {
         "schema_version": 1,
         "pass_name": "small",
         "spacecraft_id": 76,
         "start_utc": format_utc(START),
-        "stop_utc": format_utc(START + 600 * NS),
-        "files": files,
     }
-    (folder / "manifest.json").write_text(json.dumps(manifest))
+    write_manifest(folder, manifest | {"stop_utc": format_utc(START + 600 * NS)})
     return folder
 
 
@@ -324,23 +307,12 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
 
 def steady(value: Any) -> Any:
     """Return figures without times of entry, hashes and tokens, which differ between two services."""
-    times = {
-        "created",
-        "changed",
-        "requested",
-        "decided",
-        "held",
-        "noted",
-        "sent",
-        "entered",
-        "expires",
-        "used",
-        "revoked",
-        "time",
-    }
-    random = {"token", "hint", "sha256", "previous_sha256", "report_id", "number", "event"}
+    left_out = {
+        "created", "changed", "requested", "decided", "held", "noted", "sent", "entered", "expires", "used", "revoked",
+        "time", "token", "hint", "sha256", "previous_sha256", "report_id", "number", "event",
+    }  # fmt: skip
     if isinstance(value, dict):
-        return {key: None if key in times | random else steady(item) for key, item in value.items()}
+        return {key: None if key in left_out else steady(item) for key, item in value.items()}
     if isinstance(value, list):
         return [steady(item) for item in value]
     return None if isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) else value  # id of a job

@@ -6,25 +6,15 @@ import pytest
 from lunar.comparison import compare
 from lunar.ephemeris import ephemeris_from_states
 from lunar.errors import EphemerisCoverageError
-from lunar.timescales import NS, parse_utc
+from lunar.timescales import NS
+from tests.lunar.orbits import POLAR, RADIUS_M, RATE_RAD_S, START, circle, times
 
-START = parse_utc("2029-08-07T00:00:00")
 ELAPSED_S = np.arange(200) * 30.0
-RATE_RAD_S = 2 * np.pi / 6672.0
 
 
-def circle(elapsed_s, radius_m=1_768_180.0):
-    angle = RATE_RAD_S * elapsed_s
-    zero = np.zeros_like(angle)
-    position = radius_m * np.stack([np.cos(angle), zero, np.sin(angle)], -1)
-    return position, radius_m * RATE_RAD_S * np.stack([-np.sin(angle), zero, np.cos(angle)], -1)
-
-
-def ephemeris(elapsed_s=ELAPSED_S, radius_m=1_768_180.0, late_s=0.0, shift_m=(0.0, 0.0, 0.0)):
-    position, velocity = circle(elapsed_s - late_s, radius_m)
-    return ephemeris_from_states(
-        START + np.rint(elapsed_s * NS).astype(np.int64), position + shift_m, velocity
-    )
+def ephemeris(elapsed_s=ELAPSED_S, radius_m=RADIUS_M, late_s=0.0, shift_m=(0.0, 0.0, 0.0)):
+    position, velocity = circle(elapsed_s - late_s, radius_m, north=POLAR)
+    return ephemeris_from_states(times(elapsed_s), position + shift_m, velocity)
 
 
 def test_an_ephemeris_does_not_differ_from_itself():

@@ -11,26 +11,12 @@ from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import NS, parse_utc
-
-START = parse_utc("2029-08-07T00:00:00")
-RADIUS_M = 1_768_180.0
-RATE_RAD_S = 2 * np.pi / 6672.0
-
-
-def circle(elapsed_s):
-    """Position and velocity on a circular orbit, tilted."""
-    angle = RATE_RAD_S * np.asarray(elapsed_s)
-    position = RADIUS_M * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
-    velocity = (
-        RADIUS_M * RATE_RAD_S * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
-    )
-    return position, velocity
+from tests.lunar.orbits import START, circle, times
 
 
 def arc(elapsed_s, **fields):
     elapsed_s = np.asarray(elapsed_s, dtype=np.float64)
-    utc_ns = START + np.rint(elapsed_s * NS).astype(np.int64)
-    return ephemeris_from_states(utc_ns, *circle(elapsed_s), **fields)
+    return ephemeris_from_states(times(elapsed_s), *circle(elapsed_s), **fields)
 
 
 def at_s(ephemeris, elapsed_s):

@@ -5,29 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from lunar.constants import GM_MOON_M3_S2
-from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
 from lunar.ground_track import even_epochs, ground_track
-from lunar.timescales import NS, parse_utc
-
-START = parse_utc("2029-08-07T00:00:00")
-SEMI_MAJOR_AXIS_M = 1_768_180.0
+from lunar.timescales import NS
+from tests.lunar.orbits import polar_orbit
 
 
 @pytest.fixture(scope="module")
 def day():
     """A circular polar orbit of the paper's semi-major axis, one day in 15 s steps."""
-    rate = math.sqrt(GM_MOON_M3_S2 / SEMI_MAJOR_AXIS_M**3)
-    elapsed = np.arange(0.0, 86_400.0, 15.0)
-    # In the plane of the Moon's pole, started at the equator.
-    pole = IauOrientation().mcmf_from_icrf(9.34e8)[2]
-    node = np.cross([0.0, 0.0, 1.0], pole)
-    node /= np.linalg.norm(node)
-    angle = (rate * elapsed)[:, None]
-    position = SEMI_MAJOR_AXIS_M * (np.cos(angle) * node + np.sin(angle) * pole)
-    velocity = SEMI_MAJOR_AXIS_M * rate * (np.cos(angle) * pole - np.sin(angle) * node)
-    return ephemeris_from_states(START + np.rint(elapsed * NS).astype(np.int64), position, velocity)
+    return polar_orbit(23.999, 15.0)
 
 
 def test_a_pass_within_sixty_degrees_lasts_37_minutes(day):

@@ -29,8 +29,7 @@ from lunar.visibility import (
     sun_elevation_azimuth,
     sunlit_fraction,
 )
-
-START = parse_utc("2029-08-07T00:00:00")
+from tests.lunar.orbits import POLAR, START, circle, times
 
 
 @pytest.mark.parametrize(
@@ -153,10 +152,7 @@ def test_the_limb_hides_the_earth_on_the_far_side_only():
 
 def orbit(hours=6):
     elapsed = np.arange(0.0, hours * 3600.0, 30.0)
-    angle = elapsed * 2 * np.pi / 6672.0
-    position = 1_768_180.0 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
-    velocity = 1665.0 * np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], -1)
-    return ephemeris_from_states(START + np.rint(elapsed * NS).astype(np.int64), position, velocity)
+    return ephemeris_from_states(times(elapsed), *circle(elapsed, north=POLAR))
 
 
 GOLDSTONE = GroundStation("DSS-14", math.radians(35.42590), math.radians(243.11046), 1002.0)

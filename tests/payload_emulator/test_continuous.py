@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from payload_emulator.session.starting import launch
 from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import open_world
 from tests.scenarios import commanded_scenario
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link import LinkSettings
@@ -123,20 +124,27 @@ def opened(scenario: Scenario, craters: Path | None = None, **options: Any) -> L
     return LiveSession(*launch(scenario, DataFolder(None), craters), **options)
 
 
+@contextlib.contextmanager
+def running(session: LiveSession) -> Iterator[threading.Thread]:
+    """Run a session in a thread, which has to end within the context."""
+    thread = threading.Thread(target=session.run, daemon=True)
+    thread.start()
+    try:
+        yield thread
+        thread.join(120)
+        assert not thread.is_alive()
+    finally:
+        session.stopping.set()
+
+
 def flown(
     scenario: Scenario, hours: float, act: Act = lambda ground, contact: None, **options: Any
 ) -> tuple[LiveSession, Ground]:
     """Fly a session for some hours from its epoch, with a client."""
     stop = EPOCH + round(hours * HOUR_NS)
     session = opened(scenario, holds=True, stop_utc_ns=stop, **options)
-    thread = threading.Thread(target=session.run, daemon=True)
-    thread.start()
-    try:
+    with running(session):
         ground = Ground(session, act)
-        thread.join(120)
-        assert not thread.is_alive()
-    finally:
-        session.stopping.set()
     ground.close()
     return session, ground
 
@@ -315,17 +323,11 @@ def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path:
 
 def test_a_session_ends_with_its_console_if_that_is_asked_for() -> None:
     session = opened(scenario(), paused=True, ends_with_console=True)
-    thread = threading.Thread(target=session.run, daemon=True)
-    thread.start()
-    try:
-        with socket.create_connection(("127.0.0.1", session.ports["console"])) as console:
-            console.sendall(b"state\n")
-            assert json.loads(console.makefile("r").readline())["kind"] == "state"
-            assert thread.is_alive()
-        thread.join(120)
-        assert not thread.is_alive()
-    finally:
-        session.stopping.set()
+    port = session.ports["console"]
+    with running(session) as thread, socket.create_connection(("127.0.0.1", port)) as console:
+        console.sendall(b"state\n")
+        assert json.loads(console.makefile("r").readline())["kind"] == "state"
+        assert thread.is_alive()
 
 
 def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> None:
@@ -333,20 +335,12 @@ def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> 
     state = tmp_path / "session.state"
     flown(scenario(), 1.0, state_file=state)
     session = opened(scenario(), holds=True, stop_utc_ns=EPOCH, state_file=state)
-    thread = threading.Thread(target=session.run, daemon=True)
-    thread.start()
-    try:
-        until = time.monotonic() + 60.0
-        while not session._held:
-            assert time.monotonic() < until and thread.is_alive()
-            time.sleep(0.01)
+    with running(session) as thread:
+        wait_for(lambda: session._held, "the end of the session")
         with socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=60.0) as console:
             assert json.loads(console.makefile("r").readline())["kind"] == "finished"
             console.sendall(b"run\n")
             thread.join(60)
-        assert not thread.is_alive()
-    finally:
-        session.stopping.set()
 
 
 def test_images_that_the_payload_refuses_to_look_at_are_no_frames() -> None:

@@ -416,9 +416,7 @@ class LinkRunner:
             return
         if link.downlink is not None:
             ledger = self._folder / "ingested.json"
-            folder = WatchedFolder(
-                Path(link.downlink), ledger, self._ingest_of_folder, self._report_of_folder
-            )
+            folder = WatchedFolder(Path(link.downlink), ledger, self._ingest_of_folder, self._report)
             folder.look(time.time())
             if self._contact is not None:
                 service.end_contact(self._ground, self._contact.id, self._name, mission_now_ns())
@@ -440,9 +438,6 @@ class LinkRunner:
         self._progress.received += path.stat().st_size
         self._progress.cut_utc_ns[path.name] = mission_now_ns()
         return self._ingest(path)
-
-    def _report_of_folder(self, path: Path, result: dict[str, Any] | GroundError) -> None:
-        self._report(path, result)
 
     # Ingest
 

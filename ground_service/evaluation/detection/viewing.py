@@ -18,14 +18,6 @@ GAP_STEPS = 10.0
 """Attitudes of a motion further apart than so many median steps are not interpolated."""
 
 
-def _no_times() -> IntArray:
-    return np.zeros(0, dtype=np.int64)
-
-
-def _no_quaternions() -> FloatArray:
-    return np.zeros((0, 4))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewing:
     """Camera and its pointing.
@@ -47,8 +39,8 @@ class Viewing:
     camera: PinholeCamera = field(default_factory=PinholeCamera)
     tilt_rad: float = 0.0
     yaw_rad: float = 0.0
-    attitude_utc_ns: IntArray = field(default_factory=_no_times)
-    q_wxyz: FloatArray = field(default_factory=_no_quaternions)
+    attitude_utc_ns: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    q_wxyz: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     interpolated: bool = False
 
     def pointed(self, position_mcmf_m: FloatArray) -> FloatArray:

@@ -165,11 +165,7 @@ def _rules_for(connection: Connection, occurrence: Occurrence) -> list[tuple[int
             for _, key, mission in store.missions_in_force(connection)
         ]
     key, mission = store.mission_of_vehicle(connection, occurrence.vehicle_id)
-    return [(key, _rules(mission))]
-
-
-def _rules(mission: Mission | None) -> tuple[Rule, ...]:
-    return DEFAULT_RULES if mission is None else mission.automation.rules_in_force
+    return [(key, DEFAULT_RULES if mission is None else mission.automation.rules_in_force)]
 
 
 def list_rules(ground: Ground) -> list[RuleInForce]:
@@ -213,13 +209,10 @@ def decide(ground: Ground, action_id: int, *, approve: bool, actor: str) -> Auto
         now = utc_now_ns()
         action = store.get_action(connection, action_id)
         waiting: dict[str, Any] = {"expected": ("waiting",), "now_utc_ns": now, "decided_by": actor}
-        store.change_state(connection, action, state, **waiting)
-        for other in store.actions_of_event(connection, action.event):
-            same = (other.rule, other.subject) == (action.rule, action.subject)
-            if same and other.position > action.position and other.state == "waiting":
-                store.change_state(connection, other, state, **waiting)
+        for one in [action, *_following(connection, action, "waiting")]:
+            store.change_state(connection, one, state, **waiting)
         verb = "approve" if approve else "refuse"
-        detail = {"action": action.action, "rule": action.rule, "event": action.event}
+        detail = action.model_dump(include={"action", "rule", "event"})
         audit(connection, actor, f"{verb} automation", str(action_id), detail)
         return store.get_action(connection, action_id)
 
@@ -243,15 +236,18 @@ def repeat(ground: Ground, action_id: int, *, actor: str) -> AutomationAction:
             return action
         again: dict[str, Any] = {"attempts": 0, "next_attempt_utc_ns": None, "error": None}
         store.change_state(connection, action, "queued", now_utc_ns=now, expected=("failed",), **again)
-        for other in store.actions_of_event(connection, action.event):
-            same = (other.rule, other.subject) == (action.rule, action.subject)
-            if same and other.position > action.position and other.state == "skipped":
-                store.change_state(connection, other, "queued", now_utc_ns=now, **again)
-        detail = {
-            "action": action.action,
-            "rule": action.rule,
-            "event": action.event,
-            "error": action.error,
-        }
+        for other in _following(connection, action, "skipped"):
+            store.change_state(connection, other, "queued", now_utc_ns=now, **again)
+        detail = action.model_dump(include={"action", "rule", "event", "error"})
         audit(connection, actor, "repeat automation", str(action_id), detail)
         return store.get_action(connection, action_id)
+
+
+def _following(connection: Connection, action: AutomationAction, state: str) -> list[AutomationAction]:
+    """Return the actions in a state that come after one in the same rule, for the same event and subject."""
+    return [
+        one
+        for one in store.actions_of_event(connection, action.event)
+        if (one.rule, one.subject, one.state) == (action.rule, action.subject, state)
+        and one.position > action.position
+    ]

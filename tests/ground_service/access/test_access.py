@@ -1,64 +1,27 @@
 """Users, tokens and the audit log over HTTP."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
-from ground_service.access.service import add_user
-from ground_service.app import create_app
-from ground_service.settings import Settings
 from tests.serving import TestClient
 
 V1 = "/api/v1"
 
-Tokens = dict[str, dict[str, str]]
+Guarded = tuple[TestClient, dict[str, dict[str, str]]]
 
 
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[tuple[TestClient, Tokens]]:
-    """An empty service with one user of each role, and the headers of each."""
-    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
-        ground = client.app.state.ground
-        yield (
-            client,
-            {
-                role: {"Authorization": f"Bearer {add_user(ground, role, role)}"}
-                for role in ("viewer", "operator", "admin")
-            },
-        )
-
-
-def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> None:
-    client, heads = service
+def test_an_administrator_manages_users(guarded: Guarded) -> None:
+    client, heads = guarded
     admin = heads["admin"]
     made = client.post(f"{V1}/users", json={"name": "ann", "role": "viewer", "days_valid": 2}, headers=admin)
     assert made.status_code == 201, made.text
     mine = {"Authorization": f"Bearer {made.json()['token']}"}
     assert client.get(f"{V1}/passes", headers=mine).status_code == 200
     assert client.get(f"{V1}/users/ann", headers=admin).json() == made.json()["user"]
-    assert [one["name"] for one in client.get(f"{V1}/users", headers=admin).json()["items"]] == [
-        "admin",
-        "ann",
-        "operator",
-        "viewer",
-    ]
+    names = [one["name"] for one in client.get(f"{V1}/users", headers=admin).json()["items"]]
+    assert names == ["admin", "ann", "operator", "viewer"]
     (token,) = client.get(f"{V1}/tokens?user=ann", headers=admin).json()["items"]
-    assert set(token) == {
-        *(
-            "id",
-            "user",
-            "hint",
-            "state",
-            "created",
-            "expires",
-            "revoked",
-            "used",
-            "parent_id",
-            "kind",
-            "missions",
-        )
-    }
+    shown = "id user hint state created expires revoked used parent_id kind missions"
+    assert set(token) == set(shown.split())
     assert made.json()["token"] not in str(token)
     changed = client.patch(f"{V1}/users/ann", json={"state": "disabled"}, headers=admin)
     assert changed.json()["state"] == "disabled"
@@ -66,22 +29,6 @@ def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> N
     again = client.patch(f"{V1}/users/ann", json={"state": "disabled"}, headers=admin)
     assert again.status_code == 409
     assert again.json()["detail"] == "user ann: expected state active, found disabled"
-
-
-@pytest.mark.parametrize("role", ["viewer", "operator"])
-def test_nobody_else_does(service: tuple[TestClient, Tokens], role: str) -> None:
-    client, heads = service
-    for method, path, body in (
-        ("GET", "users", None),
-        ("GET", "users/admin", None),
-        ("GET", "tokens", None),
-        ("DELETE", "tokens/1", None),
-        ("POST", "users", {"name": "x", "role": "admin"}),
-        ("PATCH", "users/admin", {"state": "disabled"}),
-        ("POST", "users/admin/tokens", {}),
-    ):
-        answer = client.request(method, f"{V1}/{path}", json=body, headers=heads[role])
-        assert answer.status_code == 403, (method, path)
 
 
 @pytest.mark.parametrize(
@@ -96,16 +43,14 @@ def test_nobody_else_does(service: tuple[TestClient, Tokens], role: str) -> None
         {"name": "ann", "role": "viewer", "admin": True},
     ],
 )
-def test_a_user_that_cannot_be_added_is_refused(
-    service: tuple[TestClient, Tokens], body: dict[str, object]
-) -> None:
-    client, heads = service
+def test_a_user_that_cannot_be_added_is_refused(guarded: Guarded, body: dict[str, object]) -> None:
+    client, heads = guarded
     assert client.post(f"{V1}/users", json=body, headers=heads["admin"]).status_code == 422
     assert client.get(f"{V1}/users", headers=heads["admin"]).json()["total"] == 3
 
 
-def test_operators_read_who_did_what(service: tuple[TestClient, Tokens]) -> None:
-    client, heads = service
+def test_operators_read_who_did_what(guarded: Guarded) -> None:
+    client, heads = guarded
     client.patch(f"{V1}/users/viewer", json={"state": "disabled"}, headers=heads["admin"])
     page = client.get(f"{V1}/audit?limit=2", headers=heads["operator"]).json()
     assert (page["total"], [one["number"] for one in page["items"]]) == (4, [4, 3])

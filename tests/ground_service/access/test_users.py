@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -28,8 +29,9 @@ from tests.serving import token_valid
 SECRET = "a-token-of-a-deployment-0123456789"
 
 
-def actions(ground: Ground) -> list[tuple[str, str, str]]:
-    return [(one.actor, one.action, one.target) for one in ground.read(list_audit, AuditFilter()).items][::-1]
+def details(ground: Ground) -> list[tuple[str, str, str, object]]:
+    entries = ground.read(list_audit, AuditFilter()).items
+    return [(one.actor, one.action, one.target, one.detail) for one in reversed(entries)]
 
 
 def test_a_disabled_user_is_refused_at_once_in_every_process(either: Ground, tmp_path: Path) -> None:
@@ -47,7 +49,7 @@ def test_a_disabled_user_is_refused_at_once_in_every_process(either: Ground, tmp
             change_user(other, "bob", state="disabled")
         change_user(other, "bob", state="active")
         assert authenticate(either, token).role == "operator"
-    assert actions(either) == [
+    assert [one[:3] for one in details(either)] == [
         ("local", "add user", "ann"),
         ("ann", "add user", "bob"),
         ("ann", "disable user", "bob"),
@@ -71,7 +73,7 @@ def test_a_revoked_token_is_refused_and_others_stay(either: Ground) -> None:
         revoke_token(either, oldest.id)
     with pytest.raises(NotFound):
         revoke_token(either, 99)
-    assert actions(either)[-1] == ("eve", "revoke token", "ann")
+    assert details(either)[-1][:3] == ("eve", "revoke token", "ann")
     third = add_token(either, "ann", revoke_others=True)
     assert [token_valid(either, one) for one in (first, second, third)] == [False, False, True]
 
@@ -92,21 +94,17 @@ def test_the_last_administrator_stays(either: Ground) -> None:
 
 def race(*tasks: Callable[[], object]) -> list[object]:
     """Run tasks simultaneously; return what each returned or raised."""
-    barrier, results = threading.Barrier(len(tasks)), [None] * len(tasks)
+    barrier = threading.Barrier(len(tasks))
 
-    def run(index: int) -> None:
+    def run(task: Callable[[], object]) -> object:
         barrier.wait()
         try:
-            results[index] = tasks[index]()
+            return task()
         except Exception as error:  # the test examines it
-            results[index] = error
+            return error
 
-    threads = [threading.Thread(target=run, args=(index,)) for index in range(len(tasks))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results
+    with ThreadPoolExecutor(len(tasks)) as pool:
+        return list(pool.map(run, tasks))
 
 
 def test_of_two_administrators_who_disable_each_other_one_stays(either: Ground) -> None:
@@ -171,13 +169,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
     put(NOW)
     return put
-
-
-def details(ground: Ground) -> list[tuple[str, str, str, object]]:
-    return [
-        (one.actor, one.action, one.target, one.detail)
-        for one in ground.read(list_audit, AuditFilter()).items
-    ][::-1]
 
 
 def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -> None:

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
-from ground_service.passes.service import define_pass
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation
@@ -34,7 +32,7 @@ from lunar.lens import BrownCamera
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import to_json
-from tests.ground_service.conftest import write_manifest
+from tests.ground_service.conftest import define_pass_of, enter_files
 from tests.ground_service.evaluation.still import TurnedOrientation
 
 MISSING_FILES = DataFolder(
@@ -43,12 +41,9 @@ MISSING_FILES = DataFolder(
 """A data folder with other models; none of them may even be opened."""
 
 
-def changed_archive(synthetic_pass: Any, folder: Path, change: Callable[[dict], None]) -> Path:
+def changed_archive(synthetic_pass: Any, folder: Path, **changed: Any) -> Path:
     shutil.copytree(synthetic_pass.folder, folder)
-    manifest = json.loads((folder / "manifest.json").read_text())
-    del manifest["files"]
-    change(manifest)
-    write_manifest(folder, manifest)
+    enter_files(folder, **changed)
     return folder
 
 
@@ -67,7 +62,7 @@ def test_a_report_does_not_depend_on_the_data_of_the_machine(synthetic_pass: Any
 def test_without_the_declared_orientation_no_figure_that_needs_it_is_given(
     synthetic_pass: Any, ground: Ground, tmp_path: Path, sources: list[str]
 ) -> None:
-    folder = changed_archive(synthetic_pass, tmp_path / "a", lambda m: m.update(data_sources=sources))
+    folder = changed_archive(synthetic_pass, tmp_path / "a", data_sources=sources)
     report = evaluate(ground, import_archive(ground, folder))
     reason = "declares the lunar orientation DE421, which is not available on this machine"
     if sources == ["circular orbit"]:
@@ -88,14 +83,7 @@ def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to
 ) -> None:
     """As of a pass flown live, whose mission description nobody has entered: the packets come, no document does."""
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
-    pass_id = define_pass(
-        ground,
-        name="live",
-        start_utc_ns=int(synthetic_pass.utc_ns[0]),
-        stop_utc_ns=int(synthetic_pass.utc_ns[-1]),
-        spacecraft_id=76,
-    )
-    report = evaluate(ground, pass_id)
+    report = evaluate(ground, define_pass_of(ground, synthetic_pass))
     assert report.verdict.startswith("Nothing can be judged: no mission description of spacecraft 76")
     assert "linna mission write SCENARIO" in report.verdict and "linna mission add FILE" in report.verdict
     assert report.verdict_level == "unknown"
@@ -104,14 +92,8 @@ def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to
     assert report.provenance["mission description"] == "none registered"
 
     add_mission(ground, MISSION_76)
-    again = define_pass(
-        ground,
-        name="live, again",
-        start_utc_ns=int(synthetic_pass.utc_ns[0]),
-        stop_utc_ns=int(synthetic_pass.utc_ns[-1]),
-        spacecraft_id=76,
-    )
-    table = {one.key: one.status for one in evaluate(ground, again).requirements}
+    again = evaluate(ground, define_pass_of(ground, synthetic_pass))
+    table = {one.key: one.status for one in again.requirements}
     assert "mission" not in table
     assert table["completeness.packets"] in ("met", "unknown") and table["detector.recall"] == "not judged"
 
@@ -122,9 +104,7 @@ def test_the_sun_of_images_is_unknown_where_a_simulated_world_draws_its_light(
 ) -> None:
     add_mission(ground, MISSION_76 + stated)
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
-    start, stop = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
-    pass_id = define_pass(ground, name="live", start_utc_ns=start, stop_utc_ns=stop, spacecraft_id=76)
-    assert load_pass_inputs(ground, pass_id).sun_known == (stated == b"")
+    assert load_pass_inputs(ground, define_pass_of(ground, synthetic_pass)).sun_known == (stated == b"")
 
 
 MISSION_76 = b"""name = "live"
@@ -140,9 +120,7 @@ def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(
 ) -> None:
     """Turning the ground by 0.01 degrees moves an estimate by 308 m times the cosine of its latitude."""
     monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation())
-    folder = changed_archive(
-        synthetic_pass, tmp_path / "a", lambda m: m.update(data_sources=["orientation DE421"])
-    )
+    folder = changed_archive(synthetic_pass, tmp_path / "a", data_sources=["orientation DE421"])
     with open_ground(tmp_path / "home", MISSING_FILES) as ground:
         report = evaluate(ground, import_archive(ground, folder))
         shift = next(s for s in report.navigation if s.name == "spherical")
@@ -196,9 +174,7 @@ def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(
     ticks = [int(ticks_from_utc_ns(int(synthetic_pass.utc_ns[k]))) for k in (5, 2)]
     rows = "".join(f"{tick},{q}\n" for tick, q in zip(ticks, ("0,1,0,0", "1,0,0,0"), strict=True))
     (folder / "attitude.csv").write_text(f"{HEADER}\n{rows}")
-    write_manifest(
-        folder, {k: v for k, v in json.loads((folder / "manifest.json").read_text()).items() if k != "files"}
-    )
+    enter_files(folder)
     viewing = load_pass_inputs(ground, import_archive(ground, folder)).viewing
     assert np.flatnonzero(viewing.known(synthetic_pass.utc_ns)).tolist() == [2, 5]
     assert viewing.q_wxyz.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
@@ -214,8 +190,7 @@ def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> A
     q_wxyz[3] *= -1.0  # the same attitude
     segment = AttitudeSegment(utc_ns, q_wxyz, **fields)
     (folder / "attitude.aem").write_text(format_aem((segment,)))
-    manifest = json.loads((folder / "manifest.json").read_text())
-    write_manifest(folder, {key: value for key, value in manifest.items() if key != "files"})
+    enter_files(folder)
     return segment
 
 
@@ -260,8 +235,7 @@ def test_two_attitude_files_are_refused(synthetic_pass: Any, ground: Ground, tmp
     folder = tmp_path / "a"
     with_attitude_message(synthetic_pass, folder)
     (folder / "attitude.csv").write_text(f"{HEADER}\n")
-    manifest = json.loads((folder / "manifest.json").read_text())
-    write_manifest(folder, {key: value for key, value in manifest.items() if key != "files"})
+    enter_files(folder)
     with pytest.raises(InvalidInput, match=r"expected one of attitude\.csv and attitude\.aem, found both"):
         import_archive(ground, folder)
 

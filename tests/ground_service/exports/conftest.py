@@ -102,7 +102,6 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
         )
     (folder / "downlink.cadu").write_bytes(encode_downlink(packets))
     manifest = json.loads((folder / "manifest.json").read_text())
-    del manifest["files"]
     manifest["gravity"]["filter_orientation"] = TurnedOrientation().name
     write_manifest(folder, manifest)
     return RichPass(folder, made.utc_ns, onboard_from_icrf, position_mcmf, camera_from_icrf, craters)

@@ -16,16 +16,16 @@ from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_batch
-from ground_service.passes.service import define_pass, list_events, parameter_series, state_series
+from ground_service.passes.service import list_events, parameter_series, state_series
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.conftest import define_pass_of
 from tests.serving import TestClient
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 
-NS = 1_000_000_000
 OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)
 
 
@@ -37,13 +37,7 @@ def fill_with_the_old(home: Path, made: Any) -> None:
             vehicle = vehicle_id(connection, 76, "flight")
             store_batch(connection, vehicle, batch_of_cut(found.buffer, found.cut, OLD, 76))
             repository.change(connection, repository.VEHICLES, vehicle, decoded_version=OLD.version)
-        define_pass(
-            ground,
-            name="p",
-            start_utc_ns=int(made.utc_ns[0]) - NS,
-            stop_utc_ns=int(made.utc_ns[-1]) + NS,
-            spacecraft_id=76,
-        )
+        define_pass_of(ground, made)
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import make_report
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
-from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera
 from ground_service.missions.service import add_mission
@@ -26,7 +25,7 @@ from ground_service.planning import service as planning
 from ground_service.store import repository
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import SyntheticPass
+from tests.ground_service.conftest import SyntheticPass, add_reference
 from tmtc.downlink import encode_cadus
 
 START, STOP = parse_utc("2029-08-07T06:00:00Z"), parse_utc("2029-08-07T06:05:45Z")
@@ -95,7 +94,7 @@ def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
     either: Ground, made: SyntheticPass, tmp_path: Path
 ) -> None:
     missions = {76: add_mission(either, WIDE.encode()), 77: add_mission(either, NARROW.encode())}
-    add_ephemeris(either, either.files.put_file(made.folder / "reference.oem"), name="reference")
+    add_reference(either, made.folder / "reference.oem")
     passes = {spacecraft: flown(either, made, spacecraft, tmp_path) for spacecraft in missions}
     reports = {}
     for spacecraft, pass_id in passes.items():
@@ -117,7 +116,7 @@ def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
     ground: Ground, made: SyntheticPass
 ) -> None:
     missions = {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
-    add_ephemeris(ground, ground.files.put_file(made.folder / "reference.oem"), name="reference")
+    add_reference(ground, made.folder / "reference.oem")
     for spacecraft, mission in missions.items():
         command = enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft, actor="ann")
         assert row(ground, repository.TELECOMMANDS, id=command)["mission_id"] == mission.id
@@ -134,7 +133,7 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
 ) -> None:
     add_mission(ground, WIDE.encode())
     add_mission(ground, NARROW.encode())
-    add_ephemeris(ground, ground.files.put_file(made.folder / "reference.oem"), name="reference")
+    add_reference(ground, made.folder / "reference.oem")
     planners = []
     made_planner = planning.planner_of
     monkeypatch.setattr(

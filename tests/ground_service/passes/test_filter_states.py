@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,23 +12,21 @@ from sqlalchemy import select
 
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.inputs import filter_states, load_pass_inputs
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import Ground
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_batch
 from ground_service.passes.archive_import import import_archive
-from ground_service.passes.service import define_pass
 from ground_service.passes.span import pass_span
 from ground_service.passes.store import get_pass
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
+from tests.ground_service.conftest import SPACECRAFT, define_pass_of, enter_files
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.stream import cut_packets
 
-NS = 1_000_000_000
-SPACECRAFT = 76
 ERROR_RTN_M = np.array([30.0, -40.0, 10.0])
 SIGMA_M = np.array([20.0, 50.0, 10.0])
 CORRELATION = 0.6
@@ -67,15 +63,10 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
             "acceleration_rtn_m_s2": np.zeros(3),
             "covariance": covariance[triangle],
         }
-        if version == 2:
-            packets.append(
-                DICTIONARY.pack("filter_state", values, ticks=ticks + 5, sequence_count=1_000 + 2 * k)
-            )
-        else:
+        name = "filter_state" if version == 2 else "filter_estimate"
+        if version != 2:
             values["innovation_degrees"] = 24
-            packets.append(
-                DICTIONARY.pack("filter_estimate", values, ticks=ticks + 5, sequence_count=1_000 + 2 * k)
-            )
+        packets.append(DICTIONARY.pack(name, values, ticks=ticks + 5, sequence_count=1_000 + 2 * k))
         state_values = {
             **frame, "estimator": 2, "outcome": "fixed", "latitude_deg": np.degrees(latitude),
             "longitude_deg": np.degrees(longitude) % 360.0, "altitude_m": altitude,
@@ -95,24 +86,12 @@ def flown(request: Any, tmp_path: Path, make_pass: Any) -> tuple[Path, Any, int]
     return path, made, request.param
 
 
-def with_pass(ground: Ground, made: Any) -> int:
-    return define_pass(
-        ground,
-        name="p",
-        start_utc_ns=int(made.utc_ns[0]) - NS,
-        stop_utc_ns=int(made.utc_ns[-1]) + NS,
-        spacecraft_id=SPACECRAFT,
-    )
-
-
 def archive_with(made: Any, packets: list[bytes]) -> Path:
     """The archive of the synthetic pass with further packets in its downlink."""
     folder: Path = made.folder
     octets = encode_cadus([*made.packets, *packets], spacecraft_id=SPACECRAFT)
     (folder / "downlink.cadu").write_bytes(octets)
-    manifest = json.loads((folder / "manifest.json").read_text())
-    manifest["files"]["downlink.cadu"] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
-    (folder / "manifest.json").write_text(json.dumps(manifest))
+    enter_files(folder)
     return folder
 
 
@@ -122,54 +101,49 @@ def states_of(ground: Ground, pass_id: int) -> Any:
 
 
 def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(
-    flown: tuple[Path, Any, int], tmp_path: Path
+    flown: tuple[Path, Any, int], ground: Ground
 ) -> None:
     path, made, version = flown
-    with open_ground(tmp_path / "home") as ground:
-        ingest_file(ground, path)
-        found = states_of(ground, with_pass(ground, made))
-        assert len(found) == 8
-        # The axes are those of the estimate, 40 m in 1,767 km (2e-5 rad) from those of the orbit.
-        np.testing.assert_allclose(found.sigma_rtn_m, np.broadcast_to(SIGMA_M, (8, 3)), rtol=1e-4)
-        block = found.position_covariance_rtn_m2
-        np.testing.assert_allclose(block[:, 0, 1], CORRELATION * 20.0 * 50.0, rtol=2e-4)
-        assert found.innovation_degrees.tolist() == [-1 if version == 2 else 24] * 8
-        with ground.database.reading() as connection:
-            table = repository.SAMPLES["filter_states"]
-            assert set(connection.execute(select(table.c.dictionary_version)).scalars()) == {
-                DICTIONARY.version
-            }
+    ingest_file(ground, path)
+    found = states_of(ground, define_pass_of(ground, made))
+    assert len(found) == 8
+    # The axes are those of the estimate, 40 m in 1,767 km (2e-5 rad) from those of the orbit.
+    np.testing.assert_allclose(found.sigma_rtn_m, np.broadcast_to(SIGMA_M, (8, 3)), rtol=1e-4)
+    block = found.position_covariance_rtn_m2
+    np.testing.assert_allclose(block[:, 0, 1], CORRELATION * 20.0 * 50.0, rtol=2e-4)
+    assert found.innovation_degrees.tolist() == [-1 if version == 2 else 24] * 8
+    with ground.database.reading() as connection:
+        table = repository.SAMPLES["filter_states"]
+        assert set(connection.execute(select(table.c.dictionary_version)).scalars()) == {DICTIONARY.version}
 
 
-def test_what_version_2_decoded_is_decoded_again_to_the_same_states(tmp_path: Path, make_pass: Any) -> None:
+def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground: Ground, make_pass: Any) -> None:
     made = make_pass(frames=8, seed=3)
     octets = b"".join(anchored_packets(made, 2))
-    with open_ground(tmp_path / "home") as ground:
-        with ground.database.writing() as connection:
-            vehicle = vehicle_id(connection, SPACECRAFT, "flight")
-            batch = batch_of_cut(octets, cut_packets(octets), replace(DICTIONARY, version=2), SPACECRAFT)
-            store_batch(connection, vehicle, batch)
-            repository.change(connection, repository.VEHICLES, vehicle, decoded_version=2)
-        pass_id = with_pass(ground, made)
-        before = states_of(ground, pass_id)
-        assert catch_up(ground, vehicle) > 0
-        after = states_of(ground, pass_id)
-        assert len(before) == len(after) == 8
-        np.testing.assert_array_equal(before.state, after.state)
-        np.testing.assert_array_equal(before.covariance, after.covariance)
-        with ground.database.reading() as connection:
-            table = repository.SAMPLES["filter_states"]
-            versions = set(connection.execute(select(table.c.dictionary_version)).scalars())
-        assert versions == {2, DICTIONARY.version}
+    with ground.database.writing() as connection:
+        vehicle = vehicle_id(connection, SPACECRAFT, "flight")
+        batch = batch_of_cut(octets, cut_packets(octets), replace(DICTIONARY, version=2), SPACECRAFT)
+        store_batch(connection, vehicle, batch)
+        repository.change(connection, repository.VEHICLES, vehicle, decoded_version=2)
+    pass_id = define_pass_of(ground, made)
+    before = states_of(ground, pass_id)
+    assert catch_up(ground, vehicle) > 0
+    after = states_of(ground, pass_id)
+    assert len(before) == len(after) == 8
+    np.testing.assert_array_equal(before.state, after.state)
+    np.testing.assert_array_equal(before.covariance, after.covariance)
+    with ground.database.reading() as connection:
+        table = repository.SAMPLES["filter_states"]
+        versions = set(connection.execute(select(table.c.dictionary_version)).scalars())
+    assert versions == {2, DICTIONARY.version}
 
 
 def test_the_report_weighs_errors_with_the_whole_covariance(
-    flown: tuple[Path, Any, int], tmp_path: Path
+    flown: tuple[Path, Any, int], ground: Ground
 ) -> None:
     _, made, version = flown
     folder = archive_with(made, anchored_packets(made, version))
-    with open_ground(tmp_path / "home") as ground:
-        report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
+    report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
     series = next(one for one in report.navigation if one.name == "anchored")
     # A hundredth of the error: the reference is interpolated, and places are reported on the sphere.
     np.testing.assert_allclose(series.nees, NEES, rtol=0.01)
@@ -178,7 +152,7 @@ def test_the_report_weighs_errors_with_the_whole_covariance(
     assert series.nis_dof is not None and series.nis_dof.tolist() == [24] * 8
 
 
-def test_sigmas_alone_give_a_sum_of_another_name(tmp_path: Path, make_pass: Any) -> None:
+def test_sigmas_alone_give_a_sum_of_another_name(ground: Ground, make_pass: Any) -> None:
     made = make_pass(frames=8, seed=3)
     octets = b"".join(anchored_packets(made, 3))
     states = [
@@ -187,8 +161,7 @@ def test_sigmas_alone_give_a_sum_of_another_name(tmp_path: Path, make_pass: Any)
         if DICTIONARY.unpack(packet)[0] == "navigation_state"
     ]
     folder = archive_with(made, states)
-    with open_ground(tmp_path / "home") as ground:
-        report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
+    report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
     series = next(one for one in report.navigation if one.name == "anchored")
     assert series.nees is None
     np.testing.assert_allclose(series.squared_normalised_errors, DIAGONAL, rtol=0.01)

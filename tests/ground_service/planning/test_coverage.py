@@ -14,6 +14,7 @@ from ground_service.missions.ephemerides.store import covering_ephemerides
 from ground_service.missions.service import add_mission
 from ground_service.planning.service import WindowEntry, add_window
 from lunar.timescales import parse_utc
+from tests.ground_service.conftest import add_reference
 
 OUTSIDE = parse_utc("2031-01-01T00:00:00Z")
 MISSION = """name = "covered"
@@ -27,7 +28,7 @@ def window(ephemeris_id: int | None = None) -> WindowEntry:
 
 
 def test_a_window_outside_the_ephemerides_has_no_prediction(ground: Ground, synthetic_pass: Any) -> None:
-    add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="reference")
+    add_reference(ground, synthetic_pass.folder / "reference.oem")
     predicted = add_window(ground, window(), actor="ann").predicted
     assert (predicted.frames, predicted.battery_minimum, predicted.downlinked_by) == (40, None, None)
 
@@ -35,7 +36,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction(ground: Ground, synt
 def test_a_window_whose_tables_need_the_ephemeris_is_refused_outside_it(
     ground: Ground, synthetic_pass: Any
 ) -> None:
-    add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="reference")
+    add_reference(ground, synthetic_pass.folder / "reference.oem")
     add_mission(ground, (MISSION + "[uploads]\n").encode())
     with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
         add_window(ground, window(), actor="ann")

@@ -14,7 +14,6 @@ from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import add_catalogue, withdraw_catalogue
-from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
 from ground_service.planning.filling import NS, Option, ResourceGrid, curves
@@ -23,6 +22,7 @@ from ground_service.planning.service import search_windows
 from ground_service.planning.store import get_window
 from lunar.catalogue import CraterCatalogue, save_catalogue
 from lunar.timescales import parse_utc
+from tests.ground_service.conftest import add_reference
 
 START = parse_utc("2029-08-07T06:00:00Z")
 MISSION = """name = "small"
@@ -64,8 +64,7 @@ def test_curves_fill_and_empty_battery_and_storage() -> None:
 def planned(ground: Ground, synthetic_pass: Any) -> Ground:
     """A service with an ephemeris of half an hour and a mission of small resources."""
     add_mission(ground, MISSION.format(catalogue="").encode(), actor="ann")
-    stored = ground.files.put_file(synthetic_pass.folder / "reference.oem")
-    add_ephemeris(ground, stored, name="reference", precedence=0, actor="ann")
+    add_reference(ground, synthetic_pass.folder / "reference.oem")
     return ground
 
 

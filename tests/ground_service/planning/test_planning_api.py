@@ -10,6 +10,7 @@ from ground_service.app import create_app
 from ground_service.passes.span import Observation, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
+from tests.ground_service.conftest import event_packet
 from tests.serving import TestClient
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -237,12 +238,7 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
     client.post(f"{V1}/windows/{key}/uplink")
     client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
     for count, seconds in zip(received, (1700, 1920 + last_s), strict=True):
-        packet = DICTIONARY.pack(
-            "event_info",
-            {"event_id": "mode_changed", "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
-            ticks=int(ticks_from_utc_ns(START + seconds * NS)),
-            sequence_count=count,
-        )
+        packet = event_packet(int(ticks_from_utc_ns(START + seconds * NS)), count)
         stream = encode_cadus([packet], spacecraft_id=76)
         assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
     assert client.get(f"{V1}/windows/{key}").json()["state"] == expected

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,17 +14,16 @@ from ground_service.contacts.commanding.service import get_command, list_telecom
 from ground_service.errors import InvalidInput, NotFound, PlanConflicts
 from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
-from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
-from ground_service.planning.model import WindowEntry, WindowFilter
+from ground_service.planning.model import Window, WindowEntry, WindowFilter
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
 from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
 from ground_service.worker.follow_up import follow_in_process
-from tests.ground_service.conftest import START, Clock, save_circle
+from tests.ground_service.conftest import START, Clock, add_reference, save_circle
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 NS = 10**9
@@ -71,9 +70,7 @@ def now(mission_time: Clock) -> Clock:
 @pytest.fixture(params=["sqlite", "postgresql"])
 def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
     """An empty service on each database, which does not follow its events: only the tests plan."""
-    url = None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("migrated_postgres")()
+    url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as opened:
         yield opened
 
@@ -93,17 +90,16 @@ def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def prepare(ground: Ground, oem: Path, extra: str = AUTOMATIC + LINKS) -> None:
     add_mission(ground, MISSION.format(extra=extra).encode(), actor="ann")
-    add_ephemeris(ground, ground.files.put_file(oem), name="reference", precedence=0, actor="ann")
+    add_reference(ground, oem)
+
+
+def windows_of(ground: Ground) -> list[Window]:
+    """All windows in the order of their start."""
+    return sorted(ground.read(list_windows, WindowFilter()).items, key=lambda one: one.start.utc_ns)
 
 
 def request(ground: Ground, **changes: object) -> int:
-    values = {
-        "name": "low Sun",
-        "spacecraft_id": 76,
-        "windows": 2,
-        "period_days": 7.0,
-        "horizon_days": 1.0,
-    } | changes
+    values = {"name": "low Sun", "spacecraft_id": 76, "windows": 2, "horizon_days": 1.0} | changes
     return standing.add_request(ground, StandingRequestIn.model_validate(values), actor="ann").id
 
 
@@ -113,7 +109,7 @@ def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, oem
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
     left = [one.reason for one in ground.read(get_plan, key).candidates if one.outcome == "rejected"]
     assert "the telecommands of 1 windows wait on board" in left
-    now.utc_ns = ground.read(list_windows, WindowFilter()).items[0].stop.utc_ns + HOUR
+    now.utc_ns = windows_of(ground)[0].stop.utc_ns + HOUR
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
 
 
@@ -122,7 +118,7 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     key = request(either)
     done = standing.plan_tick(either, now.utc_ns)
     assert done == {"failed": 0, "added": 2, "approved": 2, "released": 2}
-    windows = either.read(list_windows, WindowFilter()).items
+    windows = windows_of(either)
     assert {one.request_id for one in windows} == {key}
     for one in windows:
         assert one.state == "approved" and one.start.utc_ns >= now.utc_ns + standing.LEAD_NS
@@ -147,10 +143,10 @@ def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Clock) -
     prepare(either, oem)
     request(either)
     standing.plan_tick(either, now.utc_ns)
-    first = either.read(list_windows, WindowFilter())
+    first = windows_of(either)
     for later in (0, 600, 1200):
         assert sum(standing.plan_tick(either, now.utc_ns + later * NS).values()) == 0
-    assert either.read(list_windows, WindowFilter()) == first
+    assert windows_of(either) == first
 
 
 def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Clock) -> None:
@@ -166,8 +162,7 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
     prepare(either, oem)
     key = request(either)
     standing.plan_tick(either, now.utc_ns)
-    windows = either.read(list_windows, WindowFilter()).items
-    first = min(windows, key=lambda one: one.start.utc_ns)
+    first = windows_of(either)[0]
     now.utc_ns = first.start.utc_ns
     done = standing.plan_tick(either, now.utc_ns)
     assert (done["failed"], done["added"]) == (1, 1)
@@ -188,12 +183,12 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     prepare(either, oem)
     request(either)
     standing.plan_tick(either, now.utc_ns)
-    first = min(either.read(list_windows, WindowFilter()).items, key=lambda one: one.start.utc_ns)
+    first = windows_of(either)[0]
     with either.database.writing() as connection:
         window = store.get_record(connection, first.id)
         assert store.change_window(connection, window, state="failed", reason="a telecommand of it failed")
     assert standing.plan_tick(either, now.utc_ns)["added"] == 1
-    second = max(either.read(list_windows, WindowFilter()).items, key=lambda one: one.id)
+    second = max(windows_of(either), key=lambda one: one.id)
     assert (second.start, second.stop) == (first.start, first.stop)
     monkeypatch.setattr("ground_service.planning.progress.received_frames", lambda *_: 5)
     advance_windows(either, 1)
@@ -227,12 +222,11 @@ def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_relea
     prepare(ground, oem, LINKS)
     request(ground, windows=2)
     assert standing.plan_tick(ground, now.utc_ns) == {"failed": 0, "added": 2, "approved": 0, "released": 0}
-    windows = ground.read(list_windows, WindowFilter()).items
+    windows = windows_of(ground)
     assert {one.state for one in windows} == {"draft"}
-    last = max(windows, key=lambda one: one.start.utc_ns)
+    first, last = windows
     planning.change_window(ground, last.id, actor="bob", changes={}, decision="approved")
     assert standing.plan_tick(ground, now.utc_ns)["released"] == 1
-    first = min(windows, key=lambda one: one.start.utc_ns)
     assert standing.plan_tick(ground, first.start.utc_ns)["failed"] == 1
     assert ground.read(get_window, first.id).reason == standing.NOT_APPROVED
 
@@ -241,7 +235,7 @@ def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Cloc
     closed = 'outages = ["2029-08-07T00:00:00Z/2029-08-07T18:00:00Z"]\nminimum_elevation_deg = 0.0\n'
     text = MISSION.format(extra=AUTOMATIC + LINKS).replace("minimum_elevation_deg = 0.0\n", closed)
     add_mission(ground, text.encode(), actor="ann")
-    add_ephemeris(ground, ground.files.put_file(oem), name="reference", precedence=0, actor="ann")
+    add_reference(ground, oem)
     key = request(ground)
     standing.plan_tick(ground, now.utc_ns)
     plan = ground.read(get_plan, key)
@@ -266,7 +260,7 @@ def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem
     standing.plan_tick(ground, now.utc_ns)
     plan = ground.read(get_plan, key)
     assert plan.reason is not None and plan.reason.startswith("the reference ephemeris ends at 2029-08-10")
-    windows = ground.read(list_windows, WindowFilter()).items
+    windows = windows_of(ground)
     assert windows
     for one in windows:
         assert one.predicted.latitude_deg is not None
@@ -281,7 +275,7 @@ def test_sequences_of_windows_do_not_overlap(ground: Ground, oem: Path, now: Clo
     prepare(ground, oem, ONE_PERSON + LINKS + UPLOADS)
     request(ground, windows=9, minimum_duration_s=200.0, maximum_duration_s=400.0)
     standing.plan_tick(ground, now.utc_ns)
-    windows = sorted(ground.read(list_windows, WindowFilter()).items, key=lambda one: one.start.utc_ns)
+    windows = windows_of(ground)
     between = [(b.start.utc_ns - a.stop.utc_ns) / NS for a, b in pairwise(windows)]
     # One sequence ends 20 s after its window, and the next begins 60 s before its own.
     assert len(windows) == 9 and min(between) == 81.0
@@ -291,7 +285,7 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem:
     prepare(ground, oem, LINKS + UPLOADS)
     request(ground, windows=1)
     standing.plan_tick(ground, now.utc_ns)
-    (window,) = ground.read(list_windows, WindowFilter()).items
+    (window,) = windows_of(ground)
     planning.change_window(ground, window.id, actor=standing.PLANNER, changes={}, decision="approved")
     assert standing.plan_tick(ground, now.utc_ns)["released"] == 0
     reason = ground.read(get_window, window.id).reason
@@ -306,7 +300,7 @@ def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Clock
     )
     request(ground, windows=20, minimum_duration_s=200.0)
     standing.plan_tick(ground, now.utc_ns)
-    windows = ground.read(list_windows, WindowFilter()).items
+    windows = windows_of(ground)
     spans = [one.predicted.latitude_deg for one in windows]
     assert windows and all(span is not None and span.min > -50.1 and span.max < 50.1 for span in spans)
     sun = [one.predicted.sun_elevation_deg for one in windows]
@@ -343,7 +337,7 @@ def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, 
     standing.change_request(ground, key, StandingRequestChange(state="active", terms=terms), actor="ann")
     assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
     standing.delete_request(ground, key, actor="ann")
-    assert [one.request_id for one in ground.read(list_windows, WindowFilter()).items] == [None]
+    assert [one.request_id for one in windows_of(ground)] == [None]
     with pytest.raises(NotFound):
         ground.read(get_request, key)
 
@@ -362,17 +356,9 @@ def test_processes_that_plan_at_the_same_time_make_one_plan(
     grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]
     prepare(grounds[0], oem)
     key = request(grounds[0])
-    added: list[int] = []
-    threads = [
-        threading.Thread(target=lambda one=one: added.append(standing.plan_tick(one, now.utc_ns)["added"]))
-        for one in grounds
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(120)
-    assert sorted(added) == [0, 0, 0, 2]
-    assert grounds[0].read(list_windows, WindowFilter()).total == 2
+    with ThreadPoolExecutor(4) as pool:
+        added = list(pool.map(lambda one: standing.plan_tick(one, now.utc_ns)["added"], grounds))
+    assert sorted(added) == [0, 0, 0, 2] and len(windows_of(grounds[0])) == 2
     with grounds[0].database.reading() as connection:
         assert request_store.get_request_record(connection, key).plans == 1
     for one in grounds:

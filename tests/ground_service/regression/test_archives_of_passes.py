@@ -50,7 +50,7 @@ from tests.ground_service.conftest import (
     FlyablePass,
     SyntheticPass,
     encode_downlink,
-    write_manifest,
+    enter_files,
 )
 
 REPLAY = KeptReplay(
@@ -137,9 +137,7 @@ def test_images_that_the_ground_did_not_store_are_left_out(
     for number in range(4):
         image = Image.fromarray(np.full((512, 512), 90 + number, np.uint8))
         image.save(folder / f"frames/{number:06d}.png")
-    manifest = json.loads((folder / "manifest.json").read_text())
-    del manifest["files"]
-    write_manifest(folder, manifest)
+    enter_files(folder)
     monkeypatch.setattr("ground_service.passes.archive_import.FRAMES_KEPT", 2)
     pass_id = import_archive(ground, folder)
     [kept] = kept_archives(ground)
@@ -184,11 +182,9 @@ def unrendered(flown: FlyablePass, tmp_path: Path) -> Path:
     """An archive without two of its frames, whose scenario is not one."""
     folder = tmp_path / "unrendered"
     shutil.copytree(flown.folder, folder)
-    manifest = json.loads((folder / "manifest.json").read_text())
-    del manifest["files"]
     (folder / "frames/000001.png").unlink()
     (folder / "frames/000003.png").unlink()
-    write_manifest(folder, {**manifest, "scenario_toml": "no scenario"})
+    enter_files(folder, scenario_toml="no scenario")
     return folder
 
 
@@ -236,13 +232,6 @@ def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
     assert outcome.verdict == "pass"
     alone = run_regression(ground, [whole.folder], build, build, load_policy())
     assert [repr(gate) for gate in outcome.gates] == [repr(gate) for gate in alone.gates]
-
-
-def changed(folder: Path, **values: Any) -> None:
-    """Change keys of the manifest of an archive, and enter the files of its folder."""
-    manifest = json.loads((folder / "manifest.json").read_text())
-    del manifest["files"]
-    write_manifest(folder, {**manifest, **values})
 
 
 @pytest.mark.parametrize(
@@ -313,7 +302,7 @@ def test_an_archive_that_cannot_be_rendered_is_settled_once(
     ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (unrendered / "downlink.cadu").unlink()
-    changed(unrendered)
+    enter_files(unrendered)
     first = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
     assert first.reason.count("no received detections") == 1
     assert rendering.settle_archive(ground, first.digest, again=True) == first
@@ -371,14 +360,14 @@ def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
     folder = tmp_path / "pass"
     shutil.copytree(flown.folder, folder)
     (folder / "payload/detections.jsonl").write_text("")
-    changed(folder)
+    enter_files(folder)
     with pytest.raises(InvalidInput, match="received detections only where frames are missing"):
         keep_archive(ground, folder)
     write_flight_view(folder, tmp_path / "view")
     assert (tmp_path / "view/frames/000000.png").is_file()
     assert not (tmp_path / "view/payload/detections.jsonl").exists()
     (folder / "frames/000001.png").unlink()
-    changed(folder)
+    enter_files(folder)
     write_flight_view(folder, tmp_path / "partial")
     assert (tmp_path / "partial/payload/detections.jsonl").is_file()
     assert not (tmp_path / "partial/frames").exists()

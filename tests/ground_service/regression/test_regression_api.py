@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from ground_service.access.service import add_user
 from ground_service.client.local import local_client
 from ground_service.ground import open_ground
 from ground_service.regression.archives import pack_archive
@@ -99,16 +98,13 @@ def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
 
 
 def test_only_an_administrator_registers_a_program(
-    client: TestClient, make_build: Callable, tmp_path: Path
+    guarded: Any, make_build: Callable, tmp_path: Path
 ) -> None:
-    ground = client.app.state.ground
-    tokens = {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
+    client, heads = guarded
     body = zipped(make_build("program").parent, tmp_path / "b.zip")
     found = {
-        role: client.post(
-            f"{V1}/builds", content=body, headers={"Authorization": f"Bearer {token}"}
-        ).status_code
-        for role, token in tokens.items()
+        role: client.post(f"{V1}/builds", content=body, headers=one).status_code
+        for role, one in heads.items()
     }
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
 

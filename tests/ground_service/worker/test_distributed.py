@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,17 +28,14 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.database import (
-    open_database,
     prepare_database,
 )
-from ground_service.store.models import METADATA
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import app as app_module
 from ground_service.worker.app import queued_jobs, run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import run_job
 from tests.ground_service.archive_hash import archive_hash
-from tests.ground_service.schema import described_schema
 from tests.serving import wait_for
 
 SPACECRAFT = 76
@@ -68,17 +65,6 @@ def upgraded(postgres_url: str) -> str:
 def ground_on_postgres(upgraded: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
     with open_ground(tmp_path_factory.mktemp("pg") / "home", database_url=upgraded) as ground:
         yield ground
-
-
-def test_a_migrated_database_has_the_schema_of_the_models(
-    upgraded: str, ground_on_postgres: Ground, new_postgres_database: Callable[[], str]
-) -> None:
-    made = open_database(new_postgres_database())
-    with made.writing() as connection:
-        METADATA.create_all(connection)
-    migrated = described_schema(ground_on_postgres.database)
-    assert migrated == described_schema(made)
-    made.engine.dispose()
 
 
 def test_the_archive_is_the_same_as_on_sqlite(

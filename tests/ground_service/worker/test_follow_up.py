@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -103,11 +103,8 @@ def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground) ->
             with either.database.writing() as connection:
                 log.publish(connection, "test", {"seed": seed, "k": k})
 
-    threads = [threading.Thread(target=write, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(4)))
     found = events.read_events(either.database, 0, 1000)
     assert [event.number for event in found] == list(range(1, 41))
     for seed in range(4):
@@ -191,11 +188,8 @@ def test_several_processes_handle_each_event_once(
             say(ground, CommandsSent(vehicle_id=first + k, telecommands=(1,)))
             assert ("advance windows", first + k) in recorded.done  # complete before the caller continues
 
-    threads = [threading.Thread(target=run, args=(ground, 100 * k)) for k, ground in enumerate(grounds)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(run, grounds, (0, 100, 200)))
     assert len(recorded.done) == len(set(recorded.done)) == 24
     assert position(grounds[0]) == 24
     for ground in grounds:

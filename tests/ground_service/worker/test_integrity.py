@@ -14,6 +14,7 @@ from ground_service.store.models import ROLLUPS
 from ground_service.store.rows import table_digests
 from ground_service.worker.integrity import verify
 from ground_service.worker.integrity_store import same_values
+from tests.ground_service.conftest import event_packet
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -21,11 +22,9 @@ SPACECRAFT = 76
 
 
 def stream_of(spacecraft: int, count: int = 40) -> bytes:
-    values = {"event_id": "boot", "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
-    packets = [
-        DICTIONARY.pack("event_info", values, ticks=k << 16, sequence_count=k) for k in range(1, count + 1)
-    ]
-    return encode_cadus(packets, spacecraft_id=spacecraft)
+    return encode_cadus(
+        [event_packet(k << 16, k, "boot") for k in range(1, count + 1)], spacecraft_id=spacecraft
+    )
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,8 @@ from lunar.errors import DataFileError, EphemerisError, UnknownFrameError, Unkno
 from lunar.frames import icrf_from_j2000
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.stk import format_stk, parse_stk
-from lunar.timescales import NS, format_utc, parse_utc
-
-START = parse_utc("2029-08-07T00:00:00")
+from lunar.timescales import NS, format_utc
+from tests.lunar.orbits import START, circle, times
 
 EXAMPLE = """\
 stk.v.11.0
@@ -46,10 +45,7 @@ END Ephemeris
 
 def states(n, start_s=0.0):
     elapsed = start_s + np.arange(n) * 30.0
-    angle = elapsed * 2 * np.pi / 6672.0
-    position = 1_768_180.0 * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
-    velocity = 1665.0 * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
-    return START + np.rint(elapsed * NS).astype(np.int64), position, velocity
+    return times(elapsed), *circle(elapsed)
 
 
 def test_the_example_is_read_with_units_bias_and_segments():

@@ -8,7 +8,6 @@ import pytest
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, flown
 from tests.payload_emulator.flight.test_dynamics import start_state
 from tmtc.errors import TableError
@@ -80,29 +79,3 @@ def test_a_burn_is_flown_at_its_time_and_not_before(model: OrbitModel) -> None:
     before = flown(model, state, START, START + 599 * SECOND, TABLE)
     coasted = flown(model, state, START, START + 599 * SECOND, no_burns())
     np.testing.assert_array_equal(before, coasted)
-
-
-def test_a_burn_adds_its_change_and_its_own_uncertainty_and_nothing_else() -> None:
-    errors = kalman.CommonErrors()
-    state = kalman.initial_filter_state(
-        START, start_state()[:3], start_state()[3:6], 10.0, 0.01, (1e-9,) * 3, errors
-    )
-    after = kalman.burn(state, KICK, 0.05)
-    np.testing.assert_allclose(after.mean - state.mean, np.r_[0, 0, 0, KICK, np.zeros(12)], atol=1e-12)
-    added = after.covariance - state.covariance
-    np.testing.assert_allclose(np.diag(added)[3:6], 0.0025, rtol=1e-9)
-    added[3:6, 3:6] = 0.0
-    assert not np.any(added)
-
-
-def test_widening_adds_to_place_and_velocity_only() -> None:
-    errors = kalman.CommonErrors()
-    state = kalman.initial_filter_state(
-        START, start_state()[:3], start_state()[3:6], 10.0, 0.01, (1e-9,) * 3, errors
-    )
-    wide = kalman.widened(state, 1_000.0, 1.0)
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(wide.covariance)[:6]), [1_000.05] * 3 + [1.00005] * 3, rtol=1e-6
-    )
-    np.testing.assert_array_equal(wide.mean, state.mean)
-    assert np.array_equal(wide.covariance[6:, 6:], state.covariance[6:, 6:])

@@ -257,23 +257,19 @@ def test_ground_without_a_product_is_registered_from_its_rims(tmp_path: Path) ->
     assert "not registered" in _registration_name(terrain, beneath(-40.0, 100.0), times)[0]
 
 
-def test_a_registration_of_other_files_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("changes_list", "message"),
+    [
+        (True, r"registration.json: expected a catalogue with SHA-256 .*make it again"),
+        (False, r"flat_128ppd_000E_\+15.tif with SHA-256 .* found another file"),
+    ],
+)
+def test_a_registration_of_other_files_is_refused(tmp_path: Path, changes_list: bool, message: str) -> None:
     data = folder_of(tmp_path)
     assert data.catalogue_lu is not None
-    with data.catalogue_lu.open("a") as file:
-        file.write("\n")
-    with pytest.raises(
-        TerrainError, match=r"registration.json: expected a catalogue with SHA-256 .*make it again"
-    ):
-        find_registration(data, data.catalogue_lu, data.dem_tiles)
-
-
-def test_a_registration_of_another_raster_is_refused(tmp_path: Path) -> None:
-    data = folder_of(tmp_path)
-    assert data.catalogue_lu is not None
-    with data.dem_tiles[0].open("ab") as file:
-        file.write(b"\0")
-    with pytest.raises(TerrainError, match=r"flat_128ppd_000E_\+15.tif with SHA-256 .* found another file"):
+    with (data.catalogue_lu if changes_list else data.dem_tiles[0]).open("ab") as file:
+        file.write(b"\n")
+    with pytest.raises(TerrainError, match=message):
         find_registration(data, data.catalogue_lu, data.dem_tiles)
 
 

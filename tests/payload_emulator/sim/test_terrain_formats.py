@@ -166,27 +166,17 @@ def test_jpeg_2000_of_16_bits(tmp_path):
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
 
 
-def test_a_raster_of_another_body_is_refused(tmp_path):
-    path = write_tiff(
-        tmp_path / "earth.tif",
-        rasterio.Affine(0.1, 0, 0, 0, -0.1, 10),
-        np.zeros((9, 9), "int16"),
-        "EPSG:4326",
-    )
-    with pytest.raises(
-        TerrainError, match=r"earth\.tif: expected a raster of the Moon .* found a body of 6378"
-    ):
-        open_layers([path])
-
-
-def test_pixels_longer_than_wide_are_refused(tmp_path):
-    path = write_tiff(
-        tmp_path / "long.tif",
-        rasterio.Affine(0.1, 0, 0, 0, -0.2, 10),
-        np.zeros((9, 9), "int16"),
-        "+proj=longlat +R=1737400 +no_defs",
-    )
-    with pytest.raises(TerrainError, match="expected square pixels in degrees"):
+@pytest.mark.parametrize(
+    ("crs", "height_deg", "message"),
+    [
+        ("EPSG:4326", 0.1, r"a\.tif: expected a raster of the Moon .* found a body of 6378"),
+        ("+proj=longlat +R=1737400 +no_defs", 0.2, "expected square pixels in degrees"),
+    ],
+)
+def test_a_raster_of_another_body_and_pixels_longer_than_wide_are_refused(tmp_path, crs, height_deg, message):
+    transform = rasterio.Affine(0.1, 0, 0, 0, -height_deg, 10)
+    path = write_tiff(tmp_path / "a.tif", transform, np.zeros((9, 9), "int16"), crs)
+    with pytest.raises(TerrainError, match=message):
         open_layers([path])
 
 

@@ -53,11 +53,17 @@ def verdicts(definition: str, packets: list[bytes]) -> list[str]:
     return [VERDICTS[v] for v in decoded(definition, packets).verdict.tolist()]
 
 
+def values(definition: str, packets: list[bytes], name: str = "P") -> dict[str, list]:
+    """Values of packets of one container."""
+    columns = decoded(definition, packets).tables[name].columns
+    return {name: column.to_list() for name, column in columns.items()}
+
+
 def one(types: str, parameters: dict[str, str], entries: list[str], data: bytes) -> dict[str, list]:
     """Values of one packet of a container without header."""
-    found = decoded(document(types, parameters, container("P", entries)), [data])
-    assert found.verdict.tolist() == [0], found.counts()
-    return {name: column.to_list() for name, column in found.tables["P"].columns.items()}
+    text = document(types, parameters, container("P", entries))
+    assert verdicts(text, [data]) == ["decoded"]
+    return values(text, [data])
 
 
 # against an interpreter of another project
@@ -202,17 +208,12 @@ def test_a_spline_says_nothing_outside_its_points_unless_told_to():
     on = calibrated("T", 8, "unsigned", default(foreign.spline(points, 1, True)))
     packets = [bytes((k,)) for k in (9, 10, 19, 20, 25, 40, 41)]
 
-    def values(types: str) -> list[float]:
-        return (
-            decoded(document(types, {"A": "T"}, container("P", ["A"])), packets)
-            .tables["P"]
-            .columns["A"]
-            .to_list()
-        )
+    def read(types: str) -> list[float]:
+        return values(document(types, {"A": "T"}, container("P", ["A"])), packets)["A"]
 
-    assert values(steps) == [1.0, 1.0, 3.0, 3.0, 5.0]
-    assert values(lines) == [1.0, 2.8, 3.0, 3.5, 5.0]
-    assert values(on) == pytest.approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
+    assert read(steps) == [1.0, 1.0, 3.0, 3.0, 5.0]
+    assert read(lines) == [1.0, 2.8, 3.0, 3.5, 5.0]
+    assert read(on) == pytest.approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
     assert verdicts(document(lines, {"A": "T"}, container("P", ["A"])), packets)[::6] == ["malformed"] * 2
 
 
@@ -222,10 +223,16 @@ def test_a_code_without_a_name_stays_a_number_and_ranges_of_codes_share_one():
         '<Enumeration value="1" label="ONE"/><Enumeration value="10" maxValue="19" label="TEENS"/>'
         "</EnumerationList></EnumeratedParameterType>"
     )
-    found = decoded(
-        document(types, {"A": "E"}, container("P", ["A"])), [bytes((k,)) for k in (0, 1, 2, 9, 10, 19, 20)]
-    )
-    assert found.tables["P"].columns["A"].to_list() == [0, "ONE", 2, 9, "TEENS", "TEENS", 20]
+    text = document(types, {"A": "E"}, container("P", ["A"]))
+    assert values(text, [bytes((k,)) for k in (0, 1, 2, 9, 10, 19, 20)])["A"] == [
+        0,
+        "ONE",
+        2,
+        9,
+        "TEENS",
+        "TEENS",
+        20,
+    ]
 
 
 # texts and octets
@@ -247,8 +254,7 @@ def test_a_text_may_say_its_length_itself():
     types = text_type(size) + integer("N", 8)
     text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
     packets = [struct.pack(">H", 8 * len(t)) + t + b"\x07" for t in (b"", b"x", "µx".encode(), b"y" * 98)]
-    columns = decoded(text, packets).tables["P"].columns
-    assert columns["A"].to_list() == ["", "x", "µx", "y" * 98] and columns["B"].to_list() == [7] * 4
+    assert values(text, packets) == {"A": ["", "x", "µx", "y" * 98], "B": [7] * 4}
     wrong = [
         struct.pack(">H", 8 * 99) + b"y" * 99 + b"\x07",  # beyond maxSizeInBits
         struct.pack(">H", 12) + b"yyyy",  # no whole octets
@@ -263,8 +269,8 @@ def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
     size = YAMCS_TAG.format(most=80, end="<TerminationChar>00</TerminationChar>")
     types = text_type(size) + integer("N", 8)
     text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
-    columns = decoded(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"]).tables["P"].columns
-    assert columns["A"].to_list() == ["", "ab", "abcdefghi"] and columns["B"].to_list() == [5, 6, 7]
+    found = values(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"])
+    assert found == {"A": ["", "ab", "abcdefghi"], "B": [5, 6, 7]}
     assert verdicts(text, [b"abc", b"abcdefghijk\0\x07"]) == ["malformed", "malformed"]
 
 
@@ -284,7 +290,7 @@ def test_zeros_at_the_end_of_a_text_belong_to_it(charset):
         expected = [one * 2 for one in expected]
     expected += [one.replace("\0", "z") for one in expected] * 3
     packets = [one.encode(charset) for one in expected]
-    assert decoded(text, packets).tables["P"].columns["A"].to_list() == expected
+    assert values(text, packets)["A"] == expected
 
 
 def test_texts_and_octets_that_begin_inside_an_octet_are_read():
@@ -311,7 +317,7 @@ def test_a_size_may_be_looked_up():
     )
     text = document(types, {"N": "N", "B": "B"}, container("P", ["N", "B"]))
     packets = [b"\x01a", b"\x02abc", b"\x03abc"]
-    assert decoded(text, packets).tables["P"].columns["B"].to_list() == [b"a", b"abc"]
+    assert values(text, packets)["B"] == [b"a", b"abc"]
     assert verdicts(text, packets) == ["decoded", "decoded", "malformed"]
 
 
@@ -385,8 +391,8 @@ def test_elements_of_odd_width_begin_anywhere():
             bits.add(value, 11)
         bits.add(21, 5)
         packets.append(bits.add(0, -bits.count % 8).packed())
-    columns = decoded(text, packets).tables["P"].columns
-    assert columns["a"].to_list() == rows and columns["z"].to_list() == [21] * 5
+    found = values(text, packets)
+    assert found["a"] == rows and found["z"] == [21] * 5
 
 
 def test_arrays_of_two_dimensions_are_lists_of_lists_the_last_index_moving_fastest():
@@ -420,16 +426,16 @@ def test_arrays_in_arrays_of_which_there_are_none_are_empty():
     types = integer("N", 8) + array_type("A", "N", dimension("n"))
     types += aggregate("ROW", {"k": "N", "a": "A"}) + array_type("B", "ROW", dimension("n"))
     text = document(types, {"n": "N", "b": "B"}, container("P", ["n", "b"]))
-    assert decoded(text, [b"\0"]).tables["P"].columns["b"].to_list() == [[]]
-    two = decoded(text, [b"\0", bytes((2, 7, 1, 2, 8, 3, 4))]).tables["P"].columns["b"]
-    assert two.to_list() == [[], [{"k": 7, "a": [1, 2]}, {"k": 8, "a": [3, 4]}]]
+    assert values(text, [b"\0"])["b"] == [[]]
+    two = values(text, [b"\0", bytes((2, 7, 1, 2, 8, 3, 4))])["b"]
+    assert two == [[], [{"k": 7, "a": [1, 2]}, {"k": 8, "a": [3, 4]}]]
 
 
 def test_no_packet_with_an_element_gives_empty_arrays():
     tagged = YAMCS_TAG.format(most=800, end='<LeadingSize sizeInBitsOfSizeTag="8"/>')
     types = integer("N", 8) + text_type(tagged) + array_type("A", "T", dimension("n"))
     text = document(types, {"n": "N", "a": "A"}, container("P", ["n", "a"]))
-    assert decoded(text, [b"\0", b"\0"]).tables["P"].columns["a"].to_list() == [[], []]
+    assert values(text, [b"\0", b"\0"])["a"] == [[], []]
     assert decoded(text, []).tables == {}
 
 
@@ -458,8 +464,7 @@ def test_entries_may_stand_at_places_counted_from_the_start_or_from_the_entry_be
         "P", ["t", location("d", "containerStart", 0), location("e", "previousEntry", 40)], "BASE"
     )
     text = document(types, dict.fromkeys("abde", "N") | {"c": "W", "t": "T"}, base + child)
-    columns = decoded(text, [bytes((0, 1, 2, 65, 66, 5, 6, 7))]).tables["P"].columns
-    assert {name: column.to_list() for name, column in columns.items()} == {
+    assert values(text, [bytes((0, 1, 2, 65, 66, 5, 6, 7))]) == {
         "a": [1], "b": [65], "c": [0x0102], "t": ["AB"], "d": [0], "e": [6],
     }  # fmt: skip
     before = document(types, {"a": "N"}, container("P", [location("a", "previousEntry", -8)]))
@@ -490,14 +495,10 @@ def test_entries_under_a_condition_are_there_or_not():
         struct.pack(">BBHHIB", 1, 1, 300, 600, 6, 5),
     ]
     table = decoded(text, packets).tables["P"]
-    assert {name: column.to_list() for name, column in table.columns.items()} == {
-        "Mode": [0, 1, 0, 1],
-        "Flag": [0, 0, 1, 1],
-        "Data1": [None, 100, None, 300],
-        "Data2": [None, None, 200, 600],
-        "Always": [9, 8, 7, 6],
-        "Last": [None, None, None, 5],
-    }
+    assert values(text, packets) == {
+        "Mode": [0, 1, 0, 1], "Flag": [0, 0, 1, 1], "Data1": [None, 100, None, 300], "Data2": [None, None, 200, 600],
+        "Always": [9, 8, 7, 6], "Last": [None, None, None, 5],
+    }  # fmt: skip
     assert table.unread_bits.tolist() == [0] * 4 and isinstance(table.columns["Data1"], OptionalColumn)
     assert verdicts(text, [b"\x01\x00\x05", *packets]) == ["too_short", *["decoded"] * 4]
 
@@ -513,13 +514,7 @@ def test_a_container_in_a_container_begins_where_it_stands():
         dict.fromkeys("axyz", "N"),
         part + container("P", ["a", '<ContainerRefEntry containerRef="PART"/>', "z"]),
     )
-    found = decoded(text, [bytes((1, 2, 3, 4))])
-    assert {name: column.to_list() for name, column in found.tables["P"].columns.items()} == {
-        "a": [1],
-        "x": [2],
-        "y": [3],
-        "z": [4],
-    }
+    assert values(text, [bytes((1, 2, 3, 4))]) == {"a": [1], "x": [2], "y": [3], "z": [4]}
 
 
 def test_names_in_nested_systems_are_found_by_path_and_told_apart():
@@ -535,13 +530,8 @@ def test_names_in_nested_systems_are_found_by_path_and_told_apart():
         + "</ContainerSet></TelemetryMetaData></SpaceSystem>"
     )
     text = document("", {"x": "dt/u8", "z": "dt/u8"}, container("root", ["x"], abstract=True), more=inner)
-    columns = decoded(text, [bytes((7, 8, 9, 10))]).tables["event"].columns
-    assert {name: column.to_list() for name, column in columns.items()} == {
-        "/BUS/x": [7],
-        "/BUS/PUS5/x": [8],
-        "y": [9],
-        "w": [10],
-    }
+    expected = {"/BUS/x": [7], "/BUS/PUS5/x": [8], "y": [9], "w": [10]}
+    assert values(text, [bytes((7, 8, 9, 10))], "event") == expected
 
 
 def test_definitions_may_be_spread_over_documents():
@@ -574,13 +564,7 @@ def test_a_packet_is_decoded_by_one_container_or_told_why_not():
         space_packet(9, b"\x01\x02\x03", 0),
     ]
     found = decoded(text, packets)
-    assert [VERDICTS[v] for v in found.verdict.tolist()] == [
-        "decoded",
-        "ambiguous",
-        "decoded",
-        "too_short",
-        "decoded",
-    ]
+    assert verdicts(text, packets) == ["decoded", "ambiguous", "decoded", "too_short", "decoded"]
     assert found.tables["A"].unread_bits.tolist() == [0, 16]
     assert found.counts() == {
         "decoded": 3, "no_container": 0, "ambiguous": 1, "too_short": 1, "malformed": 0, "damaged": 0,
@@ -630,10 +614,9 @@ def test_an_element_that_its_calibrator_does_not_cover_condemns_its_packet_alone
     types = integer("N", 8) + element + array_type("A", "E", dimension("n"))
     text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
     packets = [bytes((2, 10, 20, 1)), bytes((3, 30, 101, 40, 2)), bytes((1, 100, 3)), bytes((0, 4))]
-    found = decoded(text, packets)
-    assert [VERDICTS[v] for v in found.verdict.tolist()] == ["decoded", "malformed", "decoded", "decoded"]
-    columns = found.tables["P"].columns
-    assert columns["a"].to_list() == [[5.0, 10.0], [50.0], []] and columns["z"].to_list() == [1, 3, 4]
+    assert verdicts(text, packets) == ["decoded", "malformed", "decoded", "decoded"]
+    found = values(text, packets)
+    assert found["a"] == [[5.0, 10.0], [50.0], []] and found["z"] == [1, 3, 4]
 
 
 def test_every_truncation_of_every_packet_is_a_verdict():

@@ -33,7 +33,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
 from tests.ground_service.archive_hash import archive_hash
-from tests.ground_service.conftest import Clock
+from tests.ground_service.conftest import START, Clock, add_reference
 from tests.ground_service.contacts.links.conftest import Station, declare, operated
 from tests.serving import wait_for
 from tmtc.uplink import UplinkDecoder
@@ -76,6 +76,18 @@ def packets_of(octets: bytes) -> list[bytes]:
 
 def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
     return [bytes(get_command(ground, key).record.octets or b"") for key in keys]
+
+
+def sent_to(station: Station) -> list[bytes]:
+    return packets_of(bytes(station.telecommands))
+
+
+def wait_for_telecommands(ground: Ground, station: Station, keys: list[int]) -> None:
+    wait_for(lambda: sent_to(station) == octets_of(ground, keys), f"the telecommands {keys}")
+
+
+def wait_for_state(ground: Ground, state: str) -> None:
+    wait_for(lambda: service.get_link(ground, "lab").state == state, f"the state {state}")
 
 
 def received_of(ground: Ground) -> int:
@@ -189,24 +201,20 @@ def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
     keys = released(either, 3)
     with operated(either) as runner:
         connection = station.accept()
-        wait_for(lambda: service.get_link(either, "lab").state == "connected", "the connection")
+        wait_for_state(either, "connected")
         steps(runner)
         assert not station.telecommands and runner.commands_unsent == 3
         connection.sendall(stream)
-        wait_for(
-            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
-        )
+        wait_for_telecommands(either, station, keys)
         wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
         wait_for(lambda: runner.octets_received == len(stream), "the telemetry")
         mission_time.advance(3600.0)
         wait_for(lambda: contact_events(either)[-1] == "contact ended", "the end of the contact")
         more = released(either)
         steps(runner)
-        assert len(packets_of(bytes(station.telecommands))) == 3
+        assert len(sent_to(station)) == 3
         connection.sendall(stream[: 2 * CADU])
-        wait_for(
-            lambda: packets_of(bytes(station.telecommands))[3:] == octets_of(either, more), "the next contact"
-        )
+        wait_for_telecommands(either, station, keys + more)
     assert contact_events(either).count("contact started") == 2
     ended = [one for one in read_events(either.database, 0, 10_000) if one.kind == "contact ended"]
     assert (ended[0].payload["octets"], ended[0].payload["telecommands"]) == (len(stream), 3)
@@ -219,16 +227,14 @@ def test_manual_links_send_on_request_only(ground: Ground, station: Station, str
     keys = released(ground)
     with operated(ground) as runner:
         station.accept().sendall(stream[: 3 * CADU])
-        wait_for(lambda: service.get_link(ground, "lab").state == "contact", "the contact")
+        wait_for_state(ground, "contact")
         steps(runner)
         assert not station.telecommands
         assert service.request_send(ground, "lab", actor="ann").unsent == 1
-        wait_for(
-            lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, keys), "the telecommand"
-        )
+        wait_for_telecommands(ground, station, keys)
         later = released(ground)
         steps(runner)
-        assert len(packets_of(bytes(station.telecommands))) == 1
+        assert len(sent_to(station)) == 1
         assert get_command(ground, later[0]).state == "released"
     with pytest.raises(NotFound):
         service.request_send(ground, "other", actor="ann")
@@ -253,15 +259,13 @@ def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(
     assert service.take_transmissions(either, declared, "dead") == []
     with operated(either) as runner:
         station.accept().sendall(stream[: 3 * CADU])
-        wait_for(lambda: service.get_link(either, "lab").state == "contact", "the contact")
+        wait_for_state(either, "contact")
         steps(runner)
         assert not station.telecommands
         with pytest.raises(Conflict, match="link lab: spacecraft 76 is on hold"):
             service.request_send(either, "lab", actor="ann")
         resume_spacecraft(either, 76, "flight", actor="ann")
-        wait_for(
-            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
-        )
+        wait_for_telecommands(either, station, keys)
 
 
 def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
@@ -274,11 +278,9 @@ def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
     assert service.get_link(either, "lab").unconfirmed == 1
     with operated(either, "living") as runner:
         station.accept().sendall(stream[: 3 * CADU])
-        wait_for(
-            lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands"
-        )
+        wait_for_telecommands(either, station, keys)
         steps(runner)
-        assert len(packets_of(bytes(station.telecommands))) == 2
+        assert len(sent_to(station)) == 2
     assert service.get_link(either, "lab").unconfirmed == 0
 
 
@@ -307,7 +309,7 @@ def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_conta
             rows = [stream[k * CADU : (k + 1) * CADU] for k in range(4 * contact, 4 * contact + 4)]
             connection.sendall(rows[0] + rows[1])
             wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
-            wait_for(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
+            wait_for(lambda n=wanted: len(sent_to(station)) == n, "the transmission")
             wait_for(
                 lambda: not ground.read(store.pending_transmissions, "lab"), "the record of the transmission"
             )
@@ -320,7 +322,7 @@ def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_conta
                 lambda n=contact: contact_events(ground).count("contact ended") == n + 1,
                 "the end of the contact",
             )
-        sent = packets_of(bytes(station.telecommands))
+        sent = sent_to(station)
     assert sent == octets_of(ground, keys) * service.REPEAT_ATTEMPTS
 
 
@@ -390,9 +392,7 @@ def test_expired_telecommands_are_not_sent(ground: Ground, station: Station, str
             repository.change(connection, repository.TELECOMMANDS, key, send_before_utc_ns=before)
     with operated(ground) as runner:
         station.accept().sendall(stream[: 3 * CADU])
-        wait_for(
-            lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, [timely]), "the telecommand"
-        )
+        wait_for_telecommands(ground, station, [timely])
         wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
     assert get_command(ground, late).state == "released"
 
@@ -441,7 +441,7 @@ def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(
         connection = station.accept()
         connection.sendall(stream[: 3 * CADU])
         connection.close()
-        wait_for(lambda: service.get_link(ground, "lab").state == "failed", "the state")
+        wait_for_state(ground, "failed")
         assert service.get_link(ground, "lab").reason == "closed by the station"
 
 
@@ -489,13 +489,9 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
     share: float,
     missed: int,
 ) -> None:
-    from ground_service.missions.ephemerides.service import add_ephemeris
-    from tests.ground_service.conftest import START
-
     both = station.link('station = "here"') + station.link('station = "here"').replace('"lab"', '"other"')
     declare(ground, PLACES + both)
-    stored = ground.files.put_file(synthetic_pass.folder / "reference.oem")
-    add_ephemeris(ground, stored, name="reference", precedence=0, actor="ann")
+    add_reference(ground, synthetic_pass.folder / "reference.oem")
     lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
     mission_time.utc_ns = START - 500 * 10**9
     (contact, _) = service.list_contacts(ground, mission_time.utc_ns, START + 1000 * 10**9).contacts
@@ -513,12 +509,8 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
 def test_missed_contacts_are_recorded_once_with_the_reason(
     either: Ground, station: Station, synthetic_pass: Any, mission_time: Clock
 ) -> None:
-    from ground_service.missions.ephemerides.service import add_ephemeris
-    from tests.ground_service.conftest import START
-
     declare(either, PLACES + station.link('station = "here"'))
-    stored = either.files.put_file(synthetic_pass.folder / "reference.oem")
-    add_ephemeris(either, stored, name="reference", precedence=0, actor="ann")
+    add_reference(either, synthetic_pass.folder / "reference.oem")
     declared = service.declared_links(either)["lab"]
     mission_time.utc_ns = START - 500 * 10**9
     found = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9)
