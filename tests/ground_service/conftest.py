@@ -116,6 +116,17 @@ class SyntheticPass:
     missed: int
 
 
+class Downlink:
+    """Packets of a payload with the sequence counts of their APIDs."""
+
+    def __init__(self) -> None:
+        self.sequencer, self.packets = PacketSequencer(), list[bytes]()
+
+    def send(self, name: str, values: dict[str, Any], ticks: int) -> None:
+        count = self.sequencer.next(DICTIONARY.packet(name).apid)
+        self.packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=count))
+
+
 def encode_downlink(packets: list[bytes]) -> bytes:
     """CADUs of the synthetic spacecraft."""
     return encode_cadus(packets, spacecraft_id=SPACECRAFT)
@@ -188,12 +199,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
         save_catalogue(catalogue, folder / "catalogue.csv")
 
         classes = size_class(catalogue.diameter_m)
-        sequencer, packets = PacketSequencer(), []
-        tally = {"expected": 0, "missed": 0}
-
-        def send(name: str, values: dict[str, Any], ticks: int) -> None:
-            apid = DICTIONARY.packet(name).apid
-            packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=sequencer.next(apid)))
+        sent, tally = Downlink(), {"expected": 0, "missed": 0}
 
         for k in range(frames):
             ticks = int(ticks_from_utc_ns(int(utc_ns[k])))
@@ -224,7 +230,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                 "sigma_px": np.full(len(seen) + 1, 1.0),
             }
             frame = {"frame_number": k, "image_ticks": ticks}
-            send("detections", {**frame, "image_quality": 0, "items": items}, ticks + 100)
+            sent.send("detections", {**frame, "image_quality": 0, "items": items}, ticks + 100)
             since = k - (RESET_FRAME if k >= RESET_FRAME else 0)
             flown = [
                 (0, np.array([0.0, PAPER_DRIFT_PER_FRAME_M * since, 0.0])),
@@ -236,51 +242,26 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                 filtered = estimator == 2
                 rtn = rtn_from_inertial(position[k], velocity[k])
                 place = spherical_from_mcmf(rotation[k] @ (position[k] + rtn.T @ error))
-                send(
-                    "navigation_state",
-                    {
-                        **frame,
-                        "estimator": estimator,
-                        "outcome": "fixed" if filtered else "multi",
-                        "latitude_deg": float(np.degrees(place[0])),
-                        "longitude_deg": float(np.degrees(place[1])),
-                        "altitude_m": float(place[2]),
-                        "velocity_icrf_m_s": [np.nan] * 3,
-                        "sigma_rtn_m": [1.0] * 3 if filtered else [np.nan] * 3,
-                        "nis": filter_nis if filtered else np.nan,
-                        "matched": 5,
-                    },
-                    ticks + 200 + estimator,
-                )
-                reset = (
-                    {0: "initialization", RESET_FRAME: "safety_timeout"}.get(k, "none")
-                    if estimator == 0
-                    else "none"
-                )
-                send(
-                    "frame_outcome",
-                    {
-                        **frame,
-                        "estimator": estimator,
-                        "outcome": "fixed" if filtered else "multi",
-                        "reset_trigger": reset,
-                        "detections": len(seen) + 1,
-                        "candidate_pairs": 9,
-                        "pairs": 5,
-                        "shift_east_m": 0.0,
-                        "shift_north_m": 24_500.0,
-                        "anchor_reads": (1 + (k >= RESET_FRAME)) if estimator == 0 else int(not filtered),
-                    },
-                    ticks + 300 + estimator,
-                )
-            send("housekeeping", _housekeeping(k), ticks + 400)
-        send(
-            "event_info",
-            {"event_id": "observation_stopped", "frame_number": frames, "value_1": 0.0, "value_2": 0.0},
-            ticks + 500,
-        )
+                solution = {**frame, "estimator": estimator, "outcome": "fixed" if filtered else "multi"}
+                state = {
+                    "latitude_deg": float(np.degrees(place[0])), "longitude_deg": float(np.degrees(place[1])),
+                    "altitude_m": float(place[2]), "velocity_icrf_m_s": [np.nan] * 3,
+                    "sigma_rtn_m": [1.0 if filtered else np.nan] * 3, "nis": filter_nis if filtered else np.nan,
+                    "matched": 5,
+                }  # fmt: skip
+                sent.send("navigation_state", solution | state, ticks + 200 + estimator)
+                resets = {0: "initialization", RESET_FRAME: "safety_timeout"} if estimator == 0 else {}
+                outcome = {
+                    "reset_trigger": resets.get(k, "none"), "detections": len(seen) + 1, "candidate_pairs": 9,
+                    "pairs": 5, "shift_east_m": 0.0, "shift_north_m": 24_500.0,
+                    "anchor_reads": (1 + (k >= RESET_FRAME)) if estimator == 0 else int(not filtered),
+                }  # fmt: skip
+                sent.send("frame_outcome", solution | outcome, ticks + 300 + estimator)
+            sent.send("housekeeping", _housekeeping(k), ticks + 400)
+        values = {"event_id": "observation_stopped", "frame_number": frames, "value_1": 0.0, "value_2": 0.0}
+        sent.send("event_info", values, ticks + 500)
 
-        (folder / "downlink.cadu").write_bytes(encode(packets))
+        (folder / "downlink.cadu").write_bytes(encode(sent.packets))
         start = {
             "utc": format_utc(int(utc_ns[0])),
             "position_icrf_m": list(position[0]),
@@ -288,33 +269,18 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
         }
         if mission:
             (folder / "mission.toml").write_text(mission)
-        write_manifest(
-            folder,
-            {
-                "schema_version": 1,
-                "pass_name": "synthetic pass",
-                "spacecraft_id": SPACECRAFT,
-                "scenario": "synthetic",
-                "seed": seed,
-                "build": {
-                    "name": "nothing",
-                    "version": "0",
-                    "model_sha256": "00" * 32,
-                    "parameters_sha256": "11" * 32,
-                },
-                "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
-                "start_utc": format_utc(int(utc_ns[0])),
-                "stop_utc": format_utc(int(utc_ns[-1])),
-                "cadence_s": CADENCE_S,
-                "frames_expected": frames,
-                "light": "paper",
-                "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},
-                "estimators": ["paper", "spherical"],
-                "start_state": start,
-                "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12},
-            },
-        )
-        return SyntheticPass(folder, packets, utc_ns, tally["expected"], tally["missed"])
+        build = {"name": "nothing", "version": "0", "model_sha256": "00" * 32, "parameters_sha256": "11" * 32}
+        manifest = {
+            "schema_version": 1, "pass_name": "synthetic pass", "spacecraft_id": SPACECRAFT, "scenario": "synthetic",
+            "seed": seed, "build": build, "start_utc": format_utc(int(utc_ns[0])),
+            "stop_utc": format_utc(int(utc_ns[-1])), "cadence_s": CADENCE_S, "frames_expected": frames,
+            "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
+            "light": "paper", "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},
+            "estimators": ["paper", "spherical"], "start_state": start,
+            "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12},
+        }  # fmt: skip
+        write_manifest(folder, manifest)
+        return SyntheticPass(folder, sent.packets, utc_ns, tally["expected"], tally["missed"])
 
     return make
 
@@ -325,10 +291,8 @@ def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != "manifest.json":
             octets = path.read_bytes()
-            files[str(path.relative_to(folder))] = {
-                "sha256": hashlib.sha256(octets).hexdigest(),
-                "bytes": len(octets),
-            }
+            entry = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+            files[str(path.relative_to(folder))] = entry
     (folder / "manifest.json").write_text(json.dumps({**manifest, "files": files}))
 
 
@@ -356,15 +320,10 @@ def define_pass_of(ground: Ground, made: Any) -> int:
 
 def _housekeeping(k: int) -> dict[str, Any]:
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
-    values.update(
-        structure_id=1,
-        boot_count=1,
-        mode="observing",
-        frames_processed=k,
-        temperature_c=20.0 + 0.1 * k,
-        bus_voltage_v=12.0,
-    )
-    return values
+    return values | {
+        "structure_id": 1, "boot_count": 1, "mode": "observing", "frames_processed": k,
+        "temperature_c": 20.0 + 0.1 * k, "bus_voltage_v": 12.0,
+    }  # fmt: skip
 
 
 @pytest.fixture(scope="session")
@@ -418,14 +377,8 @@ def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., Flyab
         rows = []
         for k in range(frames):
             (folder / f"frames/{k:06d}.png").write_bytes(buffer.getvalue())
-            rows.append(
-                {
-                    "frame": k,
-                    "ticks": int(ticks_from_utc_ns(int(made.utc_ns[k]))),
-                    "image": f"frames/{k:06d}.png",
-                    "shape": [512, 512],
-                }
-            )
+            ticks = int(ticks_from_utc_ns(int(made.utc_ns[k])))
+            rows.append({"frame": k, "ticks": ticks, "image": f"frames/{k:06d}.png", "shape": [512, 512]})
         (folder / "payload/inputs.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         (folder / "payload/parameters.toml").write_text("")
         (folder / "payload/dictionary.json").write_text(format_dictionary(DICTIONARY))
@@ -500,24 +453,8 @@ def redis_url() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as folder:
         users = Path(folder) / "users.acl"
         users.write_text(f"user default off\nuser linna on >tests ~* &* {rights}\n")
-        server = subprocess.Popen(
-            [
-                program,
-                "--aclfile",
-                str(users),
-                "--port",
-                str(port),
-                "--bind",
-                "127.0.0.1",
-                "--dir",
-                folder,
-                "--save",
-                "",
-                "--appendonly",
-                "no",
-            ],
-            stdout=subprocess.DEVNULL,
-        )
+        words = f"--aclfile {users} --port {port} --bind 127.0.0.1 --dir {folder} --appendonly no".split()
+        server = subprocess.Popen([program, *words, "--save", ""], stdout=subprocess.DEVNULL)
 
         def answers() -> bool:
             with socket.socket() as probe:

@@ -114,12 +114,8 @@ def test_passes_are_listed_in_pages_and_shown(client: TestClient) -> None:
 
 
 def test_a_pass_can_be_defined(client: TestClient) -> None:
-    given = {
-        "name": "p",
-        "start": "2029-08-07T06:00:00Z",
-        "stop": "2029-08-07T07:00:00Z",
-        "spacecraft_id": 76,
-    }
+    span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T07:00:00Z"}
+    given = {"name": "p", "spacecraft_id": 76, **span}
     assert client.post(f"{V1}/passes", json=given).status_code == 201
     assert is_problem(client.post(f"{V1}/passes", json={**given, "stop": "2029-08-07T05:00:00Z"}), 422)
     assert is_problem(client.post(f"{V1}/passes", json={**given, "start": "noon"}), 422)
@@ -324,18 +320,10 @@ def test_what_happens_is_sent_live_and_can_be_caught_up_with(
 def test_a_socket_opens_whose_server_announces_the_client_late(client: TestClient) -> None:
     """The first message of a socket may come after its handler started; nothing else may take it."""
     scope: dict[str, Any] = {
-        "type": "websocket",
-        "scheme": "ws",
-        "path": f"{V1}/live",
-        "raw_path": f"{V1}/live".encode(),
-        "root_path": "",
-        "query_string": b"",
-        "headers": [(b"host", b"testserver")],
-        "subprotocols": [],
-        "client": ("testclient", 50000),
-        "server": ("testserver", 80),
-        "extensions": {},
-    }
+        "type": "websocket", "scheme": "ws", "path": f"{V1}/live", "raw_path": f"{V1}/live".encode(), "root_path": "",
+        "query_string": b"", "headers": [(b"host", b"testserver")], "subprotocols": [], "extensions": {},
+        "client": ("testclient", 50000), "server": ("testserver", 80),
+    }  # fmt: skip
 
     async def opened() -> dict[str, Any]:
         arriving: asyncio.Queue[Any] = asyncio.Queue()

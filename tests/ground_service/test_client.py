@@ -38,16 +38,9 @@ from tests.ground_service.conftest import event_packet
 from tmtc.downlink import encode_cadus
 
 EPHEMERIS = {
-    "id": 1,
-    "name": "reference.oem",
-    "object_name": "SELENITA",
-    "frame": "ICRF",
-    "start": "2029-08-07T00:00:00.000000Z",
-    "stop": "2029-08-07T01:00:00.000000Z",
-    "states": 241,
-    "precedence": 0,
-    "sha256": "0" * 64,
-}
+    "id": 1, "name": "reference.oem", "object_name": "SELENITA", "frame": "ICRF", "states": 241, "precedence": 0,
+    "start": "2029-08-07T00:00:00.000000Z", "stop": "2029-08-07T01:00:00.000000Z", "sha256": "0" * 64,
+}  # fmt: skip
 MIB = 1 << 20
 
 
@@ -260,15 +253,9 @@ def passes_of(total: int, asked: list[tuple[int, int]]) -> Callable[[httpx.Reque
     def answer(request: httpx.Request) -> httpx.Response:
         limit, offset = int(request.url.params["limit"]), int(request.url.params["offset"])
         asked.append((limit, offset))
+        span = {"start": "2029-08-07T00:00:00Z", "stop": "2029-08-07T01:00:00Z"}
         items = [
-            {
-                "id": number,
-                "name": "p",
-                "spacecraft_id": 76,
-                "instance": "flight",
-                "start": "2029-08-07T00:00:00Z",
-                "stop": "2029-08-07T01:00:00Z",
-            }
+            {"id": number, "name": "p", "spacecraft_id": 76, "instance": "flight", **span}
             for number in range(offset, min(offset + limit, total))
         ]
         return httpx.Response(200, json={"items": items, "total": total, "limit": limit, "offset": offset})

@@ -88,19 +88,15 @@ def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> di
 
 def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
     with ground.database.writing() as connection:
-        repository.add(
-            connection,
-            repository.CORRELATIONS,
-            vehicle_id=vehicle,
-            method="test",
-            start_ticks=0,
-            stop_ticks=1,
-            reference_ticks=0,
-            reference_utc_ns=0,
-            drift_ppb=0.0,
-            points=2,
-            created_utc_ns=created_utc_ns,
-        )
+        line = {
+            "start_ticks": 0,
+            "stop_ticks": 1,
+            "reference_ticks": 0,
+            "reference_utc_ns": 0,
+            "drift_ppb": 0.0,
+        }
+        given = {"vehicle_id": vehicle, "method": "test", "points": 2, "created_utc_ns": created_utc_ns}
+        repository.add(connection, repository.CORRELATIONS, **line, **given)
 
 
 def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str, set[str]]) -> None:
@@ -305,21 +301,22 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
         [program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False
     )
     assert checked.returncode == 0, checked.stderr
-    healthy = [
-        {"series": 'up{job="linna"}', "values": "1x200"},
-        {"series": "linna_scheduler", "values": "1x200"},
-        {"series": "linna_backup_age_seconds", "values": "3600x200"},
-        {"series": "linna_backup_configured", "values": "1x200"},
-        {"series": 'probe_ssl_earliest_cert_expiry{job="linna-proxy"}', "values": f"{15 * 86_400}x200"},
-        {"series": "linna_queue_age_seconds", "values": "30x200"},
-        {"series": 'linna_processes{kind="worker"}', "values": "2x200"},
-        {"series": 'linna_broker_up{kind="redis"}', "values": "1x200"},
-        {"series": 'linna_runner_up{kind="exchange"}', "values": "1x200"},
-        {"series": "linna_disagreements", "values": "0x200"},
-        {"series": "linna_disk_free_bytes", "values": "50x200"},
-        {"series": "linna_disk_size_bytes", "values": "100x200"},
-        {"series": 'linna_jobs{state="failed",kind="report"}', "values": "2x200"},
-    ]
+    values = {
+        'up{job="linna"}': "1x200",
+        "linna_scheduler": "1x200",
+        "linna_backup_age_seconds": "3600x200",
+        "linna_backup_configured": "1x200",
+        'probe_ssl_earliest_cert_expiry{job="linna-proxy"}': f"{15 * 86_400}x200",
+        "linna_queue_age_seconds": "30x200",
+        'linna_processes{kind="worker"}': "2x200",
+        'linna_broker_up{kind="redis"}': "1x200",
+        'linna_runner_up{kind="exchange"}': "1x200",
+        "linna_disagreements": "0x200",
+        "linna_disk_free_bytes": "50x200",
+        "linna_disk_size_bytes": "100x200",
+        'linna_jobs{state="failed",kind="report"}': "2x200",
+    }
+    healthy = [{"series": series, "values": value} for series, value in values.items()]
     names = [rule["alert"] for rule in alerts()]
     tests: list[dict[str, Any]] = [
         {

@@ -183,7 +183,7 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
                 "--stop",
                 "2029-08-07T06:20:00Z",
                 "--spacecraft-id",
-                76,
+                "76",
             ]
             number = do("plan", "add", *window)["id"]
             ask("plan", "add", *window)
@@ -224,16 +224,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             do("report", 1, "--out", tmp_path / "report")
             ask("report", 2, "--out", tmp_path / "report")
             ask("performance", "show", "--spacecraft-id", 76)
-            ask(
-                "performance",
-                "report",
-                "--spacecraft-id",
-                76,
-                "--month",
-                "2031-01",
-                "--out",
-                tmp_path / "month",
-            )
+            month = ["--spacecraft-id", 76, "--month", "2031-01", "--out", tmp_path / "month"]
+            ask("performance", "report", *month)
             ask("performance", "list")
             ask("link", "list")
             ask("link", "contacts", "--since", "2029-08-07T00:00:00Z")

@@ -34,6 +34,7 @@ def text(kind: str) -> str:
     return render_html(_report(kind))
 
 
+@pytest.mark.parametrize("kind", ("pass", *KINDS), indirect=True)
 def test_the_page_is_whole_self_contained_and_repeatable(kind: str, text: str) -> None:
     page = Page(text)
     assert page.left_open == []

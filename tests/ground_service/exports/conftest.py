@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from tests.ground_service.conftest import (
     FILTER_ERROR_RTN_M,
     PIXEL_OFFSET,
+    Downlink,
     SyntheticPass,
     circular_states,
     encode_downlink,
@@ -28,7 +28,6 @@ from tests.ground_service.conftest import (
 )
 from tests.ground_service.evaluation.still import TurnedOrientation
 from tmtc.dictionary import DICTIONARY
-from tmtc.packets import PacketSequencer
 
 FRAMES = 12
 COVARIANCE = np.diag([100.0, 400.0, 900.0, 1e-4, 2e-4, 3e-4, 1e-12, 1e-12, 1e-12])
@@ -71,13 +70,7 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
     for k in range(0, FRAMES, 4):
         Image.fromarray(np.full((16, 16), 10 * k, np.uint8)).save(folder / "frames" / f"{k:06d}.png")
     catalogue = load_catalogue(folder / "catalogue.csv")
-    sequencer = PacketSequencer()
-    packets, craters = list(made.packets), []
-
-    def send(name: str, values: dict[str, Any], at: int) -> None:
-        apid = DICTIONARY.packet(name).apid
-        packets.append(DICTIONARY.pack(name, values, ticks=at, sequence_count=sequencer.next(apid)))
-
+    sent, craters = Downlink(), []
     for k, tick in enumerate(ticks.tolist()):
         uv = _detections(made.packets, tick)
         projected = PinholeCamera().project(
@@ -87,8 +80,8 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
         nearest = np.nanargmin(distance, axis=1)
         craters.append(catalogue.ids[nearest].tolist())
         items = {"detection": np.arange(len(nearest)), "crater_id": catalogue.ids[nearest]}
-        send("identifications", {"frame_number": k, "image_ticks": tick, "items": items}, tick + 600)
-        send(
+        sent.send("identifications", {"frame_number": k, "image_ticks": tick, "items": items}, tick + 600)
+        sent.send(
             "filter_state",
             {
                 "frame_number": k,
@@ -100,7 +93,7 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
             },
             tick + 700,
         )
-    (folder / "downlink.cadu").write_bytes(encode_downlink(packets))
+    (folder / "downlink.cadu").write_bytes(encode_downlink([*made.packets, *sent.packets]))
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["gravity"]["filter_orientation"] = TurnedOrientation().name
     write_manifest(folder, manifest)

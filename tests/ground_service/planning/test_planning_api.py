@@ -10,11 +10,10 @@ from ground_service.app import create_app
 from ground_service.passes.span import Observation, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import event_packet
+from tests.ground_service.conftest import Downlink, event_packet
 from tests.serving import TestClient
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets import PacketSequencer
 from tmtc.uplink import UplinkDecoder
 
 V1 = "/api/v1"
@@ -144,7 +143,7 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
     assert [packet.name for packet in packets] == ["enable_schedule", "insert_activity", "insert_activity"]
     inner = []
     for packet, seconds in zip(packets[1:], (60, 360), strict=True):
-        assert packet.values["release_ticks"] == int(ticks_from_utc_ns(START + seconds * NS))
+        assert packet.values["release_ticks"] == ticks_at(seconds)
         inner.append(DICTIONARY.unpack_command(bytes(packet.values["items"]["octet"].astype("u1"))))
     assert [one.values["function_id"] for one in inner] == [2, 3]
     assert (inner[0].values["argument_1"], inner[0].values["argument_2"]) == (310.0, 10.0)
@@ -168,31 +167,27 @@ def test_a_draft_or_a_failed_window_is_not_uplinked(client: TestClient) -> None:
     assert client.post(f"{V1}/windows/{after}/uplink").status_code == 409
 
 
-class Downlink:
+def ticks_at(seconds: float) -> int:
+    return int(ticks_from_utc_ns(START + int(seconds * NS)))
+
+
+class Observations(Downlink):
     """Packets of a payload; times in seconds after START."""
 
-    def __init__(self) -> None:
-        self.sequencer, self.packets = PacketSequencer(), list[bytes]()
-
-    def send(self, name: str, seconds: float, values: dict[str, Any]) -> None:
-        ticks, apid = int(ticks_from_utc_ns(START + int(seconds * NS))), DICTIONARY.packet(name).apid
-        count = self.sequencer.next(apid)
-        self.packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=count))
-
     def event(self, name: str, seconds: float, frame: int = 0, until: float | None = None) -> None:
-        planned = 0.0 if not until else float(ticks_from_utc_ns(START + int(until * NS)))
+        planned = float(ticks_at(until)) if until else 0.0
         values = {"event_id": name, "frame_number": frame, "value_1": planned, "value_2": 0.0}
-        self.send("event_info", seconds, values)
+        self.send("event_info", values, ticks_at(seconds))
 
     def images(self, first: int, times: range) -> None:
         for number, seconds in enumerate(times, first):
-            image = {"frame_number": number, "image_ticks": int(ticks_from_utc_ns(START + seconds * NS))}
-            self.send("detections", seconds, {**image, "image_quality": 0, "items": []})
+            image = {"frame_number": number, "image_ticks": ticks_at(seconds)}
+            self.send("detections", {**image, "image_quality": 0, "items": []}, ticks_at(seconds))
 
 
 def telemetry(frames: int = 5) -> list[bytes]:
     """What a payload sends about an observation that begins at START + 60 s and ends 60 s later."""
-    sent = Downlink()
+    sent = Observations()
     sent.event("observation_started", 60)
     sent.images(0, range(60, 60 + 15 * frames, 15))
     sent.event("observation_stopped", 120)
@@ -238,8 +233,7 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
     client.post(f"{V1}/windows/{key}/uplink")
     client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
     for count, seconds in zip(received, (1700, 1920 + last_s), strict=True):
-        packet = event_packet(int(ticks_from_utc_ns(START + seconds * NS)), count)
-        stream = encode_cadus([packet], spacecraft_id=76)
+        stream = encode_cadus([event_packet(ticks_at(seconds), count)], spacecraft_id=76)
         assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
     assert client.get(f"{V1}/windows/{key}").json()["state"] == expected
 
@@ -273,7 +267,7 @@ def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestC
     """Adjacent windows, one that was interrupted and begun again, and one whose images were lost."""
     spans = ((60, 120), (120, 180), (200, 260), (270, 330))
     keys = [approved(client, *span, cadence_s=10) for span in spans]
-    sent = Downlink()
+    sent = Observations()
 
     def observe(first: int, times: range, stop: float | None, until: float, lost: int = 0) -> None:
         sent.event("observation_started", times[0], first, until)

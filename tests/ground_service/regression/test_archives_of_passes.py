@@ -33,7 +33,7 @@ from ground_service.regression.archives import (
     store_of,
     write_flight_view,
 )
-from ground_service.regression.builds import load_build, register_build
+from ground_service.regression.builds import Build, load_build, register_build
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
@@ -54,17 +54,14 @@ from tests.ground_service.conftest import (
 )
 
 REPLAY = KeptReplay(
-    outcome="ok",
-    detail="",
-    downlink_sha256=None,
-    performance_sha256=None,
-    wall_s=1.0,
-    cpu_s=1.0,
-    peak_rss_mib=1.0,
-    isolation="",
-    machine="",
-)
+    outcome="ok", detail="", downlink_sha256=None, performance_sha256=None, wall_s=1.0, cpu_s=1.0, peak_rss_mib=1.0,
+    isolation="", machine="",
+)  # fmt: skip
 STOP = START + 600_000_000_000
+
+
+def good(ground: Ground, make_build: Callable, packets: dict[str, list[bytes]]) -> Build:
+    return register_build(ground, load_build(make_build("good", packets)))
 
 
 @pytest.fixture(scope="module")
@@ -80,17 +77,9 @@ def flown(make_flyable: Callable[..., FlyablePass]) -> FlyablePass:
 def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: SyntheticPass) -> None:
     _, digest = read_manifest(archive.folder)
     record = ArchiveRecord(
-        digest=digest,
-        name="synthetic pass",
-        frames=4,
-        frames_stored=4,
-        state="complete",
-        reason="",
-        octets=1,
-        pinned=True,
-        kept_since=UtcTime(0),
-        manifest_sha256="0" * 64,
-    )
+        digest=digest, name="synthetic pass", frames=4, frames_stored=4, state="complete", reason="", octets=1,
+        pinned=True, kept_since=UtcTime(0), manifest_sha256="0" * 64,
+    )  # fmt: skip
     with either.database.writing() as connection:
         store.keep_archive(connection, record)
     with local_client(either, "ann") as service:
@@ -194,7 +183,7 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     digest = keep_archive(either, unrendered).digest
     [kept] = kept_archives(either)
     assert (kept.frames, kept.frames_stored, kept.state, kept.reason) == (4, 2, "to render", "")
-    build = register_build(either, load_build(make_build("good", {"synthetic pass 5": flown.packets})))
+    build = good(either, make_build, {"synthetic pass 5": flown.packets})
     outcome = run_regression(either, [digest], build, build, load_policy())
     [kept] = kept_archives(either)
     assert kept.state == "telemetry only"
@@ -226,7 +215,7 @@ def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
     ground: Ground, unrendered: Path, make_flyable: Callable, make_build: Callable
 ) -> None:
     whole = make_flyable(frames=30, seed=41)
-    build = register_build(ground, load_build(make_build("good", {"synthetic pass 41": whole.packets})))
+    build = good(ground, make_build, {"synthetic pass 41": whole.packets})
     outcome = run_regression(ground, [whole.folder, unrendered], build, build, load_policy())
     assert [one.state for one in outcome.passes] == ["judged", "not judged"]
     assert outcome.verdict == "pass"
@@ -263,7 +252,7 @@ def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
     digest = keep_archive(ground, unrendered).digest
     with pytest.raises(rendering.RenderingFailed, match=f"found {found}"):
         rendering.settle_archive(ground, digest)
-    build = register_build(ground, load_build(make_build("good", {})))
+    build = good(ground, make_build, {})
     outcome = run_regression(ground, [digest], build, build, load_policy())
     assert [one.state for one in outcome.passes] == ["unusable"]
     assert outcome.verdict == "inconclusive"
@@ -315,7 +304,7 @@ def test_an_unchanged_archive_keeps_its_replays(
 ) -> None:
     digest = keep_archive(ground, unrendered).digest
     rendering.settle_archive(ground, digest)
-    build = register_build(ground, load_build(make_build("good", {})))
+    build = good(ground, make_build, {})
     with ground.database.writing() as connection:
         manifest = store.get_archive(connection, digest).manifest_sha256
         assert store.keep_replay(connection, digest, build.digest, REPLAY, 0, manifest_sha256=manifest)
@@ -332,7 +321,7 @@ def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
 ) -> None:
     digest = keep_archive(either, unrendered).digest
     assert rendering.settle_archive(either, digest).state == "telemetry only"
-    build = register_build(either, load_build(make_build("good", {"synthetic pass 5": flown.packets})))
+    build = good(either, make_build, {"synthetic pass 5": flown.packets})
     replayed, seen = service._replayed, []
 
     def render(_ground: Ground, _archive: PassArchive, out: Path) -> str:

@@ -38,7 +38,7 @@ from ground_service.regression.archives import kept_archives
 from ground_service.regression.pass_archives import LIVE
 from ground_service.worker import actions
 from ground_service.worker.actions import has_repetitions, repeat_due
-from ground_service.worker.automation.model import ActionFilter
+from ground_service.worker.automation.model import ActionFilter, AutomationAction
 from ground_service.worker.automation.service import decide, list_rules, record_actions, repeat
 from ground_service.worker.automation.store import list_automation_actions
 from ground_service.worker.dispatch import InlineDispatcher
@@ -126,9 +126,13 @@ def receive(ground: Ground, packets: list[bytes], folder: Path) -> None:
     ingest_file(ground, file, spacecraft_id=SPACECRAFT)
 
 
+def actions_of(ground: Ground, **equal: Any) -> list[AutomationAction]:
+    """Recorded actions, newest first."""
+    return list(ground.read(list_automation_actions, ActionFilter(**equal)).items)
+
+
 def recorded(ground: Ground, **equal: Any) -> list[tuple[str, str, str]]:
-    found = ground.read(list_automation_actions, ActionFilter(**equal)).items
-    return [(one.rule, one.action, one.state) for one in reversed(found)]
+    return [(one.rule, one.action, one.state) for one in reversed(actions_of(ground, **equal))]
 
 
 def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
@@ -166,7 +170,7 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(
         ("trends", "monthly_report", "done"),
         ("regression archive of a window", "keep_archive", "done"),
     ]
-    found = either.read(list_automation_actions, ActionFilter(pass_id=window.pass_id)).items
+    found = actions_of(either, pass_id=window.pass_id)
     log = {one.number: one for one in events.read_events(either.database, 0, 1000)}
     kept = found[0].result
     assert kept is not None and (kept["state"], kept["reason"]) == ("telemetry only", LIVE)
@@ -252,7 +256,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
         "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
     )
     assert [one for one in report["remarks"] if one.startswith(said)]
-    aligned = ground.read(list_automation_actions, ActionFilter()).items[-1]
+    aligned = actions_of(ground)[-1]
     assert aligned.result is not None and aligned.result["missing"]["camera"].startswith(said)
 
 
@@ -266,10 +270,8 @@ def test_an_event_that_is_handled_again_acts_once(
         if event.kind == WindowChanged.event_kind:
             record_actions(ground, event)
     assert recorded(ground) == before and ground.read(get_window, window_id).state == "processed"
-    made = [
-        one for one in events.read_events(ground.database, 0, 1000) if one.kind == PassEvaluated.event_kind
-    ]
-    assert len(made) == 1
+    kinds = [one.kind for one in events.read_events(ground.database, 0, 1000)]
+    assert kinds.count(PassEvaluated.event_kind) == 1
 
 
 def test_actions_that_a_process_left_are_done_by_the_next(
@@ -303,7 +305,7 @@ def test_a_failed_action_skips_those_after_it_and_states_why(
     monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
-    found = ground.read(list_automation_actions, ActionFilter()).items
+    found = actions_of(ground)
     why = "pass: expected a pass, found none (attempt 3 of 3)"
     assert [(one.action, one.state, one.error) for one in reversed(found)] == [
         ("align", "failed", why),
@@ -328,12 +330,7 @@ def test_a_failed_action_is_repeated_by_an_operator(
         window_id = prepared(either, flown)
         receive(either, flown.packets, tmp_path)
     assert [one[1:] for one in recorded(either)] == [("align", "failed"), ("report", "skipped")]
-    align = next(
-        one for one in either.read(list_automation_actions, ActionFilter()).items if one.action == "align"
-    )
-    report = next(
-        one for one in either.read(list_automation_actions, ActionFilter()).items if one.action == "report"
-    )
+    report, align = actions_of(either)
     with pytest.raises(StateConflict, match="expected state failed, found skipped"):
         repeat(either, report.id, actor="ann")
     with pytest.raises(StateConflict, match="expected state waiting, found failed"):
@@ -368,7 +365,7 @@ def test_a_report_that_failed_is_made_later(
         patched.setattr(actions, "make_report", broken)
         window_id = prepared(either, flown)
         receive(either, flown.packets, tmp_path)
-    report, align = either.read(list_automation_actions, ActionFilter()).items
+    report, align = actions_of(either)
     assert (align.state, report.state, report.attempts, len(attempts)) == ("done", "queued", 2, 2)
     assert report.error == "report: expected a renderer, found none" and report.next_attempt is not None
     assert either.read(get_window, window_id).state == "downlinked"
@@ -395,7 +392,7 @@ def test_actions_with_approval_wait_for_it(ground: Ground, flown: SyntheticPass,
     window_id = prepared(ground, flown, APPROVED)
     receive(ground, flown.packets, tmp_path)
     assert [one[1:] for one in recorded(ground)] == [("align", "waiting"), ("report", "waiting")]
-    waiting = ground.read(list_automation_actions, ActionFilter(state="waiting")).items
+    waiting = actions_of(ground, state="waiting")
     decided = decide(ground, waiting[-1].id, approve=True, actor="ann")
     assert decided.decided_by == "ann"
     assert [one[1:] for one in recorded(ground)] == [("align", "done"), ("report", "done")]
@@ -407,7 +404,7 @@ def test_actions_with_approval_wait_for_it(ground: Ground, flown: SyntheticPass,
 def test_refused_actions_are_not_done(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
     window_id = prepared(ground, flown, APPROVED)
     receive(ground, flown.packets, tmp_path)
-    waiting = ground.read(list_automation_actions, ActionFilter(state="waiting")).items
+    waiting = actions_of(ground, state="waiting")
     decide(ground, waiting[-1].id, approve=False, actor="ann")
     assert [one[1:] for one in recorded(ground)] == [("align", "refused"), ("report", "refused")]
     assert ground.read(get_window, window_id).state == "downlinked"
@@ -457,7 +454,7 @@ def test_a_report_that_is_requested_again_without_changes_is_kept(
     receive(ground, flown.packets, tmp_path)
     with ground.database.writing() as connection:
         publish(connection, WindowChanged(id=window_id, state="downlinked"))
-    found = ground.read(list_automation_actions, ActionFilter()).items
+    found = actions_of(ground)
     assert found[0].action == "report" and found[0].result is not None and found[0].result["unchanged"]
 
 
@@ -552,11 +549,7 @@ def test_a_processed_pass_is_searched_for_landmarks(
     receive(either, thin.packets, tmp_path)
     window = either.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
-    [searched] = [
-        one
-        for one in either.read(list_automation_actions, ActionFilter()).items
-        if one.action == "find_landmarks"
-    ]
+    [searched] = [one for one in actions_of(either) if one.action == "find_landmarks"]
     assert (searched.rule, searched.state, searched.pass_id) == (
         "learn from every pass",
         "done",

@@ -21,7 +21,6 @@ from ground_service.contacts.commanding.service import (
 from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
-from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
@@ -136,13 +135,6 @@ def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground) -> 
         connection.execute(table.update().values(sent_utc_ns=10**18))
     assert note_timeouts(ground, 10**18, 10**18 + 7 * 10**9) == []
     assert note_timeouts(ground, 10**18, 10**18 + 7 * 10**9 + 1) == [command]
-
-
-def test_a_job_entered_twice_is_one_job(ground: Ground) -> None:
-    first = enter_job(ground, "report", {"pass_id": 1}, job_id="0" * 32)
-    assert enter_job(ground, "report", {"pass_id": 1}, job_id="0" * 32) == first
-    with ground.database.reading() as connection:
-        assert repository.newest(connection, repository.JOBS, Paging())[1] == 1
 
 
 def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:

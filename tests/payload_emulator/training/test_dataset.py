@@ -143,11 +143,6 @@ def test_changed_labels_are_found_by_their_hash(copy):
     assert any("SHA-256" in problem for problem in check(copy))
 
 
-def test_a_folder_without_a_data_set_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match="expected a data set"):
-        store.Dataset(tmp_path)
-
-
 def test_a_data_set_of_another_schema_is_refused(copy):
     index = json.loads((copy / "dataset.json").read_text())
     index["schema_version"] = 99

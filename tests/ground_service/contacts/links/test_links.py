@@ -78,6 +78,10 @@ def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
     return [bytes(get_command(ground, key).record.octets or b"") for key in keys]
 
 
+def both_links(lab: Station, other: Station, more: str) -> str:
+    return lab.link(more) + other.link(more).replace('"lab"', '"other"')
+
+
 def sent_to(station: Station) -> list[bytes]:
     return packets_of(bytes(station.telecommands))
 
@@ -489,8 +493,7 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
     share: float,
     missed: int,
 ) -> None:
-    both = station.link('station = "here"') + station.link('station = "here"').replace('"lab"', '"other"')
-    declare(ground, PLACES + both)
+    declare(ground, PLACES + both_links(station, station, 'station = "here"'))
     add_reference(ground, synthetic_pass.folder / "reference.oem")
     lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
     mission_time.utc_ns = START - 500 * 10**9
@@ -615,10 +618,7 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
     """At a handover the link of the first station does not know yet that its contact has ended."""
     first, second = Confirming(*[0] * 1000), Confirming()
     try:
-        declare(
-            either,
-            first.link("confirm = true") + second.link("confirm = true").replace('"lab"', '"other"'),
-        )
+        declare(either, both_links(first, second, "confirm = true"))
         declared = service.declared_links(either)["other"]
         assert service.acquire(either, declared, "there", 15_000_000_000)
         other = LinkRunner(either, declared, "there")
@@ -655,10 +655,7 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
 
 def held_elsewhere(ground: Ground, station: Station) -> tuple[TransmissionRow, list[int], list[int]]:
     """Telecommands that the link "other" has taken and not sent, and later ones that any link may take."""
-    declare(
-        ground,
-        station.link("confirm = true") + station.link("confirm = true").replace('"lab"', '"other"'),
-    )
+    declare(ground, both_links(station, station, "confirm = true"))
     other = service.declared_links(ground)["other"]
     assert service.acquire(ground, other, "there", 15_000_000_000)
     earlier = released(ground, 2)
