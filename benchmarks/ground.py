@@ -120,8 +120,7 @@ def states(rows: int, queries: int = 40) -> dict[str, Any]:
     """Time down-sampled reads over a parameter, whole and in part, and reading all rows of a part."""
     ticks_a_row = 6_554  # ten a second
     with tempfile.TemporaryDirectory() as folder, open_ground(Path(folder)) as ground:
-        with ground.database.writing() as connection:
-            vehicle = vehicle_id(connection, 76, "flight")
+        vehicle = ground.write(vehicle_id, 76, "flight")
         first = int(ticks_from_utc_ns(START))
         rng = np.random.default_rng(1)
         for start in range(0, rows, STATE_BLOCK):
@@ -137,10 +136,9 @@ def states(rows: int, queries: int = 40) -> dict[str, Any]:
                 "estimator": np.zeros(count, dtype=np.int64),
                 "outcome": np.ones(count, dtype=np.int64),
             }
-            with ground.database.writing() as connection:
-                store_samples(
-                    connection, vehicle, DICTIONARY.version, {"navigation_states": columns}, number + 1
-                )
+            ground.write(
+                store_samples, vehicle, DICTIONARY.version, {"navigation_states": columns}, number + 1
+            )
         span_ns = rows * STEP_NS
         keys = []
         for part in range(queries):

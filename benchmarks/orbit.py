@@ -83,8 +83,7 @@ def rows() -> Iterator[Row]:
 
 
 def _kernels(field: GravityField) -> Iterator[Row]:
-    rng = np.random.default_rng(1)
-    positions = rng.standard_normal((EVALUATIONS, 3))
+    positions = np.random.default_rng(1).standard_normal((EVALUATIONS, 3))
     positions *= 1_768_000.0 / np.linalg.norm(positions, axis=1, keepdims=True)
     few = positions[: EVALUATIONS // 10]
     packed = _gravity_kernel.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m)

@@ -78,6 +78,16 @@ class Ground:
         with self.database.reading() as connection:
             return work(connection, *given, **named)
 
+    def write(
+        self,
+        work: Callable[Concatenate[Connection, Arguments], Result],
+        *given: Arguments.args,
+        **named: Arguments.kwargs,
+    ) -> Result:
+        """Return the result of a function of a store, called in a transaction that writes."""
+        with self.database.writing() as connection:
+            return work(connection, *given, **named)
+
     @contextmanager
     def alone(self, work: str) -> Iterator[None]:
         """Wait until no other thread or process does a piece of work, and keep others out.

@@ -115,5 +115,4 @@ def effect_of(
         function = arguments.get("function_id")
         label = _FUNCTION_NAMES.get(function, "unknown") if isinstance(function, int) else str(function)
         subject = f"{name}/{label}"
-    unknown = CommandEffect(subject, _DESTROYS, "unknown effect")
-    return EFFECTS.get(subject, unknown)
+    return EFFECTS.get(subject, CommandEffect(subject, _DESTROYS, "unknown effect"))

@@ -230,8 +230,7 @@ def _weigh(
     if code is not None:
         settings = replace(candidate, checksum=bool(held[good].sum() > good.sum() / 2))
     proved = good & held if settings.checksum else good
-    regular = are_regular(frames)
-    share = float(regular[proved].mean()) if proved.any() else 0.0
+    share = float(are_regular(frames)[proved].mean()) if proved.any() else 0.0
     first = int(np.argmax(proved)) if proved.any() else 0
     begin = int(sync.start_bits[first] >> 3)
     # enough octets for these CADUs and the gaps that a station may have inserted

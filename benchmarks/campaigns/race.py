@@ -303,8 +303,7 @@ class Campaign:
         return Request(state, "PATCH", path, f"bob{k % 2}", body)
 
     def _window(self, window: int) -> repository.Row:
-        with self.ground.database.reading() as connection:
-            return repository.get(connection, repository.WINDOWS, window, "window")
+        return self.ground.read(repository.get, repository.WINDOWS, window, "window")
 
     def _uplink_window(self, number: int) -> None:
         spacecraft = FIRST_SPACECRAFT + SPACECRAFT + number % SPACECRAFT
@@ -410,22 +409,21 @@ def prepare(ground: Ground, folder: Path) -> tuple[dict[str, str], tuple[str, st
         )
         builds.append(register_build(ground, load_build(place)).digest)
     now = utc_now_ns()
-    with ground.database.writing() as connection:
-        repository.add(
-            connection,
-            repository.REGRESSION_ARCHIVES,
-            digest="a" * 64,
-            name="race",
-            manifest_sha256="a" * 64,
-            frames=1,
-            frames_stored=1,
-            state="complete",
-            reason="",
-            octets=1,
-            pinned=1,
-            used_utc_ns=now,
-            created_utc_ns=now,
-        )
+    ground.write(
+        repository.add,
+        repository.REGRESSION_ARCHIVES,
+        digest="a" * 64,
+        name="race",
+        manifest_sha256="a" * 64,
+        frames=1,
+        frames_stored=1,
+        state="complete",
+        reason="",
+        octets=1,
+        pinned=1,
+        used_utc_ns=now,
+        created_utc_ns=now,
+    )
     return tokens, (builds[0], builds[1])
 
 

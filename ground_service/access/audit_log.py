@@ -16,8 +16,7 @@ def audit_head(ground: Ground) -> AuditHead:
     AuditBroken
         If its row is missing.
     """
-    with ground.database.reading() as connection:
-        head = chain.read_head(connection)
+    head = ground.read(chain.read_head)
     if head is None:
         raise AuditBroken("the head of the audit chain is missing; run 'linna verify'")
     return AuditHead(number=head.number, sha256=head.sha256)

@@ -66,18 +66,15 @@ def once(
     except StoreError:
         raise  # it may have been done all the same
     except GroundError:
-        with ground.database.writing() as connection:
-            store.free_key(connection, identity)
+        ground.write(store.free_key, identity)
         raise
-    with ground.database.writing() as connection:
-        store.set_answer(connection, identity, answer)
+    ground.write(store.set_answer, identity, answer)
     return answer
 
 
 def _take(ground: Ground, identity: str, asked: str) -> dict[str, Any] | None:
     """The answer that is known already; None when the key is now this caller's to use."""
-    with ground.database.writing() as connection:
-        known = store.take_key(connection, identity, asked, utc_now_ns())
+    known = ground.write(store.take_key, identity, asked, utc_now_ns())
     if known is None:
         return None
     if known.request != asked:

@@ -183,8 +183,7 @@ def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str 
 
 def list_users(ground: Ground) -> list[User]:
     """Return all users, by name."""
-    with ground.database.reading() as connection:
-        return store.list_users(connection)
+    return ground.read(store.list_users)
 
 
 def get_user(ground: Ground, name: str) -> User:
@@ -338,8 +337,7 @@ def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
     """Return who a caller is, and until when."""
     expires, provider = None, False
     if caller.token_id is not None:
-        with ground.database.reading() as connection:
-            token = store.get_token(connection, caller.token_id)
+        token = ground.read(store.get_token, caller.token_id)
         expires, provider = token.expires_utc_ns, token.provider_session is not None
     until = None if expires is None else UtcTime(expires)
     return Session(

@@ -81,8 +81,7 @@ def _store_catalogue(ground: Ground, mission: Mission, reference: Ephemeris, rec
     orientation = declared_frames(mission.frames, ground.data).orientation
     if orientation is None:
         raise InvalidInput(mission.name, "frames.orientation", "an available lunar orientation", "none")
-    camera = camera_of(mission.camera)
-    half_diagonal = math.sqrt(2.0) * math.tan(camera.fov_rad / 2.0)
+    half_diagonal = math.sqrt(2.0) * math.tan(camera_of(mission.camera).fov_rad / 2.0)
     reach = half_diagonal + math.tan(math.radians(abs(mission.camera.tilt_deg or 0.0)))
     step_ns = round(TRACK_STEP_S * NANOSECONDS_PER_SECOND)
     utc_ns = np.arange(record.start_utc_ns, record.stop_utc_ns + step_ns, step_ns, dtype=np.int64)

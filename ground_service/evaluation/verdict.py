@@ -215,9 +215,7 @@ def _converged_errors(series: NavigationSeries, limit_m: float | None) -> FloatA
 
 def _median(series: NavigationSeries | None) -> float | None:
     """Return the median error; None for a single frame, where the error is that of the start position."""
-    if series is None or len(series.utc_ns) < 2:
-        return None
-    return series.statistics.median_3d_m
+    return None if series is None or len(series.utc_ns) < 2 else series.statistics.median_3d_m
 
 
 def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:

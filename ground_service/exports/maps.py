@@ -164,7 +164,7 @@ def format_czml(inputs: PassInputs, poses: Poses, layers: tuple[Layer, ...], nam
         _track(
             one.estimator,
             one.utc_ns[known],
-            _positions(one.latitude_deg, one.longitude_deg, one.altitude_m)[known],
+            mcmf_from_spherical(*np.radians((one.latitude_deg, one.longitude_deg)), one.altitude_m)[known],
         )
         for one in inputs.navigation
         if np.count_nonzero(known := np.isfinite(one.altitude_m)) > 1
@@ -180,10 +180,6 @@ def format_czml(inputs: PassInputs, poses: Poses, layers: tuple[Layer, ...], nam
         elif layer.geometry == "Point":
             packets += _points(layer, shown)
     return json.dumps(packets, separators=(",", ":"), allow_nan=False)
-
-
-def _positions(latitude_deg: FloatArray, longitude_deg: FloatArray, altitude_m: FloatArray) -> FloatArray:
-    return mcmf_from_spherical(np.radians(latitude_deg), np.radians(longitude_deg), altitude_m)
 
 
 def _sampled(utc_ns: IntArray, values: FloatArray, decimals: int) -> tuple[str, list[float]]:

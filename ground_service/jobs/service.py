@@ -57,8 +57,7 @@ OTHER_REQUEST = "Idempotency-Key: expected the request that it was first sent wi
 
 def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
     """Enter a job to be done; its id. Entering the same id again changes nothing."""
-    with ground.database.writing() as connection:
-        return add_job(connection, kind, arguments, job_id=job_id)
+    return ground.write(add_job, kind, arguments, job_id=job_id)
 
 
 def add_job(

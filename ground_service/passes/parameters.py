@@ -274,8 +274,7 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
         There are more packets than one file may have.
     """
     with ground.database.reading() as connection:
-        record = store.get_pass(connection, pass_id)
-        span = pass_span(connection, record)
+        span = pass_span(connection, store.get_pass(connection, pass_id))
         if packet in {definition.name for definition in DICTIONARY.telemetry}:
             return format_records(_own_records(connection, span, packet), kind)
         return format_xtce_records(_declared_records(connection, span, packet), kind)
@@ -320,8 +319,7 @@ def packets_by_name(connection: Connection, span: PassSpan) -> Iterator[tuple[st
 
 
 def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
-    apid = DICTIONARY.packet(packet).apid
-    octets = sample_store.packet_octets(connection, span, apid)
+    octets = sample_store.packet_octets(connection, span, DICTIONARY.packet(packet).apid)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet,))
     records = packet_records(tables)
     if len(records) > RECORDS_LIMIT:

@@ -67,14 +67,12 @@ TREND_POINTS = 60
 
 def get_pass(ground: Ground, pass_id: int) -> PassDetail:
     """Return a pass with its spacecraft, mission and newest reports."""
-    with ground.database.reading() as connection:
-        return store.pass_detail(connection, pass_id)
+    return ground.read(store.pass_detail, pass_id)
 
 
 def keep_archive(ground: Ground, stored: StoredFile, name: str) -> None:
     """Add an uploaded pass archive to the files of the archive."""
-    with ground.database.writing() as connection:
-        register_file(connection, stored, "archive", name, utc_now_ns())
+    ground.write(register_file, stored, "archive", name, utc_now_ns())
 
 
 def define_pass(

@@ -396,9 +396,7 @@ class Planner:
             return BATTERY
         if candidate.storage_peak_octets > self.resources.storage_octets:
             return STORAGE
-        if constraints.needs_contact and candidate.downlinked_by_utc_ns is None:
-            return CONTACT
-        return None
+        return CONTACT if constraints.needs_contact and candidate.downlinked_by_utc_ns is None else None
 
 
 def in_regions(

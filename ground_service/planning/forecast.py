@@ -199,8 +199,7 @@ def _overlaps(windows: Sequence[Window], violations: dict[int, str]) -> list[Win
 
 def crater_density(ground: Ground, spacecraft_id: int) -> CraterDensity:
     """Return the crater density of the catalogue of the mission description in force."""
-    with ground.database.reading() as connection:
-        mission = service.mission_of(connection, spacecraft_id)
+    mission = ground.read(service.mission_of, spacecraft_id)
     low, high = DENSITY_DIAMETER_KM
     found = CraterDensity(
         source=None,

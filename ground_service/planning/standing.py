@@ -136,8 +136,7 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | N
     """
     now = mission_now_ns() if now_utc_ns is None else now_utc_ns
     done = {"failed": _fail_late(ground, now, vehicle_id), "added": 0, "approved": 0, "released": 0}
-    with ground.database.reading() as connection:
-        requests = store.active_requests(connection, vehicle_id)
+    requests = ground.read(store.active_requests, vehicle_id)
     for request_id in requests:
         ground.check_stopping()
         try:

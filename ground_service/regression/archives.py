@@ -377,8 +377,7 @@ def archive_of(ground: Ground, record: ArchiveRecord, folder: Path) -> PassArchi
 
 def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
     """Exclude an archive from retention, or include it again."""
-    with ground.database.writing() as connection:
-        store.pin_archive(connection, digest, pinned)
+    ground.write(store.pin_archive, digest, pinned)
 
 
 def let_go(

@@ -113,8 +113,7 @@ def run_build(
 
 
 def _judged(build: Build, report: Mapping[str, Any], written: Path, out: Path) -> BuildRun:
-    printed = tail(out / PRINTED, PRINTED_SHOWN)
-    outcome, detail = _outcome(report, printed)
+    outcome, detail = _outcome(report, tail(out / PRINTED, PRINTED_SHOWN))
     downlink: Path | None = None
     performance = None
     for name in DOWNLINKS:

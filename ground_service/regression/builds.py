@@ -401,15 +401,12 @@ def registered_build(ground: Ground, digest: str) -> Build:
     InvalidInput
         If its files are no longer those that were registered.
     """
-    with ground.database.reading() as connection:
-        whole = store.find_build(connection, digest)
+    whole = ground.read(store.find_build, digest)
     if whole is None or len(digest) < 8:
         raise NotFound("build", digest)
     folder = _folder_of(ground, whole)
     if not folder.exists():  # registered on another machine, or before the service was restored
-        with ground.database.reading() as connection:
-            sha256 = store.file_of_build(connection, whole)
-        _unpack(ground.files.get(sha256), folder)
+        _unpack(ground.files.get(ground.read(store.file_of_build, whole)), folder)
     build = load_build(folder)
     if build.digest != whole:
         raise InvalidInput(

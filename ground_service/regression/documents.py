@@ -255,8 +255,7 @@ def changed_tracks(ground: Ground, judged: Sequence[PassVerdict]) -> list[Change
 def _changed_track(ground: Ground, one: PassVerdict, row: int) -> ChangedTrack:
     assert one.context and one.baseline_read and one.candidate_read
     context, old, new = one.context, one.baseline_read.frames.craters, one.candidate_read.frames.craters
-    with ground.database.reading() as connection:
-        archive = store.get_archive(connection, one.digest)
+    archive = ground.read(store.get_archive, one.digest)
     files = store_of(ground)
     manifest = json.loads(files.get(archive.manifest_sha256))
     frame, crater = int(old.frame[row]), int(old.crater[row])

@@ -136,8 +136,7 @@ def _outcome(
             yield item
             ground.check_stopping()
             share = 0.95 * number / total
-            with ground.database.writing() as connection:
-                set_progress(connection, job_id, share)
+            ground.write(set_progress, job_id, share)
 
     archives = list(arguments["archives"])
     candidate, baseline = (

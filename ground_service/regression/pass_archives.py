@@ -66,8 +66,7 @@ def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArch
     InvalidInput
         The pass has no telemetry, or its archive was imported by a version that did not store the manifest.
     """
-    with ground.database.reading() as connection:
-        record = passes.get_pass(connection, pass_id)
+    record = ground.read(passes.get_pass, pass_id)
     with working_folder(ground) as work:
         folder = work / "archive"
         folder.mkdir()
@@ -82,8 +81,7 @@ def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArch
 
 def archive_of_pass(ground: Ground, pass_id: int) -> KeptArchive:
     """Return the kept archive of a pass, which is kept now if there is none."""
-    with ground.database.reading() as connection:
-        kept = store.archives_of_pass(connection, pass_id)
+    kept = ground.read(store.archives_of_pass, pass_id)
     return kept_archive(ground, kept[0].digest) if kept else keep_pass(ground, pass_id)
 
 

@@ -26,11 +26,12 @@ def run_placebo(
     The outcome has the noise of each metric. No replay is kept. `options` are those of `run_regression`.
     """
     # Seeds of one placebo are of no other.
-    sides = [_noisy(build, one) for one in (2 * seed, 2 * seed + 1)]
+    sides = [
+        replace(build, noise=one, digest=hashlib.sha256(f"{build.digest} noise {one}".encode()).hexdigest())
+        for one in (2 * seed, 2 * seed + 1)
+    ]
     outcome = run_regression(ground, archives, sides[1], sides[0], policy, **options)
-    with ground.database.writing() as connection:
-        unused = store.remove_replays(connection, [one.digest for one in sides])
-    remove_unheld(ground, unused)
+    remove_unheld(ground, ground.write(store.remove_replays, [one.digest for one in sides]))
     noise = gate_noise(outcome.gates, policy.policy)
     for one in outcome.passes:
         if one.state == JUDGED and one.context and one.baseline_read and one.candidate_read:
@@ -40,8 +41,3 @@ def run_placebo(
     return replace(
         outcome, baseline=build, candidate=build, noise=tuple(noise), remarks=(*outcome.remarks, told)
     )
-
-
-def _noisy(build: Build, seed: int) -> Build:
-    identity = hashlib.sha256(f"{build.digest} noise {seed}".encode()).hexdigest()
-    return replace(build, noise=seed, digest=identity)

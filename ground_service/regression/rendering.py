@@ -100,8 +100,7 @@ def settle_archive(ground: Ground, digest: str, *, again: bool = False) -> KeptA
         The renderer failed without refusing the archive, whose state does not change.
     """
     with ground.alone(f"render {digest}"):
-        with ground.database.reading() as connection:
-            record = store.get_archive(connection, digest)
+        record = ground.read(store.get_archive, digest)
         if record.state == COMPLETE:
             return kept_archive(ground, digest)
         manifest = archive_of(ground, record, Path()).manifest

@@ -265,8 +265,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
 
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
     """What was kept of a replay; None where it was not done, or something of it is lost."""
-    with ground.database.reading() as connection:
-        replay = store.find_replay(connection, digest, build.digest)
+    replay = ground.read(store.find_replay, digest, build.digest)
     if replay is None:
         return None
     files = store_of(ground)
@@ -364,9 +363,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
 
 def report_of(ground: Ground, regression_id: str) -> bytes:
     """Return the HTML report of a regression."""
-    with ground.database.reading() as connection:
-        sha256 = store.get_report(connection, regression_id)
-    return ground.files.get(sha256)
+    return ground.files.get(ground.read(store.get_report, regression_id))
 
 
 def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
@@ -375,8 +372,7 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
     try:
         if path.exists():
             return _settled(ground, keep_archive(ground, path).digest, path)
-        with ground.database.reading() as connection:
-            record = store.find_archive(connection, str(given))
+        record = ground.read(store.find_archive, str(given))
         if record is None:
             raise InvalidInput(
                 str(given), "", "a pass archive, or the identity or the pass of one that is kept", "neither"

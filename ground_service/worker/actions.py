@@ -54,15 +54,12 @@ def run_actions(ground: Ground, event: int, *, notify: bool = False) -> dict[str
     """
     due: list[AutomationAction] = []
     with ground.alone(f"actions of event {event}"):
-        with ground.database.reading() as connection:
-            actions = store.actions_of_event(connection, event)
+        actions = ground.read(store.actions_of_event, event)
         for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
             due += _run_chain(ground, list(chain), notify)
     for one in due:
-        with ground.database.writing() as connection:
-            publish(connection, AutomationChanged(id=one.id, event=event, action=one.action, state="sending"))
-    with ground.database.reading() as connection:
-        after = store.actions_of_event(connection, event)
+        ground.write(publish, AutomationChanged(id=one.id, event=event, action=one.action, state="sending"))
+    after = ground.read(store.actions_of_event, event)
     counts: dict[str, int] = {}
     for one in after:
         counts[one.state] = counts.get(one.state, 0) + 1
@@ -136,14 +133,18 @@ def _give_up(ground: Ground, action: AutomationAction, error: str) -> None:
 
 def repeat_due(ground: Ground) -> list[str]:
     """Add the jobs of actions whose next attempt is due; return their ids."""
-    with ground.database.reading() as connection:
-        due = store.events_to_repeat(connection, utc_now_ns())
+    due = ground.read(store.events_to_repeat, utc_now_ns())
     if not due:
         return []
     with ground.database.writing() as connection:
         return [
-            add_job(connection, "automation", {"event": event}, job_id=_repetition_id(event, attempts))
-            for event, attempts in due
+            add_job(
+                connection,
+                "automation",
+                {"event": event},
+                job_id=hashlib.blake2b(name, digest_size=16).hexdigest(),
+            )
+            for event, name in ((event, f"repeat {event} {attempts}".encode()) for event, attempts in due)
         ]
 
 
@@ -153,23 +154,17 @@ def has_repetitions(ground: Ground) -> bool:
         return bool(store.events_to_repeat(connection, utc_now_ns() + sum(RETRY_NS)))
 
 
-def _repetition_id(event: int, attempts: int) -> str:
-    return hashlib.blake2b(f"repeat {event} {attempts}".encode(), digest_size=16).hexdigest()
-
-
 def _end(ground: Ground, action: AutomationAction, state: str, **values: Any) -> None:
     """Record the end of an action, unless another process has recorded it."""
     try:
-        with ground.database.writing() as connection:
-            store.change_state(connection, action, state, now_utc_ns=utc_now_ns(), **values)
+        ground.write(store.change_state, action, state, now_utc_ns=utc_now_ns(), **values)
     except StateConflict as error:
         log.warning("%s", error)
 
 
 def _rule(ground: Ground, action: AutomationAction) -> Rule:
     """Return the rule of an action in the revision that caused it."""
-    with ground.database.reading() as connection:
-        rules = store.rules_of_revision(connection, action.mission_id)
+    rules = ground.read(store.rules_of_revision, action.mission_id)
     for rule in (*rules, *DEFAULT_RULES):
         if rule.name == action.rule:
             return rule
@@ -193,10 +188,6 @@ def _correlate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     return {"changed": recorrelate(ground, action.vehicle_id)}
 
 
-def _align(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    return align_pass(ground, _pass_of(action))
-
-
 def _evaluate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     found = pass_summary(ground, _pass_of(action))
     kept = ("frames", "packets", "packets_lost", "navigation", "verdict", "verdict_level", "evidence_level")
@@ -206,8 +197,7 @@ def _evaluate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
 def _report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     """Make the first report of a pass, or a new one if anything in it differs from the last."""
     pass_id, identity = _pass_of(action), _identity(action)
-    with ground.database.reading() as connection:
-        previous = newest_report(connection, pass_id, other_than=identity)
+    previous = ground.read(newest_report, pass_id, other_than=identity)
     if previous is None:
         made = make_report(ground, pass_id, report_id=identity, pdf=True)
         return {"report_id": made.report_id, "verdict": made.summary["verdict"]}
@@ -265,8 +255,7 @@ def _monthly_report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
 def _notify(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     """Send the event over the channels of the rule; each gets it, also if another one fails."""
     rule = _rule(ground, action)
-    with ground.database.reading() as connection:
-        channels = store.channels_of_revision(connection, action.mission_id)
+    channels = ground.read(store.channels_of_revision, action.mission_id)
     content = {
         name: value
         for name, value in action.model_dump(mode="json").items()
@@ -294,7 +283,7 @@ def _notify(ground: Ground, action: AutomationAction) -> dict[str, Any]:
 
 DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
     "correlate": _correlate,
-    "align": _align,
+    "align": lambda ground, action: align_pass(ground, _pass_of(action)),
     "evaluate": _evaluate,
     "report": _report,
     "mark_processed": _mark_processed,

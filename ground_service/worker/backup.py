@@ -102,8 +102,7 @@ def restore(folder: Path, ground: Ground) -> dict[str, Any]:
         If the service is not empty.
     """
     manifest = _manifest(folder)
-    with ground.database.reading() as connection:
-        filled = rows.first_filled_table(connection)
+    filled = ground.read(rows.first_filled_table)
     if filled is not None:
         raise Conflict(f"{ground.database.label}: expected an empty service, found rows in {filled}")
     try:

@@ -126,8 +126,7 @@ def _archive(ground: Ground, _settings: Settings) -> Result:
 
 
 def _files(ground: Ground, _settings: Settings) -> Result:
-    with ground.database.reading() as connection:
-        names = file_names(connection)
+    names = ground.read(file_names)
     faults = []
     for sha256 in names:
         try:

@@ -176,16 +176,14 @@ def _reevaluate(ground: Ground, pass_id: int, event: int) -> str | None:
 
 def _decode(ground: Ground, vehicle: int, event: int) -> str:
     """Add the job that decodes the packets of a vehicle with a new mission description."""
-    with ground.database.writing() as connection:
-        return add_job(
-            connection, "redecode", {"vehicle_id": vehicle}, job_id=_job_id("decode", vehicle, event)
-        )
+    return ground.write(
+        add_job, "redecode", {"vehicle_id": vehicle}, job_id=_job_id("decode", vehicle, event)
+    )
 
 
 def _match_rules(ground: Ground, number: int, _event: int) -> None:
     """Record the actions that rules of mission descriptions take on an event."""
-    with ground.database.reading() as connection:
-        [event] = events.read_events(connection, number - 1, 1)
+    [event] = ground.read(events.read_events, number - 1, 1)
     record_actions(ground, event)
 
 
@@ -193,8 +191,7 @@ def _add_job_of_event(kind: str) -> Callable[[Ground, int, int], str]:
     """Return a function that adds the job of event `number` because of another event, which it caused."""
 
     def add(ground: Ground, number: int, event: int) -> str:
-        with ground.database.writing() as connection:
-            return add_job(connection, kind, {"event": number}, job_id=_job_id(kind, number, event))
+        return ground.write(add_job, kind, {"event": number}, job_id=_job_id(kind, number, event))
 
     return add
 

@@ -243,8 +243,7 @@ def _compare_times(connection: Connection, scratch: Ground, vehicle: int, found:
         return
     recorrelate(scratch, vehicle)
     stored = load_correlations(connection, vehicle)
-    with scratch.database.reading() as made:
-        derived = load_correlations(made, vehicle)
+    derived = scratch.read(load_correlations, vehicle)
     found.count("correlations", len(stored))
     ends = [end for one in (*stored, *derived) for end in (one.start_ticks, one.stop_ticks)]
     ticks = np.array(ends, dtype=np.int64)

@@ -82,8 +82,7 @@ def _archive(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict
 
 def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
     vehicle = int(arguments["vehicle_id"])
-    rows = catch_up(ground, vehicle)
-    return {"rows": rows + apply_definition(ground, vehicle)}
+    return {"rows": catch_up(ground, vehicle) + apply_definition(ground, vehicle)}
 
 
 def _automation(
@@ -130,14 +129,12 @@ def run_job(ground: Ground, job_id: str) -> Job:
     """
     with _alone_here(job_id) as here, ground.database.alone(job_id) as alone:
         if not (here and alone):
-            with ground.database.reading() as connection:
-                return store.get_job(connection, job_id)
+            return ground.read(store.get_job, job_id)
         return _run_alone(ground, job_id)
 
 
 def _run_alone(ground: Ground, job_id: str) -> Job:
-    with ground.database.reading() as connection:
-        job = store.get_job(connection, job_id)
+    job = ground.read(store.get_job, job_id)
     if job.state in FINISHED:
         return job
     with span(f"job {job.kind}", parent=job.traceparent, attributes={"linna.job": job_id}) as further:
@@ -196,8 +193,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
         nonlocal kept
         if share - kept >= PROGRESS_STEP and share < 1.0:
             kept = share
-            with ground.database.writing() as connection:
-                store.set_progress(connection, job_id, share)
+            ground.write(store.set_progress, job_id, share)
 
     return keep
 

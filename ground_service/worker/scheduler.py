@@ -105,8 +105,7 @@ class Scheduler:
 
     def tick(self) -> bool:
         """Do the work that is due if this process has the lease or gets it now; return whether it has."""
-        with self._ground.database.writing() as connection:
-            mine = leases.acquire(connection, LEASE, self.owner, LEASE_NS)
+        mine = self._ground.write(leases.acquire, LEASE, self.owner, LEASE_NS)
         if not mine:
             self._since_utc_ns = None
             return False
@@ -130,8 +129,7 @@ class Scheduler:
             work()
 
     def _repeat_ingests(self) -> None:
-        with self._ground.database.writing() as connection:
-            repeat_ingests(connection, utc_now_ns())
+        self._ground.write(repeat_ingests, utc_now_ns())
 
     def _repeat_actions(self) -> None:
         for job_id in repeat_due(self._ground):
@@ -165,8 +163,7 @@ class Scheduler:
 
     def _release(self) -> None:
         try:
-            with self._ground.database.writing() as connection:
-                leases.release(connection, LEASE, self.owner)
+            self._ground.write(leases.release, LEASE, self.owner)
         except GroundError as error:
             log.warning("the lease of the recurring work ends by itself: %s", error)
 

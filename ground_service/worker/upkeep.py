@@ -60,8 +60,7 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     removed["archives"] = remove_archives(
         ground, int(arguments.get("archive_days", 0)), int(arguments.get("archive_limit_mib", 0))
     )
-    with ground.database.reading() as connection:
-        vehicles = all_vehicles(connection)
+    vehicles = ground.read(all_vehicles)
     found: list[dict[str, Any]] = []
     for vehicle in vehicles:
         trends = vehicle_trends(ground, vehicle.id)
@@ -75,8 +74,7 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
             )
     broken = [one for vehicle in vehicles for one in broken_limits(ground, vehicle.id)]
     if broken:
-        with ground.database.writing() as connection:
-            publish(connection, LimitsBroken(broken=broken))
+        ground.write(publish, LimitsBroken(broken=broken))
     monthly, failed = make_due_reports(ground)
     if arguments.get("audit_heads"):
         keep_head(ground, arguments["audit_heads"])
@@ -102,8 +100,7 @@ def remove_archives(ground: Ground, days: int, limit_mib: int) -> int:
 
 def broken_limits(ground: Ground, vehicle: int) -> list[dict[str, Any]]:
     """Return the housekeeping parameters of a vehicle whose trends are outside their limits."""
-    with ground.database.reading() as connection:
-        found = get_vehicle(connection, vehicle)
+    found = ground.read(get_vehicle, vehicle)
     return [
         {
             "spacecraft_id": found.ccsds_id,

@@ -49,8 +49,7 @@ class Watch:
         now, before = mission_now_ns(), self._clock
         self._clock = now
         links = list_links(self.ground)
-        with self.ground.database.reading() as connection:
-            waiting = records_where(connection, WINDOWS.c.state.in_(("uplinked", "executing")))
+        waiting = self.ground.read(records_where, WINDOWS.c.state.in_(("uplinked", "executing")))
         awaited = {one.spacecraft_id for one in waiting}
         for number in spacecraft:
             mine = [one for one in links if one.spacecraft_id == number]

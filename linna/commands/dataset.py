@@ -57,8 +57,7 @@ def _build(arguments: argparse.Namespace) -> int:
         recipe, arguments.out, arguments.frames, data_folder(), max(1, arguments.workers), blender_python()
     ):
         first = done if first is None else first
-        elapsed = max(time.monotonic() - began, 1e-9)
-        rate = (done - first) / elapsed
+        rate = (done - first) / max(time.monotonic() - began, 1e-9)
         left = f", {(total - done) / rate:.0f} s left" if rate > 0 else ""
         log(f"dataset: {done}/{total} frames ({rate:.1f}/s{left})")
     made = done - (first or 0)

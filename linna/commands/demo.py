@@ -59,8 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     home = arguments.out / "ground"
     with local_client(open_ground(home, data), local_actor()) as service:
         pass_id = service.import_archive(archive)
-        report_id = service.make_report(pass_id)
-        summary = service.get_report_summary(report_id)
+        summary = service.get_report_summary(service.make_report(pass_id))
         spacecraft_id = service.get_pass(pass_id).spacecraft_id
     figures = {
         "report": str(home.absolute() / "reports" / f"pass-{pass_id}" / "report.html"),

@@ -52,8 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     duration = "6 minutes" if arguments.quick else "an hour"
     log(f"this takes about {duration} on two idle cores; the same command continues it")
     started = time.monotonic()
-    data = data_folder()
-    report = make_paper(_workshop(arguments, data), quick=arguments.quick)
+    report = make_paper(_workshop(arguments, data_folder()), quick=arguments.quick)
     html, pdf = render_pages(report)
     out = arguments.out
     (out / "paper.html").write_text(html, encoding="utf-8")

@@ -323,8 +323,7 @@ class Spacecraft:
             if region in board.memory:
                 board.flip(board.memory[region], bits, self._rng)
             if fault.kind == "model_lost" and region in board.tables:
-                kept = np.frombuffer(board.tables[region], dtype=np.uint8)
-                board.flip(kept, bits, self._rng)
+                board.flip(np.frombuffer(board.tables[region], dtype=np.uint8), bits, self._rng)
         elif fault.kind == "store_flip":
             self._flip_used(board.store, bits)
         elif fault.kind == "settings_flip":

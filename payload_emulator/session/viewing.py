@@ -112,8 +112,7 @@ def _add_packets(message: dict[str, Any], packets: Sequence[bytes]) -> dict[str,
             items = values["items"]
             identified |= dict(zip(items["detection"].tolist(), items["crater_id"].tolist(), strict=True))
         elif name in ("frame_outcome", "navigation_state"):
-            estimator = labels(name, "estimator")[values["estimator"]]
-            estimate = estimates.setdefault(estimator, {})
+            estimate = estimates.setdefault(labels(name, "estimator")[values["estimator"]], {})
             estimate["outcome"] = labels(name, "outcome")[values["outcome"]]
             if name == "frame_outcome":
                 estimate["reset_trigger"] = labels(name, "reset_trigger")[values["reset_trigger"]]

@@ -358,8 +358,7 @@ def _fly_to_windows(
     window = scenario.window
     not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
     if scenario.orbit.oem:
-        ephemeris = load_oem(Path(scenario.orbit.oem))
-        truth = _truth_of_ephemeris(ephemeris, model.orientation)
+        truth = _truth_of_ephemeris(load_oem(Path(scenario.orbit.oem)), model.orientation)
         return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns))
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":

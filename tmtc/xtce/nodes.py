@@ -90,8 +90,7 @@ def parse_xml(text: str | bytes, document: str) -> Node:
     octets = text.encode() if isinstance(text, str) else text
     if len(octets) > MAX_OCTETS:
         raise DefinitionError(f"{document}: expected at most {MAX_OCTETS} octets, found {len(octets)}")
-    builder = _Builder(document, "utf-8" if isinstance(text, str) else None)
-    return builder.parse(octets)
+    return _Builder(document, "utf-8" if isinstance(text, str) else None).parse(octets)
 
 
 class _Builder:

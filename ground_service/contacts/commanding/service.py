@@ -297,8 +297,7 @@ def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[
 
     Each timeout is recorded once, also with concurrent processes. Later verification reports are still accepted.
     """
-    with ground.database.reading() as connection:
-        views = store.views_of_unnoted_timeouts(connection, since_utc_ns, until_utc_ns, utc_now_ns())
+    views = ground.read(store.views_of_unnoted_timeouts, since_utc_ns, until_utc_ns, utc_now_ns())
     noted = []
     for view in views:
         if view.fate is None or not view.fate.timed_out:
@@ -314,8 +313,7 @@ def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[
 
 def get_command(ground: Ground, command_id: int) -> CommandView:
     """Return a telecommand and its verification."""
-    with ground.database.reading() as connection:
-        return store.get_view(connection, command_id, utc_now_ns())
+    return ground.read(store.get_view, command_id, utc_now_ns())
 
 
 def list_telecommands(connection: Connection, asked: TelecommandFilter) -> PageOf[Telecommand]:

@@ -73,8 +73,7 @@ class SendDue:
 
 def declared_links(ground: Ground) -> dict[str, DeclaredLink]:
     """Return the links of the mission descriptions in force by name."""
-    with ground.database.reading() as connection:
-        return _declared(connection)
+    return ground.read(_declared)
 
 
 def list_links(ground: Ground) -> list[LinkStatus]:
@@ -172,10 +171,9 @@ def predict(
     station = station_of(declared.stations, declared.link.station)
     if station is None:
         return (), "the mission description states no place of the station"
-    with ground.database.reading() as connection:
-        references = ephemerides.covering_ephemerides(
-            connection, start_utc_ns, stop_utc_ns, declared.spacecraft_id
-        )
+    references = ground.read(
+        ephemerides.covering_ephemerides, start_utc_ns, stop_utc_ns, declared.spacecraft_id
+    )
     if not references:
         return (), "no reference ephemeris covers the time"
     outages = outages_of(declared.stations)
@@ -189,23 +187,21 @@ def predict(
 def acquire(ground: Ground, declared: DeclaredLink, owner: str, lease_ns: int) -> bool:
     """Take or renew the lease of a link; return whether `owner` has it."""
     now = utc_now_ns()
-    with ground.database.writing() as connection:
-        return store.acquire(
-            connection,
-            declared.link.name,
-            declared.spacecraft_id,
-            declared.link.instance,
-            owner=owner,
-            wall_utc_ns=now,
-            until_utc_ns=now + lease_ns,
-            mission_utc_ns=mission_now_ns(),
-        )
+    return ground.write(
+        store.acquire,
+        declared.link.name,
+        declared.spacecraft_id,
+        declared.link.instance,
+        owner=owner,
+        wall_utc_ns=now,
+        until_utc_ns=now + lease_ns,
+        mission_utc_ns=mission_now_ns(),
+    )
 
 
 def release(ground: Ground, name: str, owner: str) -> None:
     """Give a link back."""
-    with ground.database.writing() as connection:
-        store.release(connection, name, owner, utc_now_ns())
+    ground.write(store.release, name, owner, utc_now_ns())
 
 
 def change_state(ground: Ground, name: str, owner: str, state: str, reason: str | None) -> bool:
@@ -231,8 +227,7 @@ def owners(ground: Ground) -> dict[str, str | None]:
 
 def last_heard_ns(ground: Ground, name: str) -> int | None:
     """Return the mission time of the newest ingested reception of a link; None if nothing was received."""
-    with ground.database.reading() as connection:
-        found = store.find_link(connection, name)
+    found = ground.read(store.find_link, name)
     return None if found is None else found.heard_utc_ns
 
 
@@ -328,8 +323,7 @@ def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: 
     A contact is not missed while another station received the spacecraft, which has one transmitter.
     """
     name = declared.link.name
-    with ground.database.reading() as connection:
-        found = store.find_link(connection, name)
+    found = ground.read(store.find_link, name)
     if found is None or declared.link.downlink is None or now_utc_ns <= found.considered_utc_ns:
         return 0
     since = max(found.considered_utc_ns, now_utc_ns - PREDICT_LIMIT_NS)
@@ -371,8 +365,7 @@ def send_due(ground: Ground, name: str) -> SendDue:
 
 def note_sent_request(ground: Ground, name: str, owner: str, number: int) -> None:
     """Record that requests up to a number are done."""
-    with ground.database.writing() as connection:
-        store.change_link(connection, name, owner, send_done=number)
+    ground.write(store.change_link, name, owner, send_done=number)
 
 
 def unsent(ground: Ground, declared: DeclaredLink) -> int:

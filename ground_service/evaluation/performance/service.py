@@ -304,8 +304,7 @@ def make_due_reports(ground: Ground) -> tuple[list[dict[str, Any]], list[int]]:
 
     The first value has the reports. The second has the spacecraft whose report failed; the log states why.
     """
-    with ground.database.reading() as connection:
-        spacecraft = store.spacecraft_with_passes(connection, FLOWN)
+    spacecraft = ground.read(store.spacecraft_with_passes, FLOWN)
     made: list[dict[str, Any]] = []
     failed = []
     for one in spacecraft:
@@ -319,8 +318,7 @@ def make_due_reports(ground: Ground) -> tuple[list[dict[str, Any]], list[int]]:
 
 def due_report_of_vehicle(ground: Ground, vehicle: int) -> MonthlyReport | None:
     """Make the report of the last complete month of a vehicle; see `make_due_report`."""
-    with ground.database.reading() as connection:
-        found = get_vehicle(connection, vehicle)
+    found = ground.read(get_vehicle, vehicle)
     return make_due_report(ground, found.ccsds_id, found.instance)
 
 

@@ -82,8 +82,7 @@ def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor:
     """Correlate a spacecraft from its received time reports, also over what was entered; the correlations in force."""
     vehicle = _vehicle(ground, spacecraft_id, instance)
     if recorrelate(ground, vehicle, over_manual=True):
-        with ground.database.writing() as connection:
-            audit(connection, actor, "correlate time", str(vehicle), {"from": "time reports"})
+        ground.write(audit, actor, "correlate time", str(vehicle), {"from": "time reports"})
     return ground.read(store.correlations_in_force, vehicle)
 
 

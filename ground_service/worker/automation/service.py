@@ -170,8 +170,7 @@ def _rules_for(connection: Connection, occurrence: Occurrence) -> list[tuple[int
 
 def list_rules(ground: Ground) -> list[RuleInForce]:
     """Return the rules in force of every spacecraft, and the default rules of all others."""
-    with ground.database.reading() as connection:
-        missions = store.missions_in_force(connection)
+    missions = ground.read(store.missions_in_force)
     stated = [
         _in_force(rule, spacecraft, mission)
         for spacecraft, _, mission in missions

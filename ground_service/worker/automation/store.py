@@ -90,8 +90,7 @@ def spacecraft_vehicle(connection: Connection, ccsds_id: int, instance: str) -> 
 
 def report_summary(connection: Connection, report_id: str) -> dict[str, Any]:
     """Return the figures of a report."""
-    row = repository.get(connection, repository.REPORTS, report_id, "report")
-    return dict(row["summary"])
+    return dict(repository.get(connection, repository.REPORTS, report_id, "report")["summary"])
 
 
 def add_action(

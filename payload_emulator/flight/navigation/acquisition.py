@@ -197,8 +197,7 @@ class _Votes:
         rows, columns = np.nonzero((size > np.log(low) - gate) & (size < np.log(high) + gate + 2.0 * sag))
         if not rows.size:
             return None
-        pole = np.array([0.0, 0.0, 1.0])
-        east = np.cross(pole, up)
+        east = np.cross(np.array([0.0, 0.0, 1.0]), up)
         east = east / max(float(np.linalg.norm(east)), 1e-9)
         return cls(
             crater=landmarks.position_mcmf_m[index[columns]],

@@ -150,8 +150,7 @@ def step(
     A frame that needs a reset where the anchor ephemeris has nothing is `missed`: before the first reset the
     state stays None, afterwards it is held and the reset stays due.
     """
-    altitude_m = anchor.altitude_m(ticks)
-    features = frame_features(detections, altitude_m, camera, mode)
+    features = frame_features(detections, anchor.altitude_m(ticks), camera, mode)
     trigger = _reset_trigger(state, ticks, parameters, manual_step)
     if trigger is not ResetTrigger.none or state is None:
         return _reset(state, ticks, features, anchor, trigger)

@@ -53,8 +53,7 @@ def failure(name: str) -> int:
 def parse_commands(octets: bytes) -> Iterator[Command | Refusal]:
     """Return the telecommand packets laid end to end in the octets; a broken length ends the reading."""
     while octets:
-        padded = octets[:4].ljust(4, b"\0")
-        request_id = int.from_bytes(padded, "big")
+        request_id = int.from_bytes(octets[:4].ljust(4, b"\0"), "big")
         length = 7 + int.from_bytes(octets[4:6], "big") if len(octets) >= _PRIMARY_HEADER_LENGTH else 0
         if length < _SHORTEST_PACKET or length > len(octets):
             yield Refusal(request_id, failure("bad_length"))

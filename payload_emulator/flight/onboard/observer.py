@@ -506,9 +506,7 @@ def _rotation(attitude: FloatArray) -> FloatArray | None:
         return None
     length = float(np.linalg.norm(attitude[:4]))
     # Rounding of a unit quaternion is far below this; anything else is no attitude.
-    if abs(length - 1.0) > 1e-3:
-        return None
-    return matrix_from_quaternion(attitude[:4] / length)
+    return None if abs(length - 1.0) > 1e-3 else matrix_from_quaternion(attitude[:4] / length)
 
 
 def _reported(found: Detections) -> IntArray:

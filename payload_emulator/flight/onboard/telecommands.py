@@ -54,9 +54,7 @@ def check(machine: Machine, command: Command) -> int:
         known = DICTIONARY.labels(command.name, "quantity")
         if any(int(code) not in known for code in values["items"]["quantity"]):
             return failure("value_out_of_range")
-    if command.name == "insert_activity":
-        return _check_activity(machine, values)
-    return 0
+    return _check_activity(machine, values) if command.name == "insert_activity" else 0
 
 
 def execute(machine: Machine, command: Command) -> int:

@@ -113,9 +113,7 @@ def turn_back(
         return (width_px - 1.0) - v_px, u_px
     if turns == 2:
         return (width_px - 1.0) - u_px, (height_px - 1.0) - v_px
-    if turns == 3:
-        return v_px, (height_px - 1.0) - u_px
-    return u_px, v_px
+    return (v_px, (height_px - 1.0) - u_px) if turns == 3 else (u_px, v_px)
 
 
 def turn_forward(
@@ -127,9 +125,7 @@ def turn_forward(
         return v_px, (width_px - 1.0) - u_px
     if turns == 2:
         return (width_px - 1.0) - u_px, (height_px - 1.0) - v_px
-    if turns == 3:
-        return (height_px - 1.0) - v_px, u_px
-    return u_px, v_px
+    return ((height_px - 1.0) - v_px, u_px) if turns == 3 else (u_px, v_px)
 
 
 def _plane_shape(image: NDArray[np.generic]) -> tuple[int, int]:

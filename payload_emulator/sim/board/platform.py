@@ -115,8 +115,7 @@ class SimulatedBoard:
         """Let time pass, the arrays lit by a share of the Sun."""
         model = self.model
         self.uptime += round(seconds * TICKS_PER_SECOND)
-        drawn_w = self.drawn_w
-        energy_wh = (model.array_w * sunlit - drawn_w) * seconds / 3600.0
+        energy_wh = (model.array_w * sunlit - self.drawn_w) * seconds / 3600.0
         self.charge = min(max(self.charge + energy_wh / model.capacity_wh, 0.0), 1.0)
         tends_c = model.dark_c + (model.lit_c - model.dark_c) * sunlit
         self.structure_c = _relax(self.structure_c, tends_c, seconds, model.structure_s)

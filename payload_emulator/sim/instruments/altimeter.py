@@ -152,8 +152,7 @@ def _around(axis: FloatArray, offsets_rad: FloatArray) -> FloatArray:
     """Return unit vectors (n, 3) at small angles (n, 2) from a unit axis."""
     aside = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     aside /= np.linalg.norm(aside)
-    other = np.cross(axis, aside)
-    rays = axis + offsets_rad[:, :1] * aside + offsets_rad[:, 1:] * other
+    rays = axis + offsets_rad[:, :1] * aside + offsets_rad[:, 1:] * np.cross(axis, aside)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 

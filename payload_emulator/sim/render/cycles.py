@@ -129,8 +129,7 @@ def rendering_of_passes(planes: dict[str, Image], scene: CyclesScene) -> Renderi
     The direct diffuse pass is the Sun's irradiance over pi times the cosine of incidence and the share of the disc in
     sight (the lamp shines with pi); the normal pass gives the cosine.
     """
-    alpha = _plane(planes, "Combined.A")
-    ground = alpha > 0.5
+    ground = _plane(planes, "Combined.A") > 0.5
     sun = scene.sun_to_world[:3, 2]
     normal = [_plane(planes, f"Normal.{axis}") for axis in "XYZ"]
     cosine = sum(np.float32(s) * plane for s, plane in zip(sun, normal, strict=True))

@@ -52,8 +52,7 @@ def render(
     level = terrain.level_for(height_above_ground_m("raymarch", terrain, position) / camera.focal_px)
     v, u = np.mgrid[0 : camera.height_px : every, 0 : camera.width_px : every]
     rays = camera.rays(np.stack([u, v], axis=-1).astype(np.float64)) @ rotation
-    places = rays_window(camera, position, rotation, sun)
-    patch = terrain.patch(*places, level)
+    patch = terrain.patch(*rays_window(camera, position, rotation, sun), level)
     radiance, lit, range_m = (np.empty(u.shape, np.float32) for _ in range(3))
     march(
         position,

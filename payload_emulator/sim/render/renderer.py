@@ -241,8 +241,7 @@ def tangent_view(
         toward = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
         length = float(np.linalg.norm(toward))
     away = -toward / length
-    across = np.cross(up, away)
-    frame = np.stack([away, across, up])
+    frame = np.stack([away, np.cross(up, away), up])
     return View(
         frame,
         distance - MOON_RADIUS_M,

@@ -46,8 +46,7 @@ class AlbedoTiles:
         """Albedo over its mean on a grid of places, (rows, columns)."""
         out = np.full((latitude_rad.size, longitude_rad.size), np.nan)
         for layer in reversed(self._layers):
-            values = _averaged(layer, latitude_rad, longitude_rad)
-            out = np.where(np.isnan(out), values, out)
+            out = np.where(np.isnan(out), _averaged(layer, latitude_rad, longitude_rad), out)
         return np.asarray(np.clip(np.nan_to_num(out / self._mean, nan=1.0), LEAST, GREATEST))
 
 

@@ -256,8 +256,7 @@ def _clear(craters: CraterCatalogue, fit: _Fit) -> Rims:
 
 def _measured(craters: CraterCatalogue, heights: Heights) -> _Fit:
     """Return fits of all craters, made block by block of the raster."""
-    count = len(craters)
-    columns = np.full((8, count), np.nan)
+    columns = np.full((8, len(craters)), np.nan)
     for rows, window in _blocks(craters, heights):
         columns[:, rows] = _fitted(craters.select(rows), heights.pixels_per_degree, *window)
     return _Fit(*columns)

@@ -294,8 +294,7 @@ def write_shard(folder: Path, name: str, labels: ShardLabels) -> str:
         if getattr(labels, key):
             arrays[key] = np.array(getattr(labels, key))
     np.savez(buffer, **arrays)
-    octets = buffer.getvalue()
-    return write_whole(folder / "shards" / f"{name}.npz", octets)
+    return write_whole(folder / "shards" / f"{name}.npz", buffer.getvalue())
 
 
 def load_shard(path: Path) -> ShardLabels:

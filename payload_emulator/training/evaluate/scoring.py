@@ -338,8 +338,7 @@ def best_threshold(tallied: Tally, beta: float = 1.0) -> tuple[float, Figures]:
     """
     candidates = np.arange(0.10, 0.91, 0.01)
     every = [tallied.figures(float(threshold)) for threshold in candidates]
-    values = np.array([_f_beta(figures, beta) for figures in every])
-    best = int(np.argmax(values))
+    best = int(np.argmax(np.array([_f_beta(figures, beta) for figures in every])))
     return float(candidates[best]), every[best]
 
 

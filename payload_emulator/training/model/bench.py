@@ -20,8 +20,7 @@ def bench(model_octets: bytes, threads: int = 1, frames: int = 100) -> dict[str,
     gives cost as much as a frame of craters.
     """
     detector = OnnxDetector(model_octets, threads=threads)
-    rng = np.random.default_rng(0)
-    frame = rng.integers(20, 235, (512, 512, 3), dtype=np.uint8)
+    frame = np.random.default_rng(0).integers(20, 235, (512, 512, 3), dtype=np.uint8)
     sun = np.array([0.0, -1.0, -0.2])
     whole, whole_cpu, network_cpu = [], [], []
     for count in range(frames + 5):

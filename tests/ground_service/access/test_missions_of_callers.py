@@ -259,8 +259,7 @@ def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet: Fleet) -> N
     ground = fleet.client.app.state.ground
     with fleet.client.websocket_connect(f"{V1}/live", headers=fleet.headers) as socket:
         for vehicle in (1, 2):
-            with ground.database.writing() as connection:
-                publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=1))
+            ground.write(publish, CorrelationChanged(vehicle_id=vehicle, segments=1))
         assert socket.receive_json()["payload"]["vehicle_id"] == 2
     with fleet.client.websocket_connect(f"{V1}/live?after=0", headers=fleet.headers) as socket:
         assert socket.receive_json()["payload"]["vehicle_id"] == 2

@@ -118,8 +118,7 @@ def test_a_report_is_written_and_kept(imported: Imported, tmp_path: Path) -> Non
     made = make_report(ground, pass_id, out=tmp_path / "out")
     assert "synthetic pass" in made.html.read_text()
     assert json.loads(made.json.read_text())
-    with ground.database.reading() as connection:
-        row = repository.get(connection, repository.REPORTS, made.report_id, "report")
+    row = ground.read(repository.get, repository.REPORTS, made.report_id, "report")
     assert ground.files.get(row["html_sha256"]) == made.html.read_bytes()
 
 

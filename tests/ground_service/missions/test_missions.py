@@ -281,8 +281,7 @@ def test_the_mission_changes_which_telecommands_need_a_second_person(ground) -> 
 
 def test_a_description_in_an_archive_changes_nothing_of_what_people_approve(ground) -> None:
     mission, text = read_mission(approval_text(RELAXED))
-    with ground.database.writing() as connection:
-        enter(connection, mission, text, actor="archive")
+    ground.write(enter, mission, text, actor="archive")
     assert not released_by_one(ground, *SET_MODE)
 
 

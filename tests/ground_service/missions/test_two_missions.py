@@ -84,8 +84,7 @@ def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) ->
 
 
 def row(ground: Ground, table: Any, **equal: Any) -> dict[str, Any]:
-    with ground.database.reading() as connection:
-        found = repository.find(connection, table, **equal)
+    found = ground.read(repository.find, table, **equal)
     assert found is not None
     return found
 

@@ -80,8 +80,7 @@ def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: SyntheticP
         digest=digest, name="synthetic pass", frames=4, frames_stored=4, state="complete", reason="", octets=1,
         pinned=True, kept_since=UtcTime(0), manifest_sha256="0" * 64,
     )  # fmt: skip
-    with either.database.writing() as connection:
-        store.keep_archive(connection, record)
+    either.write(store.keep_archive, record)
     with local_client(either, "ann") as service:
         assert [one.pass_id for one in service.list_kept_archives()] == [None]
         pass_id = import_archive(either, archive.folder)

@@ -44,8 +44,7 @@ def state_of(ground: Ground, key: int) -> str:
 
 def test_a_transition_happens_once_and_the_second_is_told_the_state_that_won(either: Ground) -> None:
     key = add_command(either)
-    with either.database.writing() as connection:
-        move(connection, TELECOMMAND, key, "released", reason="first")
+    either.write(move, TELECOMMAND, key, "released", reason="first")
     with (
         pytest.raises(
             StateConflict, match=f"telecommand {key}: expected state queued, found released"
@@ -64,22 +63,20 @@ def test_a_row_that_does_not_exist_is_not_found(either: Ground) -> None:
 
 
 def test_a_transition_can_ask_for_more_than_the_state(either: Ground) -> None:
-    with either.database.writing() as connection:
-        repository.add(
-            connection,
-            repository.JOBS,
-            id="j",
-            kind="report",
-            state="running",
-            arguments={},
-            progress=0.0,
-            attempts=2,
-            created_utc_ns=1,
-        )
+    either.write(
+        repository.add,
+        repository.JOBS,
+        id="j",
+        kind="report",
+        state="running",
+        arguments={},
+        progress=0.0,
+        attempts=2,
+        created_utc_ns=1,
+    )
     with pytest.raises(StateConflict), either.database.writing() as connection:
         move(connection, JOB, "j", "done", where={"attempts": 1})
-    with either.database.writing() as connection:
-        move(connection, JOB, "j", "done", where={"attempts": 2})
+    either.write(move, JOB, "j", "done", where={"attempts": 2})
 
 
 def test_only_rows_in_a_state_that_may_be_left_are_moved_together(either: Ground) -> None:
@@ -112,8 +109,7 @@ def test_counters_give_every_number_once_to_transactions_at_the_same_time(either
         vehicles = [vehicle_id(connection, number, "flight") for number in (1, 2)]
 
     def count(vehicle: int) -> int:
-        with either.database.writing() as connection:
-            return next_telecommand(connection, vehicle)
+        return either.write(next_telecommand, vehicle)
 
     with ThreadPoolExecutor(8) as pool:
         given = list(pool.map(count, vehicles * 20))
@@ -121,8 +117,7 @@ def test_counters_give_every_number_once_to_transactions_at_the_same_time(either
 
 
 def test_a_number_that_was_not_used_is_given_again(either: Ground) -> None:
-    with either.database.writing() as connection:
-        vehicle = vehicle_id(connection, 1, "flight")
+    vehicle = either.write(vehicle_id, 1, "flight")
     with pytest.raises(RuntimeError), either.database.writing() as connection:
         next_telecommand(connection, vehicle)
         raise RuntimeError("the transaction fails")

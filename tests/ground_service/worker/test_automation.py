@@ -115,8 +115,7 @@ def prepared(
             "velocity_icrf_m_s": tuple(velocity[0].tolist()),
         }
     )
-    with ground.database.writing() as connection:
-        windows.note_uploads(connection, window.id, WindowUploads(start_state=state))
+    ground.write(windows.note_uploads, window.id, WindowUploads(start_state=state))
     return window.id
 
 
@@ -146,8 +145,7 @@ def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
         octets=1,
         telecommands=0,
     )
-    with ground.database.writing() as connection:
-        publish(connection, ended)
+    ground.write(publish, ended)
 
 
 def report_of(ground: Ground, pass_id: int) -> dict[str, Any]:
@@ -236,8 +234,7 @@ def test_a_reference_that_arrives_after_the_report_completes_it(
     assert 0.6 < report["detector"]["micro"]["recall"] < 0.8
     assert not {"detector", "reference", "error", "baselines"} & set(report["not_available"])
     assert either.read(get_window, window_id).state == "processed"
-    with either.database.reading() as connection:
-        newest = newest_report(connection, window.pass_id, other_than="")
+    newest = either.read(newest_report, window.pass_id, other_than="")
     assert newest is not None and newest.previous_id is not None and newest.event_number is not None
     assert {one[2] for one in recorded(either)} == {"done"}
 
@@ -439,11 +436,9 @@ def test_a_gate_acts_for_every_mission_that_reacts_to_it(
     monkeypatch.setattr(actions, "RETRY_NS", (0, 0))
     rule = '[[automation.rules]]\nname = "gate"\non = "gate done"\nwhen = { verdict = ["fail"] }\n'
     prepared(ground, flown, rule + 'do = ["compute_trends"]\n')
-    with ground.database.writing() as connection:
-        publish(connection, RegressionJudged(id="0" * 32, verdict="pass"))
+    ground.write(publish, RegressionJudged(id="0" * 32, verdict="pass"))
     assert recorded(ground) == []
-    with ground.database.writing() as connection:
-        publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
+    ground.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
     assert recorded(ground) == [("gate", "compute_trends", "failed")]
 
 
@@ -452,8 +447,7 @@ def test_a_report_that_is_requested_again_without_changes_is_kept(
 ) -> None:
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
-    with ground.database.writing() as connection:
-        publish(connection, WindowChanged(id=window_id, state="downlinked"))
+    ground.write(publish, WindowChanged(id=window_id, state="downlinked"))
     found = actions_of(ground)
     assert found[0].action == "report" and found[0].result is not None and found[0].result["unchanged"]
 

@@ -41,8 +41,7 @@ SPACECRAFT = 76
 
 
 def job_row(ground: Ground, job_id: str) -> dict[str, Any]:
-    with ground.database.reading() as connection:
-        return repository.get(connection, repository.JOBS, job_id, "job")
+    return ground.read(repository.get, repository.JOBS, job_id, "job")
 
 
 def finished(ground: Ground, job_id: str) -> dict[str, Any]:
@@ -120,8 +119,7 @@ def test_a_worker_makes_the_report(
     lines = (tmp_path / "worker.log").read_text().splitlines()
     logged = [json.loads(line) for line in lines if line.startswith("{")]
     assert {"job", "kind", "state", "seconds"} <= {key for entry in logged for key in entry}
-    with ground.database.reading() as connection:
-        report = repository.get(connection, repository.REPORTS, row["result"]["report_id"], "report")
+    report = ground.read(repository.get, repository.REPORTS, row["result"]["report_id"], "report")
     assert report["summary"]["packets"] == pass_summary(ground, pass_id)["packets"]
 
 

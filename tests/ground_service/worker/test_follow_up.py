@@ -44,8 +44,7 @@ def kinds(ground: Ground) -> list[str]:
 
 
 def position(ground: Ground) -> int:
-    with ground.database.reading() as connection:
-        return log.position_of(connection, follow_up.CONSUMER)
+    return ground.read(log.position_of, follow_up.CONSUMER)
 
 
 def jobs_of(ground: Ground, kind: str) -> list[dict[str, Any]]:
@@ -100,8 +99,7 @@ def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground) ->
                 with pytest.raises(RuntimeError), either.database.writing() as connection:
                     log.publish(connection, "test", {"lost": k})
                     raise RuntimeError
-            with either.database.writing() as connection:
-                log.publish(connection, "test", {"seed": seed, "k": k})
+            either.write(log.publish, "test", {"seed": seed, "k": k})
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(write, range(4)))
@@ -249,8 +247,7 @@ def reported_pass(ground: Ground, early: Path) -> int:
 
 
 def reports_of(ground: Ground, pass_id: int) -> list[dict[str, Any]]:
-    with ground.database.reading() as connection:
-        rows, _ = repository.newest(connection, repository.REPORTS, Paging(limit=10), pass_id=pass_id)
+    rows, _ = ground.read(repository.newest, repository.REPORTS, Paging(limit=10), pass_id=pass_id)
     return sorted(rows, key=lambda row: int(row["created_utc_ns"]))
 
 

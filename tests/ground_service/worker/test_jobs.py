@@ -41,8 +41,7 @@ def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground, work: Any) -> str:
 
 
 def row_of(ground: Ground, job: str) -> Row:
-    with ground.database.reading() as connection:
-        return repository.get(connection, repository.JOBS, job, "job")
+    return ground.read(repository.get, repository.JOBS, job, "job")
 
 
 @pytest.mark.parametrize(
@@ -149,8 +148,7 @@ def test_an_attempt_that_another_has_overtaken_changes_nothing(
     """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
     def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
-        with ground.database.writing() as connection:
-            move(connection, JOB, job_id, "running", attempts=2)
+        ground.write(move, JOB, job_id, "running", attempts=2)
         return {"made by": "the first"}
 
     row = run_job(ground, job_that(monkeypatch, ground, work))

@@ -77,8 +77,7 @@ def worker(home: Path, environment: dict[str, str]) -> Iterator[None]:
 
 
 def job_of(ground: Ground, key: str) -> dict[str, Any]:
-    with ground.database.reading() as connection:
-        return repository.get(connection, repository.JOBS, key, "job")
+    return ground.read(repository.get, repository.JOBS, key, "job")
 
 
 def result_of(ground: Ground, key: str) -> dict[str, Any]:

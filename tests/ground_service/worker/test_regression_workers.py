@@ -44,6 +44,5 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(
         assert [row["state"] for row in rows] == ["done"] * 5
         assert rows[-1]["result"] == {"regression_id": verdict, "verdict": "pass"}
         assert [row["result"]["outcome"] for row in rows[:-1]] == ["ok"] * 4
-        with ground.database.reading() as connection:
-            kept = repository.get(connection, repository.REGRESSIONS, verdict, "regression")
+        kept = ground.read(repository.get, repository.REGRESSIONS, verdict, "regression")
         assert [one["state"] for one in kept["result"]["passes"]] == ["judged", "judged"]

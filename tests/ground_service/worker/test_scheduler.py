@@ -179,8 +179,7 @@ def test_a_night_that_was_missed_is_made_up_for_after_a_while(
     assert work.submitted == []
     monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
     other, work = make(ground)
-    with ground.database.writing() as connection:
-        leases.release(connection, LEASE, one.owner)
+    ground.write(leases.release, LEASE, one.owner)
     other.tick()
     assert len(work.submitted) == 1
 

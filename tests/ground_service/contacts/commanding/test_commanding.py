@@ -588,17 +588,16 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
     vehicle = vehicle_of(ground)
 
     def add(name: str, arguments: dict[str, Any]) -> int:
-        with ground.database.writing() as connection:
-            return commanding.add_released(
-                connection,
-                vehicle,
-                name,
-                arguments,
-                actor="ann",
-                timeout_s=50,
-                window_id=3,
-                approval=approval,
-            )
+        return ground.write(
+            commanding.add_released,
+            vehicle,
+            name,
+            arguments,
+            actor="ann",
+            timeout_s=50,
+            window_id=3,
+            approval=approval,
+        )
 
     def schedule() -> int:
         with ground.database.writing() as connection:

@@ -308,8 +308,7 @@ def test_a_contact_ends_once_for_two_processes(
     service.end_contact(either, found.id, "lab", found.start_utc_ns + 5)
     service.end_contact(either, found.id, "lab", found.start_utc_ns + 9)
     assert contact_events(either) == ["contact started", "contact ended"]
-    with either.database.reading() as connection:
-        (row,) = store.contacts_between(connection, 0, found.start_utc_ns + NS)
+    (row,) = either.read(store.contacts_between, 0, found.start_utc_ns + NS)
     assert (row.state, row.stop_utc_ns) == ("ended", found.start_utc_ns + 5)
 
 
@@ -328,8 +327,7 @@ def test_a_transmission_is_repeated_once_for_two_links(
     service.end_contact(either, first.id, "lab", mission_now_ns())
     contact = service.start_contact(either, declared, mission_now_ns())
     assert contact is not None
-    with either.database.reading() as connection:
-        sent = store.transmitted_before(connection, contact.vehicle_id, mission_now_ns(), 0, 3)
+    sent = either.read(store.transmitted_before, contact.vehicle_id, mission_now_ns(), 0, 3)
     monkeypatch.setattr(store, "transmitted_before", lambda *_: sent)
     assert service.repeat_unconfirmed(either, declared, contact) == 1
     assert service.repeat_unconfirmed(either, declared, contact) == 0

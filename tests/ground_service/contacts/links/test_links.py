@@ -558,8 +558,7 @@ def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground: Grou
 def test_the_lease_is_kept_while_the_link_is_operated(ground: Ground, station: Station) -> None:
     declare(ground, station.link())
     with operated(ground):
-        with ground.database.reading() as connection:
-            first = store.find_link(connection, "lab")
+        first = ground.read(store.find_link, "lab")
         wait_for(
             lambda: service.get_link(ground, "lab").owner == "here" and _lease(ground) > first.lease_utc_ns,
             "a longer lease",
@@ -568,8 +567,7 @@ def test_the_lease_is_kept_while_the_link_is_operated(ground: Ground, station: S
 
 
 def _lease(ground: Ground) -> int:
-    with ground.database.reading() as connection:
-        found = store.find_link(connection, "lab")
+    found = ground.read(store.find_link, "lab")
     assert found is not None
     return found.lease_utc_ns
 

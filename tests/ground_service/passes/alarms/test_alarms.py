@@ -257,8 +257,7 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
             watch.tick()
             active = {one.name for one in alarms(ground) if one.active}
             assert active == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
-            with ground.database.writing() as connection:
-                repository.change(connection, repository.WINDOWS, window, state="uplinked")
+            ground.write(repository.change, repository.WINDOWS, window, state="uplinked")
             watch.tick()
             active = {one.name for one in alarms(ground) if one.active}
             assert active == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
@@ -273,8 +272,7 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
             moment += 10**9
             watch.tick()
             assert "mission_time_stopped" not in {one.name for one in alarms(ground) if one.active}
-            with ground.database.writing() as connection:
-                repository.change(connection, repository.WINDOWS, window, state="downlinked")
+            ground.write(repository.change, repository.WINDOWS, window, state="downlinked")
             watch.tick()
             assert not any(one.name == "report_overdue" for one in alarms(ground))
             moment += 2 * 86_400 * 10**9
