@@ -163,15 +163,8 @@ def states(rows: int, queries: int = 40) -> dict[str, Any]:
         with ground.database.reading() as connection:
             clock = time.perf_counter()
             stop = first + rows // 10 * ticks_a_row
-            telemetry.sample_arrays(
-                connection,
-                "navigation_states",
-                vehicle,
-                first,
-                stop,
-                DICTIONARY.version,
-                ("ticks", "altitude_m"),
-            )
+            where = (vehicle, first, stop, DICTIONARY.version)
+            telemetry.sample_arrays(connection, "navigation_states", where, ("ticks", "altitude_m"))
             all_of_a_tenth = time.perf_counter() - clock
     return {
         "states_rows": rows,

@@ -255,13 +255,8 @@ class Settings(BaseSettings):
     @property
     def kept(self) -> dict[str, Any]:
         """Arguments of the nightly job: for how long, or up to which size, data are kept."""
-        return {
-            "retention_days": self.retention_days,
-            "archive_days": self.archive_days,
-            "archive_limit_mib": self.archive_limit_mib,
-            "audit_heads": self.audit_heads,
-            "placebo_passes": self.placebo_passes,
-        }
+        named = {"retention_days", "archive_days", "archive_limit_mib", "audit_heads", "placebo_passes"}
+        return self.model_dump(include=named)
 
     def resolved_database_url(self) -> str:
         """The SQLAlchemy URL in force."""

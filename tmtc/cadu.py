@@ -191,8 +191,7 @@ class _Synchroniser:
         return self._result()
 
     def _result(self) -> CaduSync:
-        none = np.empty(0, dtype=np.int64)
-        starts = np.concatenate([none, *self.starts])
+        starts = np.concatenate([np.empty(0, dtype=np.int64), *self.starts])
         wrong, inverted = _marker_errors(self.octets, starts)
         damaged = np.flatnonzero(wrong > self.tolerance)
         sound = np.flatnonzero(wrong <= self.tolerance)

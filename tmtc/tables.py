@@ -470,8 +470,7 @@ def _interpolate(ticks: IntArray, values: FloatArray, at_ticks: int) -> FloatArr
     np.fill_diagonal(difference, 1.0)
     ratio = -nodes[None, :] / difference
     np.fill_diagonal(ratio, 1.0)
-    weights = np.prod(ratio, axis=1)
-    return np.asarray(weights @ values[low:high], dtype=np.float64)
+    return np.asarray(np.prod(ratio, axis=1) @ values[low:high], dtype=np.float64)
 
 
 def _sine_latitude(position: FloatArray) -> float:

@@ -57,8 +57,7 @@ def once(
     if key is None:
         return work()
     identity = _digest([actor, operation, key])
-    asked = _digest(request)
-    known = _take(ground, identity, asked)
+    known = _take(ground, identity, _digest(request))
     if known is not None:
         return known
     try:

@@ -246,8 +246,7 @@ def cut_ring(places: Ring) -> tuple[Ring, ...]:
         part = _clipped(ring, 360.0 * world - 180.0, 1.0)
         part = _clipped(part, 360.0 * world + 180.0, -1.0)
         if len(part) > 2 and np.ptp(part[:, 0]) > 0.0:
-            closed = np.concatenate([part, part[:1]])
-            parts.append(_counterclockwise(_in_world(closed)))
+            parts.append(_counterclockwise(_in_world(np.concatenate([part, part[:1]]))))
     return tuple(parts)
 
 

@@ -164,7 +164,9 @@ def format_czml(inputs: PassInputs, poses: Poses, layers: tuple[Layer, ...], nam
         _track(
             one.estimator,
             one.utc_ns[known],
-            mcmf_from_spherical(*np.radians((one.latitude_deg, one.longitude_deg)), one.altitude_m)[known],
+            mcmf_from_spherical(np.radians(one.latitude_deg), np.radians(one.longitude_deg), one.altitude_m)[
+                known
+            ],
         )
         for one in inputs.navigation
         if np.count_nonzero(known := np.isfinite(one.altitude_m)) > 1

@@ -84,8 +84,7 @@ def _check_directory(path: Path, name: str) -> None:
         If the directory has too many octets or entries, also if the end record states fewer.
     """
     with path.open("rb") as stream:
-        size = stream.seek(0, os.SEEK_END)
-        tail_start = max(size - (1 << 16) - _END.size, 0)
+        tail_start = max(stream.seek(0, os.SEEK_END) - (1 << 16) - _END.size, 0)
         stream.seek(tail_start)
         tail = stream.read()
         at = len(tail) - _END.size

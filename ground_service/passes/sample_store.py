@@ -31,18 +31,14 @@ _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 
 def samples(connection: Connection, span: PassSpan, kind: str, names: Sequence[str]) -> dict[str, list[Any]]:
     """Return columns of the samples of one kind in a span, in order of time."""
-    return telemetry.samples(
-        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
-    )
+    return telemetry.samples(connection, kind, span.where, names)
 
 
 def sample_arrays(
     connection: Connection, span: PassSpan, kind: str, names: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
-    return telemetry.sample_arrays(
-        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
-    )
+    return telemetry.sample_arrays(connection, kind, span.where, names)
 
 
 def packet_octets(connection: Connection, span: PassSpan, apid: int) -> bytes:

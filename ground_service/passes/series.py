@@ -74,7 +74,7 @@ def kind_samples(kind: str, version: int, part: int = 0) -> SampleSource:
 
     def read(connection: Connection, span: PassSpan, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         where = (span.vehicle, span.start_ticks, span.stop_ticks, version)
-        return telemetry.sample_arrays(connection, kind, *where, ("ticks", *names), **equal)
+        return telemetry.sample_arrays(connection, kind, where, ("ticks", *names), **equal)
 
     return SampleSource(code, version, part, {name: k for k, name in enumerate(values)}, read)
 

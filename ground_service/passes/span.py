@@ -39,6 +39,11 @@ class PassSpan:
     correlations: tuple[TimeCorrelation, ...]
     dictionary_version: int
 
+    @property
+    def where(self) -> telemetry.Where:
+        """Place of the samples."""
+        return self.vehicle, self.start_ticks, self.stop_ticks, self.dictionary_version
+
     def utc_ns(self, ticks: Sequence[int] | IntArray) -> IntArray:
         """Return the correlated UTC (n,) of on-board ticks."""
         return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]
@@ -112,8 +117,7 @@ def belongs_to(one: Observation, mine: Planned, others: Sequence[Planned], margi
 
 def observation_events(connection: Connection, span: PassSpan) -> list[tuple[int, int, int]]:
     """Return on-board time, event and planned end of the reports of start and end of observations in an interval."""
-    where = span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version
-    found = telemetry.samples(connection, "events", *where, ("ticks", "event_id", "value_1"))
+    found = telemetry.samples(connection, "events", span.where, ("ticks", "event_id", "value_1"))
     rows = zip(found["ticks"], found["event_id"], found["value_1"], strict=True)
     return [
         (ticks, event, int(planned or 0)) for ticks, event, planned in rows if event in (STARTED, STOPPED)

@@ -41,7 +41,8 @@ def insert_columns(
     conflict = _on_conflict(table, columns) if replace else ""
     if connection.dialect.name == "postgresql":
         driver: Any = connection.connection.driver_connection
-        kinds = [_copy_type(table, name) for name in columns]
+        types = [table.c[name].type for name in columns]
+        kinds = [next(code for of, code in _COPY_TYPES if isinstance(one, of)) for one in types]
         if count <= FEW_ROWS:
             arrays = ", ".join(f"%b::{kind}[]" for kind in kinds)
             with driver.cursor() as cursor:
@@ -79,8 +80,3 @@ def plain_column(column: Column) -> list[Any]:
     if column.dtype.kind == "f" and np.isnan(column).any():
         return [None if value != value else value for value in values]
     return values
-
-
-def _copy_type(table: Table, name: str) -> str:
-    kind = table.c[name].type
-    return next(code for sqlalchemy_type, code in _COPY_TYPES if isinstance(kind, sqlalchemy_type))

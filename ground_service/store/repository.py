@@ -73,8 +73,7 @@ SAMPLES: dict[str, Table] = {table.name: table for table in models.SAMPLE_TABLES
 
 def add(connection: Connection, table: Table, **values: Any) -> Any:
     """Insert one row; its primary key."""
-    result = connection.execute(insert(table).values(**values))
-    key = result.inserted_primary_key
+    key = connection.execute(insert(table).values(**values)).inserted_primary_key
     return key[0] if key is not None and len(key) == 1 else key
 
 

@@ -81,38 +81,23 @@ def newest_packet(connection: Connection, vehicle: int, apid: int) -> bytes | No
     return None if found is None else bytes(found)
 
 
-def samples(
-    connection: Connection,
-    kind: str,
-    vehicle: int,
-    start_ticks: int,
-    stop_ticks: int,
-    dictionary_version: int,
-    columns: Sequence[str],
-    **equal: int,
-) -> dict[str, list[Any]]:
-    """Columns of the samples of one kind between two on-board times (both included), in order of time.
+Where = tuple[int, int, int, int]
+"""Vehicle, first and last on-board time (both included), and dictionary version of samples."""
 
-    `equal` keeps only rows whose columns have these values.
-    """
-    query = _samples(kind, vehicle, start_ticks, stop_ticks, dictionary_version, columns, equal)
-    rows = connection.execute(query).all()
+
+def samples(
+    connection: Connection, kind: str, where: Where, columns: Sequence[str], **equal: int
+) -> dict[str, list[Any]]:
+    """Return columns of the samples of one kind, in order of time; `equal` keeps rows with these values."""
+    rows = connection.execute(_samples(kind, where, columns, equal)).all()
     return {name: [row[i] for row in rows] for i, name in enumerate(columns)}
 
 
 def sample_arrays(
-    connection: Connection,
-    kind: str,
-    vehicle: int,
-    start_ticks: int,
-    stop_ticks: int,
-    dictionary_version: int,
-    columns: Sequence[str],
-    **equal: int,
+    connection: Connection, kind: str, where: Where, columns: Sequence[str], **equal: int
 ) -> dict[str, NDArray[Any]]:
     """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for what is not known."""
-    query = _samples(kind, vehicle, start_ticks, stop_ticks, dictionary_version, columns, equal)
-    with connection.execute(query) as result:
+    with connection.execute(_samples(kind, where, columns, equal)) as result:
         # Plain tuples of the driver: they need no translation, and rows as objects would take most of the time.
         rows = result.cursor.fetchall()
     # Whole numbers are below 2^53, so that float64 holds them.
@@ -124,16 +109,9 @@ def sample_arrays(
     }
 
 
-def _samples(
-    kind: str,
-    vehicle: int,
-    start_ticks: int,
-    stop_ticks: int,
-    dictionary_version: int,
-    columns: Sequence[str],
-    equal: dict[str, int],
-) -> Select[Any]:
+def _samples(kind: str, where: Where, columns: Sequence[str], equal: dict[str, int]) -> Select[Any]:
     table = SAMPLES[kind]
+    vehicle, start_ticks, stop_ticks, dictionary_version = where
     return (
         select(*(table.c[name] for name in columns))
         .where(

@@ -54,18 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or data_directory() / PRODUCT
     save_registration(out, registration)
     tiles = by_tile(registration)
+    names = ("south_deg", "west_deg", "east_m", "north_m", "sigma_m", "rims")
     figures = {
-        "tiles": [
-            {
-                "south_deg": tile.south_deg,
-                "west_deg": tile.west_deg,
-                "east_m": tile.east_m,
-                "north_m": tile.north_m,
-                "sigma_m": tile.sigma_m,
-                "rims": tile.rims,
-            }
-            for tile in tiles
-        ],
+        "tiles": [{name: getattr(tile, name) for name in names} for tile in tiles],
         "nodes": int(registration.row.size),
         "rims": int(registration.rims.sum()),
         "out": str(out),

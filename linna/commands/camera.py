@@ -9,6 +9,12 @@ from linna.commands._choices import CATALOGUE_HELP, open_catalogue
 from linna.output import emit, finish, log
 from linna.parser import ABOVE_ZERO, number, option
 
+FIGURES = (
+    "selected_fov_deg", "selected_every_altitude_deg", "needed", "threshold", "positions", "positions_covered",
+    "craters",
+)  # fmt: skip
+"""Values of a study of the field of view that are printed as they are."""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
@@ -52,13 +58,7 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     figures = {
         "fov_deg": study.fov_deg,
         "probability_at_least": {str(n): values for n, values in study.probability_at_least.items()},
-        "selected_fov_deg": study.selected_fov_deg,
-        "selected_every_altitude_deg": study.selected_every_altitude_deg,
-        "needed": study.needed,
-        "threshold": study.threshold,
-        "positions": study.positions,
-        "positions_covered": study.positions_covered,
-        "craters": study.craters,
+        **{name: getattr(study, name) for name in FIGURES},
         "altitude_km": {
             "min": float(track.altitude_m.min()) / 1e3,
             "mean": float(track.altitude_m.mean()) / 1e3,

@@ -117,10 +117,7 @@ def _archives(parser: argparse.ArgumentParser) -> None:
     option(parser, "--workers N", int, "simultaneous replays (default: one for each core)")
 
 
-def _finish(
-    parser: argparse.ArgumentParser,
-    handler: Callable[[argparse.Namespace], int],
-) -> None:
+def _finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespace], int]) -> None:
     add_operator_options(parser)
     finish(parser, handler)
 

@@ -267,8 +267,7 @@ def foreign_signal(process):
 
 def regain():
     header = (ctypes.c_uint32 * 2)(0x2008_0522, 0)
-    data = (ctypes.c_uint32 * 6)(1 << 21, 1 << 21, 0, 0, 0, 0)
-    return libc("capset", header, data)
+    return libc("capset", header, (ctypes.c_uint32 * 6)(1 << 21, 1 << 21, 0, 0, 0, 0))
 
 
 # Limits

@@ -70,8 +70,7 @@ def become_container(exchange: Path) -> None:
     )
     child = os.fork()
     if child:
-        status = os.waitpid(child, 0)[1]
-        os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
+        os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) & 0xFF)
     kernel.die_with_parent()
     kernel.mount("proc", "/proc", "proc")
     held = os.open(exchange, os.O_PATH)

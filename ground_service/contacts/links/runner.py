@@ -338,7 +338,7 @@ class LinkRunner:
             elif not self._is_handed_over(self._up, one):
                 return
         if due.requested:
-            service.note_sent_request(self._ground, self._name, self._owner, due.request)
+            self._ground.write(store.change_link, self._name, self._owner, send_done=due.request)
 
     def _is_in_turn(self, transmission: TransmissionRow) -> bool:
         """Return whether no earlier transmission of the spacecraft waits at another link, or the wait was too long.
@@ -428,7 +428,7 @@ class LinkRunner:
                     _write_transmission(Path(link.uplink), one, link.format)
                     self._note_transmitted(one)
                 if due.requested:
-                    service.note_sent_request(self._ground, self._name, self._owner, due.request)
+                    self._ground.write(store.change_link, self._name, self._owner, send_done=due.request)
         self._show("connected", self._ingest_fault)
         self._stopping.wait(TICK_S * 5)
 

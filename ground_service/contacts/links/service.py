@@ -363,11 +363,6 @@ def send_due(ground: Ground, name: str) -> SendDue:
     return SendDue(not held, found.send_requested, pending)
 
 
-def note_sent_request(ground: Ground, name: str, owner: str, number: int) -> None:
-    """Record that requests up to a number are done."""
-    ground.write(store.change_link, name, owner, send_done=number)
-
-
 def unsent(ground: Ground, declared: DeclaredLink) -> int:
     """Return the number of telecommands that could be sent now: released ones, and pending transmissions."""
     with ground.database.reading() as connection:

@@ -132,7 +132,7 @@ def release(connection: Connection, name: str, owner: str, wall_utc_ns: int) -> 
     connection.execute(update(_LINKS).where(*mine).values(**values))
 
 
-def change_link(connection: Connection, name: str, owner: str, **values: Any) -> bool:
+def change_link(connection: Connection, /, name: str, owner: str, **values: Any) -> bool:
     """Change columns of a link that `owner` has; return whether it has it."""
     mine = (_LINKS.c.name == name, _LINKS.c.owner == owner)
     return connection.execute(update(_LINKS).where(*mine).values(**values)).rowcount == 1

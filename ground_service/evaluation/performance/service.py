@@ -340,8 +340,7 @@ def month_span(month: str) -> tuple[int, int]:
 
 def last_month(utc_ns: int) -> str:
     """Return the last complete month before a time."""
-    first = parse_utc(f"{format_utc(utc_ns)[:7]}-01T00:00:00Z")
-    return format_utc(first - DAY_NS)[:7]
+    return format_utc(parse_utc(f"{format_utc(utc_ns)[:7]}-01T00:00:00Z") - DAY_NS)[:7]
 
 
 def _entity(report: StoredMonthlyReport) -> MonthlyReport:

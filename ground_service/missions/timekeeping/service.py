@@ -119,5 +119,4 @@ def spacecraft_time_reports(ground: Ground, spacecraft_id: int, instance: str) -
 
 
 def _vehicle(ground: Ground, spacecraft_id: int, instance: str) -> int:
-    with ground.database.reading() as connection:
-        return find_vehicle(connection, spacecraft_id, instance).id
+    return ground.read(find_vehicle, spacecraft_id, instance).id

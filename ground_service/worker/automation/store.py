@@ -177,6 +177,7 @@ def last_result(connection: Connection, action: AutomationAction) -> dict[str, A
 
 def change_state(
     connection: Connection,
+    /,
     action: AutomationAction,
     state: str,
     *,

@@ -215,8 +215,7 @@ def _consensus(
     starts = np.flatnonzero(np.r_[True, detection[1:] != detection[:-1]])
     nearest = np.minimum.reduceat(distance, starts, axis=1)
     # A hypothesis explains its own pair by construction.
-    score = np.maximum(GATE - nearest, 0.0).sum(axis=1)
-    best = int(np.argmax(score))
+    best = int(np.argmax(np.maximum(GATE - nearest, 0.0).sum(axis=1)))
     hypothesis = int(tried[best])
     row = distance[best].copy()
     row[hypothesis] = -1.0

@@ -493,5 +493,4 @@ def _span(longitude: FloatArray) -> tuple[float, float]:
     ordered = np.sort(np.mod(longitude, 2.0 * math.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2.0 * math.pi)
     widest = int(np.argmax(gaps))
-    west = float(ordered[(widest + 1) % ordered.size])
-    return west, 2.0 * math.pi - float(gaps[widest])
+    return float(ordered[(widest + 1) % ordered.size]), 2.0 * math.pi - float(gaps[widest])

@@ -187,6 +187,5 @@ def _singletons(
         nothing = np.empty(0, dtype=np.int64)
         return nothing, nothing
     middle = 0.5 * (parameters.north_minimum_m + parameters.north_maximum_m) * scale * direction
-    distance = np.where(lone, np.hypot(east, north - middle), np.inf)
-    best = int(np.argmin(distance))
+    best = int(np.argmin(np.where(lone, np.hypot(east, north - middle), np.inf)))
     return rows[best : best + 1], columns[best : best + 1]

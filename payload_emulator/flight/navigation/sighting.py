@@ -148,8 +148,7 @@ def in_view(landmarks: LandmarkMap, pose: Pose, camera: PinholeCamera, margin_px
     radius = float(np.linalg.norm(position))
     if not radius > MOON_RADIUS_M:
         return look(landmarks, np.empty(0, dtype=np.int64), pose, camera)
-    reach = _reach_rad(radius, pose, camera, margin_px)
-    index = landmarks.near(position / radius, reach)
+    index = landmarks.near(position / radius, _reach_rad(radius, pose, camera, margin_px))
     away = position - landmarks.position_mcmf_m[index]
     height = np.einsum("ij,ij->i", away, landmarks.enu_from_mcmf[index, 2])
     sine = np.sin(_LIMB_MARGIN_RAD)

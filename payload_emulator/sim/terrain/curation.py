@@ -218,7 +218,8 @@ def curate(
     clear = _unmistakable(latitude[rows], longitude[rows], diameter_m[rows], fit.depth_m[rows], rules)
     dropped["confusable"] = int(np.count_nonzero(~clear))
     rows = rows[clear]
-    correction_m = _low_rim_m(heights.pixels_per_degree)
+    halvings = math.log2(_FULL_RESOLUTION_PPD / heights.pixels_per_degree)
+    correction_m = _LOW_RIM_M_PER_HALVING * max(0.0, halvings)
     centre_sigma = fit.scatter_m[rows] * math.sqrt(2.0 / _INDEPENDENT)
     centre_sigma = np.hypot(centre_sigma, rules.centre_sigma_m)
     up_sigma = np.hypot(fit.sigma_rim_m[rows], rules.height_sigma_m + 0.5 * correction_m)
@@ -395,11 +396,6 @@ def _unmistakable(
         for j in others[twin]:
             clear[i if depth[i] < depth[j] else j] = False
     return clear
-
-
-def _low_rim_m(pixels_per_degree: float) -> float:
-    """Return by how much rims lie low on a raster of this resolution."""
-    return _LOW_RIM_M_PER_HALVING * max(0.0, math.log2(_FULL_RESOLUTION_PPD / pixels_per_degree))
 
 
 def _bilinear(values: FloatArray, row: FloatArray, column: FloatArray) -> FloatArray:

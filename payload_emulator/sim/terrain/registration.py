@@ -189,8 +189,7 @@ def by_tile(registration: Registration) -> list[TileShift]:
     column = np.mod(registration.column, turn)
     middle = (registration.row % 2 == 1) & (column % 2 == 1)
     for row, west in sorted(zip(registration.row[middle].tolist(), column[middle].tolist(), strict=True)):
-        beside = np.mod(column - west + 1, turn)
-        mine = (np.abs(registration.row - row) <= 1) & (beside <= 2)
+        mine = (np.abs(registration.row - row) <= 1) & (np.mod(column - west + 1, turn) <= 2)
         tiles.append(
             TileShift(
                 (row - 1) * LATTICE_DEG,

@@ -449,13 +449,8 @@ def _validate(
     found = [detect_with_network(network, dataset, frame, device) for dataset, frame in chosen]
     truths = [frame_truth(dataset, frame) for dataset, frame in chosen]
     threshold, figures = best_threshold(tally(truths, found))
-    return {
-        "f1": figures.f1,
-        "precision": figures.precision,
-        "recall": figures.recall,
-        "loc_px": figures.loc_px,
-        "threshold": threshold,
-    }
+    names = ("f1", "precision", "recall", "loc_px")
+    return {name: getattr(figures, name) for name in names} | {"threshold": threshold}
 
 
 def _load_images(

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import event, select, update
+from sqlalchemy import event, update
 
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.model import HandoverFilter, TelecommandFilter
