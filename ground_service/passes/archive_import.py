@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,10 @@ def import_archive(ground: Ground, folder: Path) -> int:
     mission, text = _mission(folder, manifest)
     for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
         if name in names:
-            _refuse_unreadable(folder / name, load)
+            try:
+                load(folder / name)
+            except LunarError as error:
+                raise InvalidInput(str(folder / name), "", "a readable file", str(error)) from None
     receptions = read_receptions(folder / RECEPTIONS_FILE) if RECEPTIONS_FILE in names else None
     attitudes = attitude_file(names, str(folder))
     if attitudes is not None:
@@ -222,13 +225,6 @@ def _mission(folder: Path, manifest: Mapping[str, Any]) -> tuple[Mission, str | 
         expected = f"{manifest['spacecraft_id']} as in manifest.json"
         raise InvalidInput(str(path), "spacecraft.id", expected, str(stated))
     return mission, text
-
-
-def _refuse_unreadable(path: Path, load: Callable[[Path], object]) -> None:
-    try:
-        load(path)
-    except LunarError as error:
-        raise InvalidInput(str(path), "", "a readable file", str(error)) from None
 
 
 def _chosen_frames(names: list[str]) -> list[tuple[int, str]]:

@@ -149,7 +149,9 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
     band_rad = _band_rad(scenario)
     frames = [frame_times(truth, start, stop, interval_ns, band_rad) for start, stop in windows]
     frame_utc_ns = np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64)
-    frame_utc_ns = _one_arc_of(scenario.window.arc_interval, frame_utc_ns, interval_ns)
+    # An arc ends where the latitude limit interrupts the frames.
+    arc = np.cumsum(np.diff(frame_utc_ns, prepend=frame_utc_ns[:1]) > interval_ns)
+    frame_utc_ns = frame_utc_ns[arc % scenario.window.arc_interval == 0]
     if frame_utc_ns.size == 0:
         raise ScenarioError(
             f"scenario {scenario.name}: the observation window holds no frame between latitudes "
@@ -290,12 +292,6 @@ def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueB
         (*truth.breaks_utc_ns, *(burn.utc_ns for burn in burns)),
     )
     return longer, burns
-
-
-def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
-    """Return the frames of every n-th arc; an arc ends where the latitude limit interrupts the frames."""
-    arc = np.cumsum(np.diff(frame_utc_ns, prepend=frame_utc_ns[:1]) > step_ns)
-    return np.asarray(frame_utc_ns[arc % interval == 0])
 
 
 def _disturbed(
