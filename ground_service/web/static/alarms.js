@@ -2,7 +2,7 @@ import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
 import { chart } from "./charts.js";
 import { list } from "./lists.js";
-import { acting, byId, dictionary, element, figure, isoText, limitText, loading, notice, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
+import { acting, byId, dictionary, element, figure, isoText, limitText, loading, notice, on, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
 import { seriesOf } from "./parameters.js";
 
 const OPEN = ["raised", "acknowledged", "shelved"];
@@ -114,5 +114,5 @@ for (const name of ["state", "severity"]) {
     await reload.first();
   }));
 }
-byId("acknowledge").addEventListener("click", acting(acknowledgeChosen));
+on("acknowledge", "click", acknowledgeChosen);
 if (stated("alarm")) loading(() => showDetail(stated("alarm")));

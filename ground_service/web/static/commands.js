@@ -2,7 +2,7 @@ import { bind } from "./address.js";
 import { get, send } from "./api.js";
 import { control } from "./forms.js";
 import { list } from "./lists.js";
-import { acting, byId, dictionary, element, figure, loading, notice, show, showTable, timeText, words } from "./page.js";
+import { acting, byId, dictionary, element, figure, loading, notice, on, show, showTable, timeText, words } from "./page.js";
 
 const definition = Object.fromEntries(dictionary.telecommands.map((one) => [one.name, one]));
 const STAGES = ["accepted", "started", "completed"];
@@ -151,23 +151,20 @@ const load = list("/telecommands", {
 show("name", dictionary.telecommands.map((one) => element("option", { value: one.name }, words(one.name))));
 byId("name").value = "test_connection";
 bind("name", "state");
-byId("state").addEventListener("change", acting(() => load.first()));
+on("state", "change", () => load.first());
 byId("name").addEventListener("change", () => showArguments());
 showArguments();
-byId("enter").addEventListener(
-  "submit",
-  acting(async () => {
-    const chosen = definition[byId("name").value];
-    const made = await send("POST", "telecommands", {
-      name: chosen.name,
-      arguments: argumentsOf(chosen),
-      spacecraft_id: byId("spacecraft").valueAsNumber,
-      instance: byId("instance").value,
-      timeout_s: byId("timeout").valueAsNumber,
-    });
-    notice(`${words(made.name)} is queued as number ${made.id}`);
-    await load();
-  }),
-);
+on("enter", "submit", async () => {
+  const chosen = definition[byId("name").value];
+  const made = await send("POST", "telecommands", {
+    name: chosen.name,
+    arguments: argumentsOf(chosen),
+    spacecraft_id: byId("spacecraft").valueAsNumber,
+    instance: byId("instance").value,
+    timeout_s: byId("timeout").valueAsNumber,
+  });
+  notice(`${words(made.name)} is queued as number ${made.id}`);
+  await load();
+});
 
 loading(loadLinks, () => true);

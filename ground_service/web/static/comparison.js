@@ -2,7 +2,7 @@
 import { bind, restore, statedAll } from "./address.js";
 import { get } from "./api.js";
 import { chart, columns } from "./charts.js";
-import { acting, byId, element, figure, lengthText, loading, seconds, show, stateMark, table, timeText } from "./page.js";
+import { byId, element, figure, lengthText, loading, on, seconds, show, stateMark, table, timeText } from "./page.js";
 
 const asked = [...new Set(statedAll("pass"))];
 let compared = [];
@@ -147,7 +147,7 @@ async function load() {
   byId("solution").value = compared.map(({ report }) => report?.estimator).find(Boolean) ?? solutions[0] ?? "";
   restore("solution");
   bind("solution");
-  byId("solution").addEventListener("change", acting(draw));
+  on("solution", "change", draw);
   draw();
   showRequirements();
 }

@@ -1,6 +1,6 @@
 import { get, send } from "./api.js";
 import { list } from "./lists.js";
-import { acting, byId, element, show, showTable, svg, timeText } from "./page.js";
+import { acting, byId, element, on, show, showTable, svg, timeText } from "./page.js";
 
 const CROP = 3; // diameters of the crater that a picture shows
 let chosen = null;
@@ -53,16 +53,13 @@ async function open(id) {
 }
 
 for (const decision of ["accept", "reject"]) {
-  byId(decision).addEventListener(
-    "click",
-    acting(async () => {
-      await send("POST", `landmarks/${chosen}/${decision}`, { reason: byId("reason").value });
-      byId("reason").value = "";
-      await open(chosen);
-      await load();
-    }),
-  );
+  on(decision, "click", async () => {
+    await send("POST", `landmarks/${chosen}/${decision}`, { reason: byId("reason").value });
+    byId("reason").value = "";
+    await open(chosen);
+    await load();
+  });
 }
 
 const load = list("/landmarks", { place: "landmarks", columns, query: () => ({ state: byId("state").value || null }), concerns: (message) => message.kind === "landmarks" });
-byId("state").addEventListener("change", acting(() => load.first()));
+on("state", "change", () => load.first());

@@ -1,6 +1,6 @@
 import { get, request } from "./api.js";
 import { entered, property } from "./forms.js";
-import { acting, byId, confirmed, element, figure, labelled, loading, mayOperate, plural, schemas, session, show, table, timeText, trouble, words } from "./page.js";
+import { acting, byId, confirmed, element, figure, labelled, loading, mayOperate, on, plural, schemas, session, show, table, timeText, trouble, words } from "./page.js";
 import { tables, without, written } from "./toml.js";
 
 const revision = location.pathname.split("/").at(-1);
@@ -149,8 +149,8 @@ byId("document").addEventListener("input", () => {
     check().catch(trouble);
   }, TYPED_MS);
 });
-byId("dry-run").addEventListener("click", acting(dryRun));
-byId("editor").addEventListener("submit", acting(enter));
+on("dry-run", "click", dryRun);
+on("editor", "submit", enter);
 
 async function load() {
   await session;

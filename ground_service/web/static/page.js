@@ -166,6 +166,8 @@ export function acting(task) {
   };
 }
 
+export const on = (id, event, task) => byId(id).addEventListener(event, acting(task));
+
 export const seconds = (text) => (text ? Date.parse(`${text.slice(0, 23).replace(/Z$/, "")}Z`) / 1000 : NaN);
 export const timeText = (text) => (text ? `${text.slice(0, 10)} ${text.slice(11, 19)}` : "");
 export const isoText = (unix) => `${new Date(1000 * unix).toISOString().slice(0, 19)}Z`;
@@ -234,8 +236,8 @@ export function pager(load, size = 25) {
     next.disabled = offset + size >= page.total;
     if (pressed?.disabled) (pressed === next ? previous : next).focus(); // a disabled button loses the focus
   }
-  byId("previous").addEventListener("click", acting(() => go(offset - size)));
-  byId("next").addEventListener("click", acting(() => go(offset + size)));
+  on("previous", "click", () => go(offset - size));
+  on("next", "click", () => go(offset + size));
   const again = () => go(offset);
   again.first = () => go(0);
   return again;

@@ -3,7 +3,7 @@ import { finished, get, request, send } from "./api.js";
 import { chart, columns, solutionStyle } from "./charts.js";
 import { craterRims, layerItem, moonMap, terrain, track } from "./moon.js";
 import { drawParameters } from "./parameters.js";
-import { acting, byId, dictionary, element, figure, lengthText, loading, notice, parameterName, parameterOptions, seconds, show, showTable, stateClass, stateMark, table, timeText, unitText, words } from "./page.js";
+import { acting, byId, dictionary, element, figure, lengthText, loading, notice, on, parameterName, parameterOptions, seconds, show, showTable, stateClass, stateMark, table, timeText, unitText, words } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
@@ -248,19 +248,16 @@ async function showLatestReport(ids) {
   showErrors(report);
 }
 
-byId("make-report").addEventListener(
-  "click",
-  acting(async () => {
-    const job = await send("POST", `passes/${passId}/reports`);
-    const bar = element("progress", { max: 1, value: 0, "aria-label": "report" });
-    byId("report-links").replaceChildren(bar);
-    await finished(job.id, (now) => (bar.value = now.progress));
-    notice("The report is made.");
-    const { reports } = await get(`passes/${passId}`);
-    await showLatestReport(reports);
-  }),
-);
-byId("parameter").addEventListener("change", acting(showParameter));
+on("make-report", "click", async () => {
+  const job = await send("POST", `passes/${passId}/reports`);
+  const bar = element("progress", { max: 1, value: 0, "aria-label": "report" });
+  byId("report-links").replaceChildren(bar);
+  await finished(job.id, (now) => (bar.value = now.progress));
+  notice("The report is made.");
+  const { reports } = await get(`passes/${passId}`);
+  await showLatestReport(reports);
+});
+on("parameter", "change", showParameter);
 bind("only-alarms");
 byId("only-alarms").addEventListener("change", showEvents);
 

@@ -1,7 +1,7 @@
 import { keep, restore, state, statedAll } from "./address.js";
 import { get, send } from "./api.js";
 import { list, spacecraftOf, spacecraftOptions } from "./lists.js";
-import { acting, byId, element, figure, lengthText, notice, seconds, showTable, stateMark, trouble } from "./page.js";
+import { byId, element, figure, lengthText, notice, on, seconds, showTable, stateMark, trouble } from "./page.js";
 
 restore("search", "verdict");
 
@@ -65,27 +65,21 @@ const load = list("/passes", {
   ready: spacecraftOptions("of-spacecraft", element("option", { value: "" }, "all")),
 });
 
-byId("find").addEventListener(
-  "submit",
-  acting(async () => {
-    keep("search", "verdict", "of-spacecraft");
-    await load.first();
-  }),
-);
+on("find", "submit", async () => {
+  keep("search", "verdict", "of-spacecraft");
+  await load.first();
+});
 for (const id of ["verdict", "of-spacecraft"]) byId(id).addEventListener("change", () => byId("find").requestSubmit());
-byId("define").addEventListener(
-  "submit",
-  acting(async () => {
-    const made = await send("POST", "passes", {
-      name: byId("name").value,
-      start: byId("start").value,
-      stop: byId("stop").value,
-      spacecraft_id: byId("spacecraft").valueAsNumber,
-    });
-    notice(`${made.name} is kept as pass ${made.id}`);
-    await load();
-  }),
-);
+on("define", "submit", async () => {
+  const made = await send("POST", "passes", {
+    name: byId("name").value,
+    start: byId("start").value,
+    stop: byId("stop").value,
+    spacecraft_id: byId("spacecraft").valueAsNumber,
+  });
+  notice(`${made.name} is kept as pass ${made.id}`);
+  await load();
+});
 
 const METRICS = { recall: ["Recall", ""], drift_percent: ["Drift", "% of path"], median_error_m: ["Median error", "m"] };
 const metricName = (metric) => METRICS[metric].filter(Boolean).join(", ");
@@ -120,5 +114,5 @@ async function showPerformance() {
 }
 
 byId("performance").addEventListener("toggle", () => byId("performance").open && showPerformance().catch(trouble));
-byId("trend").addEventListener("submit", acting(showPerformance));
+on("trend", "submit", showPerformance);
 

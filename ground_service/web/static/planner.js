@@ -1,6 +1,6 @@
 import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
-import { acting, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { acting, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
 import { contactOf, release, sequenceTable, transmit, uplinkOf } from "./chain.js";
@@ -450,23 +450,17 @@ byId("week").addEventListener("click", () => {
   view = [from, from + 7 * DAY_S];
   zoom(1)();
 });
-byId("search").addEventListener("submit", acting(search));
-byId("enter").addEventListener("submit", acting(enter));
-byId("export").addEventListener(
-  "click",
-  acting(async () => {
-    const body = await (await request("plan")).blob();
-    element("a", { href: URL.createObjectURL(body), download: "linna-plan.json" }).click();
-  }),
-);
-byId("import").addEventListener(
-  "change",
-  acting(async () => {
-    const made = await send("POST", "plan", JSON.parse(await byId("import").files[0].text()));
-    notice(`${Object.keys(made.windows).length} windows of the plan are here`);
-    await load();
-  }),
-);
+on("search", "submit", search);
+on("enter", "submit", enter);
+on("export", "click", async () => {
+  const body = await (await request("plan")).blob();
+  element("a", { href: URL.createObjectURL(body), download: "linna-plan.json" }).click();
+});
+on("import", "change", async () => {
+  const made = await send("POST", "plan", JSON.parse(await byId("import").files[0].text()));
+  notice(`${Object.keys(made.windows).length} windows of the plan are here`);
+  await load();
+});
 new ResizeObserver(drawTimeline).observe(byId("timeline"));
 
 // Spacecraft that telemetry or a mission description names, flown ones first.
@@ -513,7 +507,7 @@ async function start() {
     showAll();
   });
   byId("spacecraft").addEventListener("change", soonConditions);
-  byId("spacecraft").addEventListener("change", acting(() => Promise.all([showDaylight(missions), loadRequests(spacecraftChosen())])));
+  on("spacecraft", "change", () => Promise.all([showDaylight(missions), loadRequests(spacecraftChosen())]));
   const [from, to] = (stated("view") ?? "").split("~").map((text) => Date.parse(text) / 1000);
   if (from < to) [view, viewChosen] = [[from, to], true];
   await Promise.all([load(), showDaylight(missions), loadRequests(spacecraftChosen())]);

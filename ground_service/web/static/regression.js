@@ -1,6 +1,6 @@
 import { keep, restore, state, stated } from "./address.js";
 import { finished, get, request, send } from "./api.js";
-import { acting, byId, element, figure, loading, notice, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
+import { byId, element, figure, loading, notice, on, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
 
 const LATEST = 12;
 let open = stated("gates");
@@ -160,29 +160,23 @@ async function load() {
   await loadRegressions();
 }
 
-byId("run").addEventListener(
-  "submit",
-  acting(async () => {
-    const archives = [...document.querySelectorAll("input[name=archive]:checked")].map((box) => box.value);
-    if (!archives.length) throw new Error("Choose at least one archive.");
-    const job = await send("POST", "regressions", { candidate: byId("candidate").value, baseline: byId("baseline").value, archives });
-    open = job.id;
-    await loadRegressions();
-    await finished(job.id);
-    await loadRegressions();
-    notice("The regression is complete.");
-  }),
-);
-byId("bring").addEventListener(
-  "submit",
-  acting(async () => {
-    const [file] = byId("zip").files;
-    const kind = byId("zip-kind").value;
-    const made = await upload(kind, file);
-    notice(`${made.name} is ${kind === "builds" ? "registered" : "kept"}`);
-    await load();
-  }),
-);
+on("run", "submit", async () => {
+  const archives = [...document.querySelectorAll("input[name=archive]:checked")].map((box) => box.value);
+  if (!archives.length) throw new Error("Choose at least one archive.");
+  const job = await send("POST", "regressions", { candidate: byId("candidate").value, baseline: byId("baseline").value, archives });
+  open = job.id;
+  await loadRegressions();
+  await finished(job.id);
+  await loadRegressions();
+  notice("The regression is complete.");
+});
+on("bring", "submit", async () => {
+  const [file] = byId("zip").files;
+  const kind = byId("zip-kind").value;
+  const made = await upload(kind, file);
+  notice(`${made.name} is ${kind === "builds" ? "registered" : "kept"}`);
+  await load();
+});
 
 let pending = null;
 watch((message) => {

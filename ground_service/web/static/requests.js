@@ -1,7 +1,7 @@
 // Standing requests on the planner: their windows, their last plan with its reasons, and changes of them.
 import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, element, figure, notice, show, showTable, table, timeText } from "./page.js";
+import { acting, byId, element, figure, notice, on, show, showTable, table, timeText } from "./page.js";
 
 let spacecraft = null;
 
@@ -81,23 +81,20 @@ function limits(name) {
   return { min, max };
 }
 
-byId("add-request").addEventListener(
-  "submit",
-  acting(async () => {
-    const number = (name) => byId(`request-${name}`).valueAsNumber;
-    const made = await send("POST", "requests", {
-      name: byId("request-name").value,
-      ...spacecraft,
-      windows: number("windows"),
-      period_days: number("period"),
-      horizon_days: number("horizon"),
-      sun_elevation_deg: limits("sun"),
-      altitude_km: limits("altitude"),
-      minimum_duration_s: number("shortest"),
-      maximum_duration_s: number("longest"),
-      priority: number("priority"),
-    });
-    notice(`Standing request ${made.name} is added as number ${made.id}`);
-    await loadRequests(spacecraft);
-  }),
-);
+on("add-request", "submit", async () => {
+  const number = (name) => byId(`request-${name}`).valueAsNumber;
+  const made = await send("POST", "requests", {
+    name: byId("request-name").value,
+    ...spacecraft,
+    windows: number("windows"),
+    period_days: number("period"),
+    horizon_days: number("horizon"),
+    sun_elevation_deg: limits("sun"),
+    altitude_km: limits("altitude"),
+    minimum_duration_s: number("shortest"),
+    maximum_duration_s: number("longest"),
+    priority: number("priority"),
+  });
+  notice(`Standing request ${made.name} is added as number ${made.id}`);
+  await loadRequests(spacecraft);
+});

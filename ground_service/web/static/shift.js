@@ -1,7 +1,7 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
 import { chainOf, contactOf, inTime, release, transmit, uplinkOf } from "./chain.js";
-import { acting, byId, element, lengthText, loading, missionNow, notice, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
+import { acting, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "executing", "executed", "downlinked"];
 const SHOWN = 5;
@@ -214,28 +214,25 @@ async function load() {
   showJobs(jobs.items);
 }
 
-byId("upload").addEventListener(
-  "submit",
-  acting(async () => {
-    const [file] = byId("file").files;
-    const kind = byId("kind").value;
-    const answer = await request(`${kind}?name=${encodeURIComponent(file.name)}`, {
-      method: "POST",
-      body: file,
-      headers: { "Content-Type": "application/octet-stream" },
-    });
-    const accepted = await answer.json();
-    if (kind === "telemetry") {
-      const bar = byId("upload-progress");
-      bar.hidden = false;
-      await finished(accepted.job_id, (job) => (bar.value = job.progress)).finally(() => (bar.hidden = true));
-      notice(`${file.name}: ingested`);
-    } else {
-      notice(`${file.name}: ${accepted.states} states from ${timeText(accepted.start)} to ${timeText(accepted.stop)}`);
-    }
-    await load();
-  }),
-);
+on("upload", "submit", async () => {
+  const [file] = byId("file").files;
+  const kind = byId("kind").value;
+  const answer = await request(`${kind}?name=${encodeURIComponent(file.name)}`, {
+    method: "POST",
+    body: file,
+    headers: { "Content-Type": "application/octet-stream" },
+  });
+  const accepted = await answer.json();
+  if (kind === "telemetry") {
+    const bar = byId("upload-progress");
+    bar.hidden = false;
+    await finished(accepted.job_id, (job) => (bar.value = job.progress)).finally(() => (bar.hidden = true));
+    notice(`${file.name}: ingested`);
+  } else {
+    notice(`${file.name}: ${accepted.states} states from ${timeText(accepted.start)} to ${timeText(accepted.stop)}`);
+  }
+  await load();
+});
 
 watch((message) => {
   byId("feed").prepend(element("li", { value: message.sequence }, `${timeText(message.time)} ${message.kind}: ${textOf(message.payload)}`));

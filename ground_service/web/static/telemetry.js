@@ -2,7 +2,7 @@ import { bind, restore, state, stated, statedAll } from "./address.js";
 import { get } from "./api.js";
 import { drawParameters } from "./parameters.js";
 import { showLive } from "./values.js";
-import { acting, byId, element, loading, parameterName, parameterOptions, show, timeText } from "./page.js";
+import { byId, element, loading, on, parameterName, parameterOptions, show, timeText } from "./page.js";
 
 let drawn = []; // [{pass, names}] of the charts, in their order
 const known = new Map(); // parameters by pass
@@ -92,8 +92,8 @@ function keepPassAndParameter() {
   for (const id of ["pass", "parameter"]) byId(id).addEventListener("change", () => state({ [id]: byId(id).value }));
 }
 
-byId("choice").addEventListener("submit", acting(add));
-byId("pass").addEventListener("change", acting(chooseParameters));
+on("choice", "submit", add);
+on("pass", "change", chooseParameters);
 byId("clear").addEventListener("click", () => {
   show("charts");
   drawn = [];

@@ -1,5 +1,5 @@
 import { get, send } from "./api.js";
-import { acting, byId, element, loading, notice, show, showTable, timeText } from "./page.js";
+import { acting, byId, element, loading, notice, on, show, showTable, timeText } from "./page.js";
 
 const ROLES = ["viewer", "operator", "admin"];
 
@@ -95,13 +95,10 @@ async function load() {
   );
 }
 
-byId("add").addEventListener(
-  "submit",
-  acting(async () => {
-    const given = { name: byId("name").value.trim(), role: byId("role").value, missions: missionsGiven(), days_valid: daysValid() };
-    showToken(await send("POST", "users", given));
-    byId("name").value = byId("missions").value = "";
-    await load();
-  }),
-);
+on("add", "submit", async () => {
+  const given = { name: byId("name").value.trim(), role: byId("role").value, missions: missionsGiven(), days_valid: daysValid() };
+  showToken(await send("POST", "users", given));
+  byId("name").value = byId("missions").value = "";
+  await load();
+});
 loading(load);

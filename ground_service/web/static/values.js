@@ -1,8 +1,9 @@
 // Newest values of the parameters of a spacecraft: value, limit state, age and recent course, updated by the feed.
 import { bind, restore } from "./address.js";
 import { get } from "./api.js";
+import { spacecraftOptions } from "./lists.js";
 import { merged } from "./newest.js";
-import { acting, byId, element, lengthText, parameterName, show, stateMark, svg, table, trouble, unitText, watch, words } from "./page.js";
+import { byId, element, lengthText, on, parameterName, show, stateMark, svg, table, trouble, unitText, watch, words } from "./page.js";
 
 const KEPT = 60; // values of the recent course
 const STALE_S = 120; // older values are marked
@@ -98,15 +99,12 @@ function take(packet) {
 export async function showLive() {
   watch((message) => message.kind === "values" && take(message.payload), refresh, { values: true });
   try {
-    const { items } = await get("spacecraft");
-    show("spacecraft", items.map((one) => element("option", { value: `${one.spacecraft_id} ${one.instance}` }, `${one.spacecraft_id}, ${one.instance}`)));
-    restore("spacecraft");
-    if (!items.length) draw();
+    if (!(await spacecraftOptions("spacecraft")).length) draw();
     await refresh();
   } catch (error) {
     if (error.status !== 401) trouble(error);
   }
-  byId("spacecraft").addEventListener("change", acting(refresh));
+  on("spacecraft", "change", refresh);
   bind("spacecraft", "packet");
   byId("packet").addEventListener("change", draw);
   setInterval(draw, 5000);

@@ -308,6 +308,23 @@ def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_
     expect(flight).to_contain_text("found no link with an uplink")
 
 
+def test_a_list_has_the_columns_and_filters_of_its_operation(page):
+    settled(page, "/ephemerides")
+    document = page.request.get("/api/v1/openapi.json").json()
+    fields = document["components"]["schemas"]["Ephemeris"]["properties"]
+    expect(page.locator("#items thead th")).to_have_count(len(fields))
+    expect(page.locator("#items tbody tr").first).to_contain_text("reference of")
+    settled(page, "/audit")
+    rows = page.locator("#items tbody tr")
+    expect(rows.first).to_be_visible()
+    page.get_by_label("Action").fill("nothing of the kind")
+    page.get_by_role("button", name="Show").click()
+    expect(page.locator("#items")).to_have_text("No entry.")
+    page.reload()
+    expect(page.get_by_label("Action")).to_have_value("nothing of the kind")
+    expect(page.locator("#items")).to_have_text("No entry.")
+
+
 def test_a_mission_description_that_is_not_entered_is_told(page):
     page.goto("/missions/" + "0" * 16)
     expect(page.locator("#notices .bad")).to_contain_text("mission revision")
