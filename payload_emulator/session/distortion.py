@@ -12,6 +12,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from lunar.constants import MOON_RADIUS_M
+from lunar.frames import mcmf_from_spherical
 from tmtc.tables import CatalogueTable
 
 _WAVES = 100
@@ -41,18 +42,12 @@ def regional_field(
     ----------
     Rahimi, Recht (2007), Random features for large-scale kernel machines.
     """
-    level = np.cos(latitude_rad)
-    places = np.stack(
-        [level * np.cos(longitude_rad), level * np.sin(longitude_rad), np.sin(latitude_rad)], axis=1
-    )
+    places = mcmf_from_spherical(latitude_rad, longitude_rad, 0.0) / MOON_RADIUS_M
     fields = []
     for _ in range(3):
-        vectors = rng.standard_normal((_WAVES, 3)) / (
-            correlation_rad * np.abs(rng.standard_normal((_WAVES, 1)))
-        )
+        vectors = rng.standard_normal((_WAVES, 3))
+        vectors /= correlation_rad * np.abs(rng.standard_normal((_WAVES, 1)))
         phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
-        total = np.zeros(latitude_rad.size)
-        for vector, phase in zip(vectors, phases, strict=True):
-            total += np.cos(places @ vector + phase)
-        fields.append(total * math.sqrt(2.0 / _WAVES))
+        waves = (np.cos(places @ vector + phase) for vector, phase in zip(vectors, phases, strict=True))
+        fields.append(math.sqrt(2.0 / _WAVES) * sum(waves))
     return np.stack(fields, axis=1)
