@@ -50,3 +50,8 @@ def test_the_same_scenario_and_epoch_give_the_same_picture(scenario, frame):
 def test_an_epoch_before_the_orbit_is_refused(scenario):
     with pytest.raises(ScenarioError, match="at or after the scenario's"):
         render_frame(scenario, DataFolder(), EPOCH - 10**15)
+
+
+def test_an_unknown_renderer_is_refused(scenario):
+    with pytest.raises(ScenarioError, match="fast, raymarch, cycles, found 'magic'"):
+        render_frame(scenario, DataFolder(), EPOCH, "magic")
