@@ -284,7 +284,7 @@ function showChosen() {
     conflictsOf(row.id).length ? reasonList("Conflicts of the plan:", conflictsOf(row.id)) : null,
     row.state === "draft" ? timesForm(row) : null,
     element("p", { class: "actions" }, deeds, element("button", { type: "button", onclick: acting(() => showSequence(row)) }, "Telecommands")),
-    element("div", { id: "sequence" }),
+    listed?.id === row.id ? sequenceTable(listed.items) : null,
   );
 }
 
@@ -311,9 +311,12 @@ async function uplink(row) {
   return transmit(link, waiting.reverse());
 }
 
-async function showSequence(row) {
-  const { items } = await get(`windows/${row.id}/telecommands`);
-  show("sequence", sequenceTable(items));
+// The window whose telecommands are shown, and these; they stay through messages of the live feed.
+let listed = null;
+
+async function showSequence({ id }) {
+  listed = { id, items: (await get(`windows/${id}/telecommands`)).items };
+  showChosen();
 }
 
 async function enter() {
@@ -386,7 +389,8 @@ async function search() {
 async function load() {
   windows = (await get("windows", { limit: 500 })).items;
   drawTimeline();
-  showChosen();
+  if (windows.some((one) => one.id === listed?.id)) await showSequence(listed);
+  else showChosen();
   const link = (row) => element("button", { type: "button", class: "link", onclick: () => choose(row.id) }, row.name);
   showTable("windows", "Windows", [["Window", link], "start", LENGTH, "state", ["By", "created_by"]], windows, "No window planned: find some above.");
 }

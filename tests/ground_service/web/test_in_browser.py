@@ -69,6 +69,10 @@ def settled(page, path):
     expect(page.locator("#feed-light")).to_have_class("light on")
 
 
+def press(page, name):
+    page.get_by_role("button", name=name).click()
+
+
 def answered(page):
     """Wait until no script of the page waits for an answer."""
     wait_until(lambda: page.evaluate("window.underWay === 0"), "requests are not answered")
@@ -163,7 +167,7 @@ def test_passes_are_searched_and_show_their_verdict(page):
         "href", re.compile("/reports/[0-9a-f]{32}")
     )
     page.get_by_label("Search").fill("no such pass")
-    page.get_by_role("button", name="Search").click()
+    press(page, "Search")
     expect(page.locator("#passes")).to_contain_text("No pass matches.")
     expect(page).to_have_url(re.compile("search=no"))
 
@@ -176,7 +180,7 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     expect(page.locator("#mission").get_by_role("link")).to_contain_text("synthetic, revision")
     expect(page.get_by_label("chart: altitude, m")).to_be_visible()
     expect(page.locator("#map-legend")).to_contain_text("spherical")
-    page.get_by_role("button", name="Make a report").click()
+    press(page, "Make a report")
     expect(page.locator("#verdict .verdict")).not_to_be_empty()
     expect(page.locator("#verdict")).to_contain_text("Median position error")
     with page.expect_popup() as opened:
@@ -275,17 +279,17 @@ def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_
     page.goto("/missions/new")
     editor, part = page.get_by_label("mission.toml"), page.locator("#part")
     editor.fill(f"{MISSION}[link.stations.here] # the mast\nlatitude_deg = 10.0\nlongitude_deg = 60.0\n")
-    page.get_by_role("button", name="Change station here").click()
+    press(page, "Change station here")
     part.get_by_label("Longitude, °").fill("")
     part.get_by_label("Latitude, °").fill("-10.5")
     part.get_by_role("button", name="Write into the text").click()
     expect(page.locator("#faults")).to_contain_text("latitude_deg and longitude_deg together")
     assert editor.input_value().endswith("[link.stations.here] # the mast\nlatitude_deg = -10.5\n")
-    page.get_by_role("button", name="Change station here").click()
+    press(page, "Change station here")
     part.get_by_label("Longitude, °").fill("61")
     part.get_by_label("Name").fill("New here")
     part.get_by_role("button", name="Write into the text").click()
-    page.get_by_role("button", name="Add a link").click()
+    press(page, "Add a link")
     part.get_by_label("Name").fill("mast")
     part.get_by_label("Kind").select_option("tcp")
     part.get_by_label("Station").select_option("New here")
@@ -297,13 +301,13 @@ def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_
         'kind = "tcp"\nstation = "New here"\nuplink = "127.0.0.1:9"\n'
     )
     flight = page.locator("#flight")
-    page.get_by_role("button", name="Dry run").click()
+    press(page, "Dry run")
     expect(flight).to_contain_text("1 window, nothing contradicts the flight")
     expect(flight.locator("tbody tr")).to_contain_text("2029-08-07 06:")
-    page.get_by_role("button", name="Remove link mast").click()
+    press(page, "Remove link mast")
     assert "[[links]]" not in editor.input_value()
     expect(page.locator("#links")).to_contain_text("None stated.")
-    page.get_by_role("button", name="Dry run").click()
+    press(page, "Dry run")
     expect(flight).to_contain_text("1 window, and what contradicts the flight")
     expect(flight).to_contain_text("found no link with an uplink")
 
@@ -318,7 +322,7 @@ def test_a_list_has_the_columns_and_filters_of_its_operation(page):
     rows = page.locator("#items tbody tr")
     expect(rows.first).to_be_visible()
     page.get_by_label("Action").fill("nothing of the kind")
-    page.get_by_role("button", name="Show").click()
+    press(page, "Show")
     expect(page.locator("#items")).to_have_text("No entry.")
     page.reload()
     expect(page.get_by_label("Action")).to_have_value("nothing of the kind")
@@ -345,7 +349,7 @@ def test_a_chart_is_zoomed_with_the_keyboard(page):
 def test_a_telecommand_goes_from_entry_to_release(page):
     settled(page, "/commands")
     page.locator("#name").select_option("test_connection")
-    page.get_by_role("button", name="Queue").click()
+    press(page, "Queue")
     row = page.locator("#commands tbody tr").first
     expect(row).to_contain_text("test connection")
     expect(row).to_contain_text("queued")
@@ -361,7 +365,7 @@ def test_arguments_have_names_units_and_ranges(page):
     expect(page.get_by_label("duration, s (0 to 31 622 400)")).to_be_visible()
     page.get_by_label("duration, s").fill("900")
     page.get_by_label("cadence, s").fill("15")
-    page.get_by_role("button", name="Queue").click()
+    press(page, "Queue")
     row = page.locator("#commands tbody tr").first
     expect(row).to_contain_text("function start observation, duration 900 s, cadence 15 s")
     settled(page, "/audit")
@@ -374,7 +378,7 @@ def test_arguments_have_names_units_and_ranges(page):
     value = page.get_by_label("value, degC (20 to 100)")
     expect(value).to_have_value("60")
     value.fill("101")
-    page.get_by_role("button", name="Queue").click()
+    press(page, "Queue")
     assert not value.evaluate("input => input.validity.valid")
 
 
@@ -382,8 +386,13 @@ def test_a_telecommand_that_the_dictionary_refuses_is_told(page):
     settled(page, "/commands")
     page.locator("#name").select_option("insert_activity")
     page.locator("#argument-items").fill("300\n4")
-    page.get_by_role("button", name="Queue").click()
+    press(page, "Queue")
     expect(page.locator("#notices .bad")).to_be_visible()
+
+
+def _draft(page, name, hour):
+    times = {"start": f"2030-01-01T{hour}:00:00Z", "stop": f"2030-01-01T{hour}:20:00Z"}
+    page.request.post("/api/v1/windows", data=times | {"name": name, "spacecraft_id": 76})
 
 
 def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
@@ -391,12 +400,12 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     page.get_by_text("Upload a downlink or an ephemeris").click()
     page.locator("#file").set_input_files(day_of_orbits)
     page.locator("#kind").select_option("ephemerides")
-    page.get_by_role("button", name="Upload").click()
+    press(page, "Upload")
     expect(page.locator("#notices")).to_contain_text("361 states")
 
     settled(page, "/planner")
     page.locator("#ephemeris").select_option(label="orbits.oem, 2030-01-01 00:00:00")
-    page.get_by_role("button", name="Search").click()
+    press(page, "Search")
     expect(page.locator("#candidates tbody tr").first).to_be_visible()
     page.locator("#candidates").get_by_role("button", name="Plan").nth(1).click()
     bar = page.locator("#timeline .window.draft")
@@ -406,9 +415,9 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     page.keyboard.press("ArrowRight")
     expect(page.locator("#windows tbody td").nth(1)).not_to_have_text(start)
 
-    page.get_by_role("button", name="Approve").click()
+    press(page, "Approve")
     expect(page.locator("#selected")).to_contain_text("approved")
-    page.get_by_role("button", name="Uplink").click()
+    press(page, "Uplink")
     question = page.get_by_role("dialog", name=re.compile("^Release the telecommands of"))
     expect(question).to_contain_text("on reception")
     expect(question).to_contain_text("function start observation, duration")
@@ -418,7 +427,7 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     expect(page.get_by_role("button", name="Uplink")).to_be_hidden()
 
     page.locator("#altitude-max").fill("10")
-    page.get_by_role("button", name="Search").click()
+    press(page, "Search")
     expect(page.locator("#candidates")).to_contain_text("excluded by altitude at most 10 km")
     page.get_by_text("Enter a window").click()
     page.locator("#enter-name").fill("by hand")
@@ -426,19 +435,19 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     page.locator("#enter-stop").fill("2030-01-01T05:10:00Z")
     page.get_by_role("button", name="Enter", exact=True).click()
     expect(page.locator("#selected")).to_contain_text("2030-01-01 05:10:00")
-    page.get_by_role("button", name="Telecommands").click()
-    expect(page.locator("#sequence tbody tr").last).to_contain_text("2030-01-01 05:10:00")
+    press(page, "Telecommands")
+    sequence = page.get_by_role("table", name="Telecommands of the window").locator("tbody tr")
+    expect(sequence.last).to_contain_text("2030-01-01 05:10:00")
+    _draft(page, "of another user", "04")
+    expect(page.locator("#windows")).to_contain_text("of another user")
+    expect(sequence.last).to_contain_text("2030-01-01 05:10:00")
     settled(page, "/commands")
     expect(page.locator("#commands tbody tr", has_text="insert activity").first).to_contain_text("released")
 
 
 def test_a_draft_is_dragged_and_taken_off_the_plan(page, day_of_orbits):
     settled(page, "/planner")
-    page.evaluate(
-        """async () => fetch("/api/v1/windows", {method: "POST", headers: {"Content-Type": "application/json"},
-        body: JSON.stringify({name: "to be moved", start: "2030-01-01T03:00:00Z", stop: "2030-01-01T03:20:00Z",
-        spacecraft_id: 76})})"""
-    )
+    _draft(page, "to be moved", "03")
     bar = page.get_by_role("button", name="to be moved, draft")
     expect(bar).to_be_visible()
     before = bar.get_attribute("aria-label")
@@ -451,8 +460,8 @@ def test_a_draft_is_dragged_and_taken_off_the_plan(page, day_of_orbits):
     page.mouse.move(box["x"] + box["width"] / 2 + 60, box["y"] + box["height"] / 2, steps=4)
     page.mouse.up()
     expect(page.get_by_role("button", name=before, exact=True)).to_have_count(0)
-    page.get_by_role("button", name="to be moved, draft").click()
-    page.get_by_role("button", name="Delete").click()
+    press(page, "to be moved, draft")
+    press(page, "Delete")
     expect(page.get_by_role("button", name="to be moved, draft")).to_have_count(0)
 
 
@@ -469,8 +478,8 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
     )
     assert grey == [24, 24, 24]  # the last frame's level
     console.heard.clear()
-    page.get_by_role("button", name="Pause").click()
-    page.get_by_role("button", name="Step").click()
+    press(page, "Pause")
+    press(page, "Step")
     page.get_by_label("Rate").select_option("60")
     wait_until(lambda: len(console.heard) >= 3, f"heard no more than {console.heard}")
     assert console.heard == ["pause", "step", "rate 60"]
@@ -517,7 +526,7 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
     for kind, file in files:
         page.locator("#zip-kind").select_option(kind)
         page.locator("#zip").set_input_files(file)
-        page.get_by_role("button", name="Upload").click()
+        press(page, "Upload")
         expect(page.locator("#notices .good")).to_have_count(1 + files.index((kind, file)))
     for candidate, verdict in (("good", "pass"), ("half", "fail"), ("broken", "fail")):
         for select, build in (("#candidate", candidate), ("#baseline", "good")):
