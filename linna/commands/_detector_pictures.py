@@ -157,7 +157,7 @@ def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:
     if outcome.sun is None:
         return {"source": "unknown", "azimuth_deg": None, "confidence": None}
     return {
-        "source": "found",
+        "source": "found" if outcome.sun.determined else "undetermined",
         "azimuth_deg": round(outcome.sun.azimuth_deg, 1),
         "confidence": round(outcome.sun.confidence, 3),
     }
@@ -166,8 +166,9 @@ def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:
 def _sun_sentence(sun: dict[str, Any]) -> str:
     if sun["azimuth_deg"] is None:
         return "Sun azimuth not given and not found: no turn of the image shows a crater; searched as it is"
+    word = "found" if sun["source"] == "found" else "undetermined by half a turn, most likely"
     return (
-        f"Sun azimuth not given; found {sun['azimuth_deg']:.0f} degrees clockwise from the top "
+        f"Sun azimuth not given; {word} {sun['azimuth_deg']:.0f} degrees clockwise from the top "
         f"(confidence {sun['confidence']:.2f})"
     )
 

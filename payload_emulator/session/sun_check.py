@@ -13,20 +13,19 @@ from payload_emulator.session.world import World
 
 _FRAMES = 3
 _WIDEST_DEG = 45.0  # a quarter turn of the image brings no other Sun within 45 degrees of its top
-_LEAST_CONFIDENCE = 0.5
 
 
 def sun_warnings(world: World, detector: OnnxDetector) -> list[str]:
     """Return a line for each of three external frames whose Sun differs from that of the ephemeris.
 
-    A frame without craters from which the direction of the Sun can be found is not compared.
+    A frame whose craters leave the direction of the Sun undetermined is not compared.
     """
     warnings = []
     rows = np.linspace(0, world.frame_utc_ns.size - 1, _FRAMES, dtype=int)
     for utc_ns in world.frame_utc_ns[np.unique(rows)].tolist():
         exposure = expose(world, utc_ns)
         seen = find_sun(detector, prepare_image(exposure.image, detector.preparation).gray)
-        if seen is None or seen.confidence < _LEAST_CONFIDENCE:
+        if seen is None or not seen.determined:
             continue
         right, down = exposure.attitude[4:6]
         azimuth_deg = float(np.degrees(np.arctan2(right, -down))) % 360.0

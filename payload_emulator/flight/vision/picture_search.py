@@ -3,8 +3,10 @@
 The network is trained on images whose Sun is within 45 degrees of the top, so the direction of the Sun decides which of
 the four quarter turns is searched. Where it is not stated, it is found in two steps. First, up to four squares of the
 picture, enlarged twice, are searched in all four turns; the turn with the most evidence is taken. Evidence is the sum
-of the sixth powers of the scores of at least 0.44, so that sure craters decide and not the number of doubtful ones.
-Second, the azimuth follows from the brightness inside the craters found: the wall that faces the Sun is the bright one.
+over all craters of the picture of the fourth power of the score times how concave the ground is: the first harmonic of
+the brightness toward the Sun inside the rim minus that outside. Second, the azimuth follows from the brightness inside
+the craters found: the wall that faces the Sun is the bright one. A turn whose opposite has nearly as much evidence
+leaves the direction undetermined.
 
 The numbers of this module were fixed on rendered validation frames (`scenarios/detector-validation.toml`), never on
 photographs; `docs/detector.md` has the figures.
@@ -23,18 +25,22 @@ from payload_emulator.flight.vision.detector import INPUT_SIZE_PX, OnnxDetector,
 from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_image, sun_up_turns, turn_back
 
 EVIDENCE_SCORE = 0.44
-EVIDENCE_POWER = 6.0
-CONFIDENCE_POWER = 2.6
-"""Evidence to this power, as shares of the four turns, is the probability of a turn (maximum likelihood, squares of
-128 px of the validation frames; larger pictures are somewhat surer than stated)."""
+EVIDENCE_POWER = 4.0
+LEAST_EVIDENCE = 0.3
+ODDS_POWER = 7.3
+"""Evidence of two opposite turns, each plus `LEAST_EVIDENCE`, to this power are as their probabilities (maximum
+likelihood, 2,400 squares of 96 to 256 px of the validation frames)."""
+LEAST_CONFIDENCE = 0.95
+"""Of the half turn; below it the direction is undetermined."""
 
 _EVIDENCE_SQUARE_PX = INPUT_SIZE_PX // 2
 _LEAST_DIPOLE_PX = 8.0  # inside a smaller crater, a few pixels decide
-_DIPOLE_SHARE = 0.8  # of the radius: the rim itself and what lies beyond are left out
+_INSIDE = 0.8  # of the radius: without the rim itself
+_OUTSIDE = (1.1, 1.6)
 
-SMALL_CRATERS_PX = 32.0
-"""Up to this diameter, in pixels of the picture, craters are taken from the enlarged picture. On every source of the
-validation frames its F1 from 12 to 32 px is at least that of the picture itself; above, that is not so."""
+SMALL_CRATERS_PX = 48.0
+"""Up to this diameter, in pixels of the picture, craters are also taken from the enlarged picture. On every source of
+the validation frames the F1 of both together from 16 to 64 px is at least that of the picture itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +48,7 @@ class SunEstimate:
     """Direction of the Sun in a picture, from the picture.
 
     azimuth_deg : clockwise from the top of the picture, 0 to 360.
-    confidence : probability that the turn with the most evidence is right; .25 would be a guess.
+    confidence : probability that the Sun is not in the opposite direction; .5 would be a guess.
     evidence : of the turns that have the Sun at 0, 90, 180 and 270 degrees.
     craters : from which the azimuth was computed; 0 leaves the azimuth of the turn.
     """
@@ -51,6 +57,11 @@ class SunEstimate:
     confidence: float
     evidence: tuple[float, float, float, float]
     craters: int
+
+    @property
+    def determined(self) -> bool:
+        """Whether the picture decides between the two opposite directions."""
+        return self.confidence >= LEAST_CONFIDENCE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,26 +116,26 @@ def find_sun(detector: OnnxDetector, gray: NDArray[np.float32]) -> SunEstimate |
     """Direction of the Sun from a prepared plane (H, W); None where no turn shows a crater."""
     squares = [enlarge(square) for square in _squares(gray)]
     evidence = np.zeros(4)
-    found: list[list[Detections]] = []
+    pulls: list[NDArray[np.complex128]] = []
     for turns in range(4):
-        found.append([detector.search(np.rot90(square, turns), EVIDENCE_SCORE) for square in squares])
-        evidence[turns] = sum(float((part.score**EVIDENCE_POWER).sum()) for part in found[-1])
+        parts = [
+            _walls(plane, detector.search(plane, EVIDENCE_SCORE))
+            for plane in (np.rot90(square, turns) for square in squares)
+        ]
+        pulls.append(np.concatenate([pull for pull, _ in parts]))
+        evidence[turns] = sum(float(concave.sum()) for _, concave in parts)
     if not evidence.any():
         return None
     best = int(np.argmax(evidence))
-    share = (evidence / evidence[best]) ** CONFIDENCE_POWER
-    upright = [np.rot90(square, best) for square in squares]
-    pulls = np.concatenate(
-        [_bright_walls(plane, part) for plane, part in zip(upright, found[best], strict=True)]
-    )
-    away = complex(pulls.sum()) if pulls.size else 0j
+    away = complex(pulls[best].sum())
     # In the turned plane: the Sun is opposite to the bright walls. Clockwise from the top: right is +90 degrees.
     tilt = float(np.degrees(np.angle(complex(away.imag, -away.real)))) if away else 0.0
+    odds = ((evidence[best] + LEAST_EVIDENCE) / (evidence[best - 2] + LEAST_EVIDENCE)) ** ODDS_POWER
     return SunEstimate(
         azimuth_deg=(90.0 * best + tilt) % 360.0,
-        confidence=float(1.0 / share.sum()),
+        confidence=float(odds / (1.0 + odds)),
         evidence=(float(evidence[0]), float(evidence[1]), float(evidence[2]), float(evidence[3])),
-        craters=int(pulls.size),
+        craters=int(pulls[best].size),
     )
 
 
@@ -166,24 +177,34 @@ def _squares(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     ]
 
 
-def _bright_walls(plane: NDArray[np.float32], found: Detections) -> NDArray[np.complex128]:
-    """For each crater of a plane the direction of its bright wall (right + i down, unit) times its score, (n,)."""
-    rows, columns = plane.shape
-    pulls = []
+def _walls(plane: NDArray[np.float32], found: Detections) -> tuple[FloatArray]:
+    """For each crater of a plane: the direction of its bright wall (right + i down, unit) times its score, (n,), and
+    its evidence that the Sun is at the top, (n,)."""
+    pulls, evidence = [], []
     for u, v, diameter, score in zip(found.u_px, found.v_px, found.diameter_px, found.score, strict=True):
-        radius = 0.5 * _DIPOLE_SHARE * diameter
-        left, right = int(max(0, np.ceil(u - radius))), int(min(columns - 1, u + radius))
-        top, bottom = int(max(0, np.ceil(v - radius))), int(min(rows - 1, v + radius))
-        if not diameter >= _LEAST_DIPOLE_PX or right <= left or bottom <= top:
+        radius = 0.5 * diameter
+        if not diameter >= _LEAST_DIPOLE_PX:
             continue
-        down, across = np.mgrid[top : bottom + 1, left : right + 1]
-        inside = (across - u) ** 2 + (down - v) ** 2 <= radius**2
-        values = plane[top : bottom + 1, left : right + 1][inside].astype(np.float64)
-        values -= values.mean()
-        pull = complex(float((across - u)[inside] @ values), float((down - v)[inside] @ values))
-        if pull:
-            pulls.append(score * pull / abs(pull))
-    return np.array(pulls, dtype=np.complex128)
+        top, left = (int(max(0, np.ceil(x - _OUTSIDE[1] * radius))) for x in (v, u))
+        values = plane[top : int(v + _OUTSIDE[1] * radius) + 1, left : int(u + _OUTSIDE[1] * radius) + 1]
+        place = np.add.outer(
+            1j * (np.arange(values.shape[0]) + top - v), np.arange(values.shape[1]) + left - u
+        )
+        share = np.abs(place) / radius
+        inside, outside = share <= _INSIDE, (share > _OUTSIDE[0]) & (share <= _OUTSIDE[1])
+        if np.count_nonzero(inside) < 2 or np.count_nonzero(outside) < 2:
+            continue
+        contrast = float(values[inside | outside].std(dtype=np.float64)) * radius
+        within, beyond = (_harmonic(values[part], place[part]) for part in (inside, outside))
+        if within and contrast:
+            pulls.append(score * within / abs(within))
+            evidence.append(score**EVIDENCE_POWER * max(0.0, (within - beyond).imag / contrast))
+    return np.array(pulls, dtype=np.complex128), np.array(evidence, dtype=np.float64)
+
+
+def _harmonic(values: NDArray[np.float32], place: NDArray[np.complex128]) -> complex:
+    """Mean of the place weighted by the brightness above its mean."""
+    return complex((place * (values - values.mean(dtype=np.float64))).mean())
 
 
 def _search_enlarged(detector: OnnxDetector, upright: NDArray[np.float32]) -> Detections:
@@ -199,11 +220,6 @@ def _search_enlarged(detector: OnnxDetector, upright: NDArray[np.float32]) -> De
 
 
 def _merge(coarse: Detections, fine: Detections, detector: OnnxDetector) -> Detections:
-    """Small craters of the enlarged plane and the larger ones of the plane itself, best first, each once."""
-    every = join(
-        [
-            coarse.select(coarse.diameter_px > SMALL_CRATERS_PX),
-            fine.select(fine.diameter_px <= SMALL_CRATERS_PX),
-        ]
-    )
+    """Craters of the plane and the smaller ones of the enlarged plane, best first, each once."""
+    every = join([coarse, fine.select(fine.diameter_px <= SMALL_CRATERS_PX)])
     return drop_duplicates(every.select(np.argsort(-every.score, kind="stable")), detector.parameters)

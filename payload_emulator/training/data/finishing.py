@@ -85,7 +85,7 @@ class _CocoFile:
         self._unfinished = path.with_name(f".{path.name}.{os.getpid()}")
         self._out = self._unfinished.open("wb")
         self._digest = hashlib.sha256()
-        self._images: list[int] = []
+        self._images: list[tuple[int, float]] = []
         self._count = 0
         categories = [
             {"id": number + FIRST_ID, "name": name, "supercategory": "crater"} for number, name in CATEGORIES
@@ -98,7 +98,8 @@ class _CocoFile:
         self._write(json.dumps(head)[:-1] + ', "annotations": [')
 
     def add(self, frame: Frame) -> None:
-        self._images.append(frame.number)
+        azimuth = math.degrees(math.atan2(frame.sun_camera[0], -frame.sun_camera[1])) % 360.0
+        self._images.append((frame.number, round(azimuth, 3)))
         for annotation in _annotations(frame, *self._size):
             self._count += 1
             self._write((", " if self._count > 1 else "") + json.dumps({"id": self._count} | annotation))
@@ -110,8 +111,9 @@ class _CocoFile:
                 "file_name": f"images/{number:06d}.png",
                 "width": self._size[0],
                 "height": self._size[1],
+                "sun_azimuth_deg": azimuth,
             }
-            for number in self._images
+            for number, azimuth in self._images
         ]
         self._write(f'], "images": {json.dumps(images)}}}')
         self._out.close()

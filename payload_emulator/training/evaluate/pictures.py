@@ -336,14 +336,16 @@ def _sun_figures(
                 "quality": search.quality.name.lower(),
                 "azimuth_deg": None if sun is None else round(sun.azimuth_deg, 1),
                 "confidence": None if sun is None else round(sun.confidence, 3),
+                "determined": sun is not None and sun.determined,
                 "given_deg": float(azimuth) if np.isfinite(azimuth) else None,
             }
         )
-        if sun is not None and np.isfinite(azimuth):
+        if sun is not None and sun.determined and np.isfinite(azimuth):
             errors.append(abs((sun.azimuth_deg - float(azimuth) + 180.0) % 360.0 - 180.0))
     return {
         "images": rows,
         "not_found": sum(row["azimuth_deg"] is None for row in rows),
+        "undetermined": sum(not row["determined"] for row in rows),
         "compared": len(errors),
         "right_share": float(np.mean(np.array(errors) <= SUN_RIGHT_DEG)) if errors else math.nan,
         "median_error_deg": float(np.median(errors)) if errors else math.nan,
@@ -354,11 +356,11 @@ def _sun_line(sun: dict[str, Any]) -> str:
     if sun["compared"]:
         return (
             f"Sun azimuth found within {SUN_RIGHT_DEG:g} degrees of the given one in {sun['right_share']:.1%} of "
-            f"{sun['compared']} images, median error {sun['median_error_deg']:.1f} degrees"
+            f"{sun['compared']} images, median error {sun['median_error_deg']:.1f} degrees; "
+            f"undetermined in {sun['undetermined']}"
         )
-    sure = [row["confidence"] for row in sun["images"] if row["confidence"] is not None]
-    found = f"median confidence {np.median(sure):.2f}" if sure else "none"
-    return f"Sun azimuth not given; found in {len(sure)} of {len(sun['images'])} images, {found}"
+    total = len(sun["images"])
+    return f"Sun azimuth not given; found in {total - sun['undetermined']} of {total} images"
 
 
 def _row(name: str, row: dict[str, Any]) -> str:
