@@ -159,7 +159,10 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
             **_registration(world),
         },
         "detector": _detector(scenario),
-        "reference": _reference(scenario),
+        "reference": {
+            "source": "simulated orbit determination, one solution for the whole pass",
+            "sigma_rtn_m": list(scenario.reference.sigma_rtn_m),
+        },
         "evidence": _evidence(world),
         "observation": {
             "latitude_limit_deg": _latitude_limit_deg(world),
@@ -410,13 +413,6 @@ def _detector(scenario: Scenario) -> dict[str, Value]:
         "sha256": onnx.sha256,
         "score_threshold": onnx.score_threshold,
         "max_detections": section.max_detections,
-    }
-
-
-def _reference(scenario: Scenario) -> dict[str, Value]:
-    return {
-        "source": "simulated orbit determination, one solution for the whole pass",
-        "sigma_rtn_m": list(scenario.reference.sigma_rtn_m),
     }
 
 

@@ -125,9 +125,7 @@ class World:
         )
 
 
-@functools.lru_cache(maxsize=16)
-def _parsed_utc(text: str) -> int:
-    return parse_utc(text)
+_parsed_utc = functools.lru_cache(maxsize=16)(parse_utc)
 
 
 def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:

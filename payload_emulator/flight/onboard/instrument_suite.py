@@ -12,7 +12,6 @@ import numpy as np
 from lunar.arrays import FloatArray
 from payload_emulator.flight.instruments import (
     AttitudeEstimate,
-    FlightInstrument,
     Knowledge,
     Reading,
     flight_instruments,
@@ -59,7 +58,7 @@ class FrameReadings:
 
 def start_suite(parameters: Mapping[str, Any]) -> SuiteState:
     """Return the state after a boot; `parameters` holds those of each installed instrument by name."""
-    return SuiteState({name: _declared(name).start(values) for name, values in parameters.items()})
+    return SuiteState({name: flight_instruments()[name].start(values) for name, values in parameters.items()})
 
 
 def read_frame(
@@ -136,10 +135,6 @@ def _outcome_fields(innovation: Innovation | None) -> dict[str, object]:
         "innovation": innovation.residual,
         "innovation_sigma": innovation.sigma,
     }
-
-
-def _declared(name: str) -> FlightInstrument:
-    return flight_instruments()[name]
 
 
 def _usable(samples: FloatArray | None, columns: int, ticks: int) -> FloatArray:

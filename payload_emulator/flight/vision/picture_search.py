@@ -55,7 +55,7 @@ class SunEstimate:
 
     azimuth_deg: float
     confidence: float
-    evidence: tuple[float, float, float, float]
+    evidence: tuple[float, ...]
     craters: int
 
     @property
@@ -134,7 +134,7 @@ def find_sun(detector: OnnxDetector, gray: NDArray[np.float32]) -> SunEstimate |
     return SunEstimate(
         azimuth_deg=(90.0 * best + tilt) % 360.0,
         confidence=float(odds / (1.0 + odds)),
-        evidence=(float(evidence[0]), float(evidence[1]), float(evidence[2]), float(evidence[3])),
+        evidence=tuple(evidence.tolist()),
         craters=int(pulls[best].size),
     )
 

@@ -7,7 +7,6 @@ the beam. Where the ground inside the footprint is sloped or rough the echo is l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,10 +79,6 @@ def _limits(settings: AltimeterSection) -> tuple[Limit, ...]:
             settings.rim_height_share,
         ),
     )
-
-
-def _data_sheet(settings: AltimeterSection) -> Mapping[str, object]:
-    return {"range_sigma_m": settings.range_noise_m, "rim_height_share": settings.rim_height_share}
 
 
 def measure(
@@ -163,7 +158,10 @@ INSTRUMENT = SimulatedInstrument(
     cadence_s=lambda settings: float(settings.cadence_s),
     # Ranges lie between frames, so that each is used at its own time and none at that of an image.
     delay_s=lambda settings: 0.5 * float(settings.cadence_s),
-    data_sheet=_data_sheet,
+    data_sheet=lambda settings: {
+        "range_sigma_m": settings.range_noise_m,
+        "rim_height_share": settings.rim_height_share,
+    },
     start=lambda settings, surroundings: None,
     measure=measure,
 )

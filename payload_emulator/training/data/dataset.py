@@ -114,6 +114,11 @@ class Frame:
     position_mcmf_m: FloatArray
     craters: dict[str, NDArray[Any]]
 
+    @property
+    def sun_azimuth_rad(self) -> float:
+        """Azimuth of the Sun in the image, clockwise from its top."""
+        return float(np.arctan2(self.sun_camera[0], -self.sun_camera[1]))
+
 
 class Dataset:
     """A data set opened for reading.
@@ -248,7 +253,7 @@ def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
         ids=craters["id"].astype(np.int64),
         width_px=dataset.width_px,
         height_px=dataset.height_px,
-        sun_azimuth_image_rad=float(np.arctan2(frame.sun_camera[0], -frame.sun_camera[1])),
+        sun_azimuth_image_rad=frame.sun_azimuth_rad,
         block=int(frame.values["block"]),
     )
 

@@ -98,8 +98,7 @@ class _CocoFile:
         self._write(json.dumps(head)[:-1] + ', "annotations": [')
 
     def add(self, frame: Frame) -> None:
-        azimuth = math.degrees(math.atan2(frame.sun_camera[0], -frame.sun_camera[1])) % 360.0
-        self._images.append((frame.number, round(azimuth, 3)))
+        self._images.append((frame.number, round(math.degrees(frame.sun_azimuth_rad) % 360.0, 3)))
         for annotation in _annotations(frame, *self._size):
             self._count += 1
             self._write((", " if self._count > 1 else "") + json.dumps({"id": self._count} | annotation))

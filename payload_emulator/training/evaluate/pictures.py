@@ -353,14 +353,13 @@ def _sun_figures(
 
 
 def _sun_line(sun: dict[str, Any]) -> str:
-    if sun["compared"]:
-        return (
-            f"Sun azimuth found within {SUN_RIGHT_DEG:g} degrees of the given one in {sun['right_share']:.1%} of "
-            f"{sun['compared']} images, median error {sun['median_error_deg']:.1f} degrees; "
-            f"undetermined in {sun['undetermined']}"
-        )
-    total = len(sun["images"])
-    return f"Sun azimuth not given; found in {total - sun['undetermined']} of {total} images"
+    line = f"Sun azimuth undetermined in {sun['undetermined']} of {len(sun['images'])} images"
+    if not sun["compared"]:
+        return line
+    return (
+        f"{line}; found within {SUN_RIGHT_DEG:g} degrees of the given one in {sun['right_share']:.1%} of "
+        f"{sun['compared']}, median error {sun['median_error_deg']:.1f} degrees"
+    )
 
 
 def _row(name: str, row: dict[str, Any]) -> str:

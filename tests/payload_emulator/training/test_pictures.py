@@ -259,7 +259,7 @@ def test_a_set_without_its_sun_is_searched_with_the_sun_that_is_found(tmp_path, 
     assert found["centre"]["recall"] == 1.0
     assert found["by_sun"]["upright"]["strict"]["f1"] < found["strict"]["f1"]
     assert found["per_class"] is None and found["pixel_m"] is None
-    assert "Sun azimuth not given; found in 2 of 2 images" in format_picture_figures(found)
+    assert "Sun azimuth undetermined in 0 of 2 images" in format_picture_figures(found)
 
 
 def test_a_set_with_its_sun_tells_both(tmp_path, detector):
