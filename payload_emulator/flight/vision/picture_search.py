@@ -177,7 +177,7 @@ def _squares(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     ]
 
 
-def _walls(plane: NDArray[np.float32], found: Detections) -> tuple[FloatArray]:
+def _walls(plane: NDArray[np.float32], found: Detections) -> tuple[NDArray[np.complex128], FloatArray]:
     """For each crater of a plane: the direction of its bright wall (right + i down, unit) times its score, (n,), and
     its evidence that the Sun is at the top, (n,)."""
     pulls, evidence = [], []
