@@ -1,9 +1,9 @@
-"""Time to interactive of every page over a full database: python -m benchmarks.pages [--passes N] [--rows N].
+"""First paint and time to interactive of every page: python -m benchmarks.pages [--passes N] [--rows N].
 
 A service with passes of one spacecraft and rows of housekeeping is seeded and served, and every page is
 opened in Chromium with an empty cache, three times. A page is interactive when it has handled the last answer it asked
 for and its main thread is idle; the middle of the three is printed, with the processor time that the page's main thread
-took, which a busy machine does not stretch. `--home` opens the pages of an existing service's home instead.
+took, which a busy machine does not stretch.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.service import define_pass
 from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
 from ground_service.store.vehicles import vehicle_id
+from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from studies.harness.parts import Part, answers_http, free_port
 from tmtc.dictionary import DICTIONARY
@@ -126,17 +127,19 @@ def open_chromium() -> Iterator[Any]:
 
 
 def measure(url: str, paths: Sequence[str]) -> dict[str, dict[str, int]]:
-    """Milliseconds to interactive, and of the main thread's processor, of each page."""
+    """Milliseconds to the first paint, to interactive, and of the main thread's processor, of each page."""
     found: dict[str, dict[str, int]] = {}
     with open_chromium() as chromium:
         for path in paths:
             opened = [_opened(chromium, url + path) for _ in range(_TIMES)]
-            clock, processor = (round(statistics.median(one)) for one in zip(*opened, strict=True))
-            found[path] = {"clock": clock, "main_thread": processor}
+            found[path] = {
+                name: round(statistics.median(one))
+                for name, *one in zip(("paint", "clock", "main_thread"), *opened, strict=True)
+            }
     return found
 
 
-def _opened(chromium: Any, address: str) -> tuple[float, float]:
+def _opened(chromium: Any, address: str) -> tuple[float, float, float]:
     context = chromium.new_context(viewport={"width": 1280, "height": 900})
     page = context.new_page()
     page.add_init_script(_WATCH)
@@ -147,28 +150,16 @@ def _opened(chromium: Any, address: str) -> tuple[float, float]:
         f"() => linnaBench.open === 0 && linnaBench.idle !== null && performance.now() - linnaBench.idle > {_QUIET_MS}",
         timeout=_LIMIT_MS,
     )
-    at = float(page.evaluate("() => linnaBench.idle"))
+    paint = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? NaN"
+    painted, at = map(float, page.evaluate(f"() => [{paint}, linnaBench.idle]"))
     metrics = {one["name"]: one["value"] for one in session.send("Performance.getMetrics")["metrics"]}
     context.close()
-    return at, 1e3 * metrics["TaskDuration"]
+    return painted, at, 1e3 * metrics["TaskDuration"]
 
 
-def bench(passes: int, rows: int, home: Path | None) -> dict[str, Any]:
+def bench(passes: int, rows: int) -> dict[str, Any]:
     """Milliseconds to interactive of every page, and what the database held."""
-    pages = [
-        "/",
-        "/planner",
-        "/passes",
-        "/passes/1",
-        "/telemetry",
-        "/commands",
-        "/regression",
-        "/live",
-        "/licences",
-    ]
-    if home is not None:
-        with served(home) as url:
-            return {"interactive_ms": measure(url, pages)}
+    pages = [one.path for one in PAGES if "{" not in one.path] + ["/passes/1"]
     folder = Path(tempfile.mkdtemp(prefix="linna-pages-"))
     try:
         clock = time.perf_counter()
@@ -184,7 +175,7 @@ def bench(passes: int, rows: int, home: Path | None) -> dict[str, Any]:
 def rows() -> Iterator[Row]:
     """Yield the time to interactive of each page; the peer is the limit of one second."""
     needs("Chromium", "chromium", "chromium-browser", "google-chrome")
-    for path, found in bench(200, 200_000, None)["interactive_ms"].items():
+    for path, found in bench(200, 200_000)["interactive_ms"].items():
         yield Row(f"{path}: interactive", found["clock"], "ms", "limit", 1000.0)
 
 
@@ -192,9 +183,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--passes", type=int, default=1_000)
     parser.add_argument("--rows", type=int, default=10_000_000)
-    parser.add_argument("--home", type=Path, help="open the pages of this home; nothing is seeded")
     arguments = parser.parse_args()
-    print(json.dumps(bench(arguments.passes, arguments.rows, arguments.home), indent=2))
+    print(json.dumps(bench(arguments.passes, arguments.rows), indent=2))
 
 
 if __name__ == "__main__":

@@ -9,10 +9,11 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import TIMEOUT_MAX, Timer
 
 from ground_service.clock import mission_now_ns
 from ground_service.contacts.links import service as links
-from ground_service.errors import GroundError, InvalidInput
+from ground_service.errors import GroundError, InvalidInput, Stopping
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.missions.catalogues import add_catalogue
@@ -35,6 +36,11 @@ ASSUMED = {"name": "dry run", "windows": 10, "period_days": 1.0, "horizon_days":
 """Request of a dry run in a service without one of the spacecraft."""
 
 NO_EPHEMERIS = "no ephemeris of the spacecraft covers the time from now on"
+
+MOST_S = 20.0
+"""Longest dry run of a request to the service."""
+
+TOO_LONG = "the dry run takes too long for a request to the service: use linna mission check --flight"
 
 OPERATOR, APPROVER = "dry run", "dry run, second person"
 
@@ -69,25 +75,31 @@ def rehearsed(ground: Ground, octets: bytes) -> DryRun:
         (folder / MISSION).write_bytes(octets)
         (folder / REQUEST).write_text(json.dumps(asked or [ASSUMED | {"spacecraft_id": craft.id}]))
         shutil.copyfile(ground.files.path(mine[0]), folder / REFERENCE)
-        flown = fly(folder / MISSION, ground.data, now)
+        flown = fly(folder / MISSION, ground.data, now, MOST_S)
     return replace(flown, faults=tuple(one.replace(f"{folder}/", "") for one in flown.faults))
 
 
-def fly(mission: Path, data: DataFolder, now_utc_ns: int = 0) -> DryRun:
+def fly(mission: Path, data: DataFolder, now_utc_ns: int = 0, most_s: float = TIMEOUT_MAX) -> DryRun:
     """Plan the standing requests beside a mission description and release their telecommands; nothing is sent.
 
     The time is that at which the reference ephemeris begins, or `now_utc_ns` if that is later. A person approves
     windows that are not approved automatically, another one releases them.
     """
     with tempfile.TemporaryDirectory() as home, open_ground(Path(home), data) as ground:
+        limit = Timer(most_s, ground.stopping.set)
+        limit.start()
         try:
             requests, begin_utc_ns = _posted(ground, mission)
             start_utc_ns = max(begin_utc_ns, now_utc_ns)
             standing.plan_tick(ground, start_utc_ns)
             faults = list(_faults(ground, mission, requests, start_utc_ns))
             windows = ground.read(store.list_windows, WindowFilter()).items
+        except Stopping:
+            return DryRun(faults=(TOO_LONG,))
         except (GroundError, LunarError) as error:
             return DryRun(faults=(str(error),))
+        finally:
+            limit.cancel()
     return DryRun(tuple(sorted(windows, key=lambda one: one.start.utc_ns)), tuple(faults))
 
 
@@ -126,6 +138,7 @@ def _faults(ground: Ground, mission: Path, requests: list[int], now: int) -> Ite
         found = next(iter(told or dict(reasons.most_common(1))), "none")
         yield str(InvalidInput(str(mission.parent / REQUEST), "", "windows that can be planned", found))
     for one in windows:
+        ground.check_stopping()
         try:
             if one.state == "draft":
                 planning.change_window(ground, one.id, actor=APPROVER, changes={}, decision="approved")

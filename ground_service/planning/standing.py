@@ -325,6 +325,7 @@ def _candidates(
     found: list[tuple[int, int]] = []
     planners: list[tuple[Planner, int, int]] = []
     for day in range(start // DAY_NS, -(-end // DAY_NS)):
+        ground.check_stopping()
         begin, stop = day * DAY_NS, (day + 1) * DAY_NS
         for reference in situation.references:
             first, last = max(begin, reference.start.utc_ns), min(stop, reference.stop.utc_ns)

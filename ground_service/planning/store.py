@@ -26,6 +26,7 @@ from ground_service.planning.window_states import COMMITTED, PlannedSpan
 from ground_service.store import repository
 from ground_service.store.repository import page
 from ground_service.store.states import change_if
+from ground_service.store.telemetry import within
 
 WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
 
@@ -226,12 +227,7 @@ def has_reports_between(connection: Connection, vehicle: int, after_ticks: int, 
     version = readable_version(connection, vehicle)
     for kind in _REPORTS:
         table = repository.SAMPLES[kind]
-        query = select(table.c.ticks).where(
-            table.c.vehicle_id == vehicle,
-            table.c.dictionary_version == version,
-            table.c.ticks > after_ticks,
-            table.c.ticks <= until_ticks,
-        )
+        query = select(table.c.ticks).where(within(table, (vehicle, after_ticks + 1, until_ticks, version)))
         if connection.execute(query.limit(1)).first() is not None:
             return True
     return False

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, LargeBinary, and_, bindparam, delete, func, or_, select
+from sqlalchemy import ColumnElement, Connection, LargeBinary, and_, bindparam, delete, func, or_, select
 
 from ground_service.store.bulk import FEW_ROWS, insert_columns
 from ground_service.store.counters import hold
@@ -139,11 +139,7 @@ def rollup_rows(
     rows = connection.execute(
         select(_TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, wanted)
         .where(
-            _TABLE.c.vehicle_id == vehicle_id,
-            _TABLE.c.dictionary_version == dictionary_version,
-            _TABLE.c.kind == code,
-            _TABLE.c.part == part,
-            _TABLE.c.level == level,
+            *_of(vehicle_id, dictionary_version, code, part, level),
             _TABLE.c.bucket.between(first_bucket, last_bucket),
         )
         .order_by(_TABLE.c.bucket)
@@ -173,15 +169,15 @@ def rolled_extent(
             func.min(_TABLE.c.first_ticks),
             func.max(_TABLE.c.last_ticks),
         ).where(
-            _TABLE.c.vehicle_id == vehicle_id,
-            _TABLE.c.dictionary_version == dictionary_version,
-            _TABLE.c.kind == code,
-            _TABLE.c.part == part,
-            _TABLE.c.level == LEVELS - 1,
+            *_of(vehicle_id, dictionary_version, code, part, LEVELS - 1),
             _TABLE.c.bucket.between(start_ticks // width, stop_ticks // width),
         )
     ).one()
     return int(row[0]), int(row[1] or 0), int(row[2] or 0)
+
+
+def _of(*key: int) -> list[ColumnElement[bool]]:
+    return [_TABLE.c[name] == value for name, value in zip(_KEY, key, strict=True)]
 
 
 _Level = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]

@@ -31,6 +31,7 @@ from ground_service.ground import Ground
 from ground_service.http.common import API_PREFIX, Key
 from ground_service.missions.model import Approval, StationConnection, StationLink
 from ground_service.passes.series import STATE_VALUES
+from ground_service.planning.request_model import StandingRequestIn
 from ground_service.regression.store import get_report as get_regression_report
 from tmtc.arguments import FUNCTION_ARGUMENTS
 from tmtc.dictionary import DICTIONARY, STRUCTURES
@@ -85,18 +86,12 @@ class Page:
 DISPLAYS = Page("/mct", "mct", "Telemetry displays", "Payload", "Displays")
 """Page that `web.displays` serves."""
 
+_LINKS = (StationConnection, StationLink)
 PAGES = (
     Page("/", "shift", "Shift", "Shift", "Shift"),
-    Page("/planner", "planner", "Planner", "Plan", "Planner"),
+    Page("/planner", "planner", "Planner", "Plan", "Planner", forms=(StandingRequestIn,)),
     Page("/missions", "missions", "Missions", "Plan", "Missions"),
-    Page(
-        "/missions/{revision}",
-        "mission",
-        "Mission",
-        "Plan",
-        section="missions",
-        forms=(StationConnection, StationLink),
-    ),
+    Page("/missions/{revision}", "mission", "Mission", "Plan", "", "missions", forms=_LINKS),
     Page("/ephemerides", "ephemerides", "Reference ephemerides", "Plan", "Ephemerides"),
     Page("/automation", "automation", "Automation", "Plan", "Automation", lists="/automation/actions"),
     Page("/passes", "passes", "Passes", "Passes", "Passes"),
@@ -104,13 +99,7 @@ PAGES = (
     Page("/ingests", "ingests", "Received files", "Passes", "Received files"),
     Page("/comparison", "comparison", "Comparison of passes", "Passes", section="passes"),
     Page("/regression", "regression", "Regression", "Passes", "Regression"),
-    Page(
-        "/landmarks",
-        "landmarks",
-        "Landmarks learned from flight",
-        "Passes",
-        "Landmarks",
-    ),
+    Page("/landmarks", "landmarks", "Landmarks learned from flight", "Passes", "Landmarks"),
     Page("/telemetry", "telemetry", "Telemetry", "Payload", "Telemetry"),
     DISPLAYS,
     Page("/events", "events", "Events", "Payload", "Events"),
@@ -164,33 +153,27 @@ REPORT_POLICY = (
 """Policy of reports, which contain their styles and figures and run no script."""
 
 
-@pages.get("/reports/{report_id}")
-def report_page(request: Request, report_id: Key) -> Response:
-    """A report of a pass as a page with an address of its own."""
-    return _document(request, lambda connection: get_report(connection, report_id).html_sha256)
+def _document_answer(file_of: Callable[[Any, str], str]) -> Any:
+    def answer(request: Request, report_id: Key) -> Response:
+        try:
+            check_scope(request, caller_of(request, None))
+        except NotAuthorised:
+            return RedirectResponse(f"/?next={quote(request.url.path)}", status_code=303)
+        ground: Ground = request.app.state.ground
+        headers = {"Content-Security-Policy": REPORT_POLICY}
+        body = ground.files.get(ground.read(file_of, report_id))
+        return Response(body, media_type=MEDIA[".html"], headers=headers)
+
+    return answer
 
 
-@pages.get("/regressions/{regression_id}")
-def regression_page(request: Request, regression_id: Key) -> Response:
-    """The report of a regression as a page with an address of its own."""
-    return _document(request, lambda connection: get_regression_report(connection, regression_id))
-
-
-@pages.get("/monthly-reports/{report_id}")
-def monthly_report_page(request: Request, report_id: Key) -> Response:
-    """A monthly report as a page with an address of its own."""
-    return _document(request, lambda connection: get_monthly_report(connection, report_id).html_sha256)
-
-
-def _document(request: Request, file_of: Callable[[Any], str]) -> Response:
-    """Return a document to a signed-in browser; others are sent to the sign-in dialog and back."""
-    try:
-        check_scope(request, caller_of(request, None))
-    except NotAuthorised:
-        return RedirectResponse(f"/?next={quote(request.url.path)}", status_code=303)
-    ground: Ground = request.app.state.ground
-    headers = {"Content-Security-Policy": REPORT_POLICY}
-    return Response(ground.files.get(ground.read(file_of)), media_type=MEDIA[".html"], headers=headers)
+# Documents with addresses of their own, for a signed-in browser; others are sent to the sign-in dialog and back.
+for _path, _name, _file_of in (
+    ("/reports", "report_page", lambda *key: get_report(*key).html_sha256),
+    ("/regressions", "regression_page", get_regression_report),
+    ("/monthly-reports", "monthly_report_page", lambda *key: get_monthly_report(*key).html_sha256),
+):
+    pages.add_api_route(f"{_path}/{{report_id}}", _document_answer(_file_of), methods=["GET"], name=_name)
 
 
 @pages.get("/moon.jpg")

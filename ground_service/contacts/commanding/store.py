@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, and_, cast, func, or_, select, update
+from sqlalchemy import BigInteger, ColumnElement, Connection, and_, cast, func, or_, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.contacts.commanding.core import CommandFate, SentCommand, VerificationReport, fate_of
@@ -253,38 +253,30 @@ def sent_for_pass(connection: Connection, pass_id: int) -> bytes:
     found = window.first()
     if found is None:
         return b""
-    query = (
-        select(TELECOMMANDS.c.octets, TELECOMMANDS.c.window_id)
-        .where(
-            TELECOMMANDS.c.vehicle_id == found.vehicle_id,
-            or_(
-                TELECOMMANDS.c.window_id == found.id,
-                and_(TELECOMMANDS.c.window_id.is_(None), TELECOMMANDS.c.name == "set_parameter"),
-            ),
-            TELECOMMANDS.c.carrier_id.is_(None),
-            TELECOMMANDS.c.sent_utc_ns.is_not(None),
-            TELECOMMANDS.c.octets.is_not(None),
-        )
-        .order_by(TELECOMMANDS.c.decided_utc_ns, TELECOMMANDS.c.id)
+    concerned = or_(
+        TELECOMMANDS.c.window_id == found.id,
+        and_(TELECOMMANDS.c.window_id.is_(None), TELECOMMANDS.c.name == "set_parameter"),
     )
-    rows = connection.execute(query).all()
+    rows = connection.execute(
+        _sent_octets(found.vehicle_id, concerned, TELECOMMANDS.c.carrier_id.is_(None))
+    ).all()
     last = max((number for number, row in enumerate(rows) if row.window_id is not None), default=-1)
     return b"".join(row.octets for row in rows[: last + 1])
 
 
 def sent_parts(connection: Connection, vehicle: int) -> bytes:
     """Return the telecommand packets of uploads that were sent to a vehicle, in order of release."""
-    query = (
-        select(TELECOMMANDS.c.octets)
-        .where(
-            TELECOMMANDS.c.vehicle_id == vehicle,
-            TELECOMMANDS.c.name.startswith("uplink_"),
-            TELECOMMANDS.c.sent_utc_ns.is_not(None),
-            TELECOMMANDS.c.octets.is_not(None),
-        )
+    parts = _sent_octets(vehicle, TELECOMMANDS.c.name.startswith("uplink_"))
+    return b"".join(connection.execute(parts).scalars())
+
+
+def _sent_octets(vehicle: int, *conditions: ColumnElement[bool]) -> Select[Any]:
+    return (
+        select(TELECOMMANDS.c.octets, TELECOMMANDS.c.window_id)
+        .where(TELECOMMANDS.c.vehicle_id == vehicle, TELECOMMANDS.c.sent_utc_ns.is_not(None))
+        .where(TELECOMMANDS.c.octets.is_not(None), *conditions)
         .order_by(TELECOMMANDS.c.decided_utc_ns, TELECOMMANDS.c.id)
     )
-    return b"".join(connection.execute(query).scalars())
 
 
 def states_of_window(connection: Connection, window_id: int) -> set[str]:

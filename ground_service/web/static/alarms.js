@@ -2,7 +2,7 @@ import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
 import { chart } from "./charts.js";
 import { list } from "./lists.js";
-import { acting, byId, dictionary, element, figure, isoText, limitText, loading, notice, on, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
+import { acting, button, buttons, byId, dictionary, element, figure, isoText, limitText, loading, notice, on, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
 import { seriesOf } from "./parameters.js";
 
 const OPEN = ["raised", "acknowledged", "shelved"];
@@ -46,23 +46,17 @@ async function showDetail(id) {
 }
 
 const comment = () => ({ comment: byId("comment").value.trim() });
-const change = (path, id, body) => acting(async () => {
+const change = (path, id, body) => async () => {
   await send("POST", `alarms/${id}/${path}`, { ...comment(), ...body });
   await reload();
   if (!byId("detail-section").hidden) await showDetail(id);
-});
-
-const picked = new Set(); // survives a table that is drawn again
-const pick = (event) => picked[event.target.checked ? "add" : "delete"](Number(event.target.value));
+};
 
 async function acknowledgeChosen() {
-  const ids = [...picked];
+  const ids = [...byId("alarms").querySelectorAll("input:checked")].map((box) => box.value);
   if (!ids.length) throw new Error("Choose raised alarms in the table.");
   try {
-    for (const id of ids) {
-      picked.delete(id);
-      await send("POST", `alarms/${id}/acknowledge`, comment());
-    }
+    for (const id of ids) await send("POST", `alarms/${id}/acknowledge`, comment());
     notice(`${plural(ids.length, "alarm")} acknowledged`);
   } finally {
     await reload();
@@ -70,15 +64,13 @@ async function acknowledgeChosen() {
 }
 
 function actions(alarm) {
-  const button = (label, listener) => element("button", { type: "button", onclick: listener, "data-needs": label === "Detail" ? null : "operator", "aria-label": `${label} alarm ${alarm.id}` }, label);
+  const act = (label, task, needs) => button(label, task, { needs, name: `${label} alarm ${alarm.id}` });
   const until = (hours) => new Date(Date.now() + hours * HOUR_MS).toISOString();
-  return element(
-    "span",
-    { class: "actions" },
-    alarm.state === "raised" ? button("Acknowledge", change("acknowledge", alarm.id, {})) : null,
-    alarm.state === "shelved" ? button("Unshelve", change("shelve", alarm.id, { until: until(-1) })) : null,
-    ["raised", "acknowledged"].includes(alarm.state) ? button("Shelve 8 h", change("shelve", alarm.id, { until: until(8) })) : null,
-    button("Detail", acting(() => showDetail(alarm.id))),
+  return buttons(
+    alarm.state === "raised" ? act("Acknowledge", change("acknowledge", alarm.id, {})) : null,
+    alarm.state === "shelved" ? act("Unshelve", change("shelve", alarm.id, { until: until(-1) })) : null,
+    ["raised", "acknowledged"].includes(alarm.state) ? act("Shelve 8 h", change("shelve", alarm.id, { until: until(8) })) : null,
+    act("Detail", () => showDetail(alarm.id), null),
   );
 }
 
@@ -86,7 +78,7 @@ function restoreFilters() {
   for (const [id, usual] of [["state", "open"], ["severity", ""]]) byId(id).value = stated(id) === "any" ? "" : (stated(id) ?? usual);
 }
 
-const chosenBox = (row) => element("input", { type: "checkbox", value: row.id, checked: picked.has(row.id), onchange: pick, "data-needs": "operator", "aria-label": `choose alarm ${row.id}` });
+const chosenBox = (row) => element("input", { type: "checkbox", value: row.id, "data-needs": "operator", "aria-label": `choose alarm ${row.id}` });
 const reload = list("/alarms", {
   place: "alarms",
   columns: [

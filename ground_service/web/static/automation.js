@@ -1,6 +1,6 @@
 import { get, send } from "./api.js";
 import { list } from "./lists.js";
-import { acting, element, shown, showTable, words } from "./page.js";
+import { button, buttons, element, shown, showTable, words } from "./page.js";
 
 const columns = [
   "id",
@@ -12,23 +12,16 @@ const columns = [
   ["Cause", (row) => `event ${row.event}: ${row.text}`],
 ];
 
-const button = (row, label, decision) =>
-  element(
-    "button",
-    {
-      type: "button",
-      "data-needs": "operator",
-      "aria-label": `${label} action ${row.id}`,
-      onclick: acting(async () => {
-        await send("POST", `automation/actions/${row.id}/${decision}`);
-        await load();
-      }),
-    },
-    label,
-  );
+function decide(row, label) {
+  const decision = async () => {
+    await send("POST", `automation/actions/${row.id}/${label.toLowerCase()}`);
+    await load();
+  };
+  return button(label, decision, { name: `${label} action ${row.id}` });
+}
 
-const decisions = (row) => element("span", { class: "actions" }, button(row, "Approve", "approve"), button(row, "Refuse", "refuse"));
-const result = (row) => [row.error || shown("result", row.result), row.state === "failed" ? button(row, "Repeat", "repeat") : ""].flatMap((one) => [one, " "]);
+const decisions = (row) => buttons(decide(row, "Approve"), decide(row, "Refuse"));
+const result = (row) => [row.error || shown("result", row.result), row.state === "failed" ? decide(row, "Repeat") : ""].flatMap((one) => [one, " "]);
 
 // The other tables of the page are brought with each page of the list.
 async function query() {

@@ -1,6 +1,6 @@
 // Chain of a planned window: the steps that it has reached, the one that it waits for, and what continues it.
 import { get, send } from "./api.js";
-import { confirmed, figure, lengthText, missionNow, notice, seconds, table, timeText, words } from "./page.js";
+import { confirmed, figure, isoText, lengthText, missionNow, notice, seconds, table, timeText, words } from "./page.js";
 
 export const STEPS = ["requested", "approved", "released", "sent", "accepted", "executed", "received", "reported"];
 const VERIFIED = ["accepted", "started", "completed"];
@@ -79,25 +79,36 @@ const named = (one) => `${words(one.name)}${one.text ? `: ${one.text}` : ""}`;
 export const sequenceTable = (planned) =>
   table("Telecommands of the window", [["On board", (row) => (row.time ? timeText(row.time) : "on reception")], ["Telecommand", named]], planned, "None.");
 
-// Release the telecommands of a window after a look at them; in a contact they are sent as well.
-export async function release(window, link, contact) {
-  const { items } = await get(`windows/${window.id}/telecommands`);
-  const now = link !== null && contact?.state === "open" && contact.link === link.name;
-  const then = now ? `Link ${link.name} is in contact and sends them with what else is released.` : link?.send === "automatic" ? `Link ${link.name} sends them in its next contact.` : "They wait for Send now.";
-  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, sequenceTable(items), then];
-  if (!(await confirmed(`Release the telecommands of ${window.name}?`, lines, now ? "Release and send" : "Release"))) return;
-  const released = await send("POST", `windows/${window.id}/uplink`);
-  notice(`${window.name}: ${released.items.length} telecommands released`);
-  if (now) await order(link);
-}
+const SEND = "Release and send";
 
-async function order(link) {
+export async function order(link) {
   await send("POST", `links/${encodeURIComponent(link.name)}/send`);
   notice(`Link ${link.name} sends what is released.`);
 }
 
-// Send what is released, after a look at it.
-export async function transmit(link, waiting) {
-  const lines = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`);
-  if (await confirmed(`Send ${lines.length} telecommands over ${link.name} now?`, lines, "Send")) await order(link);
+// Release the telecommands of a window after a look at them, and send them with `others` where that is chosen.
+async function release(window, link, isOpen, others) {
+  const { items } = await get(`windows/${window.id}/telecommands`);
+  const deeds = [isOpen ? null : "Release", isOpen || link?.send === "manual" ? SEND : null].filter(Boolean);
+  const also = `Link ${link?.name} is ${isOpen ? "" : "not "}in contact. ${SEND} also sends what is released already: ${others.join("; ") || "nothing"}.`;
+  const then = deeds.includes(SEND) ? also : link ? `Link ${link.name} sends them in its next contact.` : "They wait for Send now.";
+  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, sequenceTable(items), then];
+  const chosen = await confirmed(`Release the telecommands of ${window.name}?`, lines, ...deeds);
+  if (!chosen) return;
+  const released = await send("POST", `windows/${window.id}/uplink`);
+  notice(`${window.name}: ${released.items.length} telecommands released`);
+  if (chosen === SEND) await order(link);
+}
+
+// Release the telecommands of a window, or send what is released.
+export async function uplink(window) {
+  const [links, ahead, released] = await Promise.all([get("links"), get("contacts", { since: isoText(missionNow() - 3600) }), get("telecommands", { limit: 200, state: "released" })]);
+  const contact = contactOf(window, ahead.contacts);
+  const link = uplinkOf(window, links.items, contact);
+  const waiting = released.items.filter((one) => one.spacecraft_id === window.spacecraft_id && one.instance === window.instance && one.carrier_id === null);
+  const told = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`).reverse();
+  if (!window.telecommands.length) return release(window, link, contact?.state === "open" && contact.link === link?.name, told);
+  if (!link) throw new Error("No link can send: linna command uplink writes the octets to a file.");
+  if (!told.length) throw new Error("No telecommand is released: those in the queue wait for a second person, see Commands.");
+  if (await confirmed(`Send ${told.length} telecommands over ${link.name} now?`, told, "Send")) await order(link);
 }

@@ -3,7 +3,7 @@
 import { state, stated } from "./address.js";
 import { element, figure, isoText } from "./page.js";
 
-const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const COLOURS = ["--blue", "--vermillion", "--green", "--purple", "--orange", "--sky", "--gray1"];
 export const colour = (index) => style(COLOURS[index % COLOURS.length]);
 
@@ -35,6 +35,13 @@ export function columns(buckets, seconds) {
     mean.push(bucket.mean);
   }
   return { times, low, high, mean };
+}
+
+// Errors of a solution from a time on as columns. A logarithmic axis has no zero, which is the error at a reset.
+export function errorColumns(solution, begin = 0) {
+  const at = (name, row) => solution[name][row] || null;
+  const buckets = solution.time_s.map((time, row) => ({ start: time, stop: time, min: at("min_m", row), max: at("max_m", row), mean: at("mean_m", row), after_gap: solution.after_gap[row] }));
+  return columns(buckets, (time) => time - begin);
 }
 
 // Clock times as in the tables, with the date where the day begins or the axis does.

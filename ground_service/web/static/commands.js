@@ -1,8 +1,9 @@
 import { bind } from "./address.js";
 import { get, send } from "./api.js";
+import { order } from "./chain.js";
 import { control } from "./forms.js";
 import { list } from "./lists.js";
-import { acting, byId, dictionary, element, figure, loading, notice, on, show, showTable, timeText, words } from "./page.js";
+import { button, buttons, byId, dictionary, element, figure, loading, notice, on, show, showTable, timeText, words } from "./page.js";
 
 const definition = Object.fromEntries(dictionary.telecommands.map((one) => [one.name, one]));
 const STAGES = ["accepted", "started", "completed"];
@@ -74,32 +75,18 @@ function lights(command) {
   );
 }
 
-const act = (command, deed, json) =>
-  acting(async () => {
-    await send("POST", `telecommands/${command.id}/${deed}`, json);
+const act = (label, command, json) =>
+  button(label, async () => {
+    await send("POST", `telecommands/${command.id}/${label.toLowerCase()}`, json);
     await load();
   });
 
-function deeds(command) {
-  if (command.state !== "queued") return "";
-  return element(
-    "span",
-    { class: "actions" },
-    element("button", { type: "button", "data-needs": "operator", onclick: act(command, "release") }, "Release"),
-    element("button", { type: "button", "data-needs": "operator", onclick: act(command, "reject", { reason: "rejected on the page" }) }, "Reject"),
-  );
-}
+const deeds = (command) => (command.state === "queued" ? buttons(act("Release", command), act("Reject", command, { reason: "rejected on the page" })) : "");
 
 async function loadLinks() {
   const { items } = await get("links");
-  const sending = (row) =>
-    acting(async () => {
-      await send("POST", `links/${encodeURIComponent(row.name)}/send`);
-      notice(`Link ${row.name} sends what is released.`);
-      await loadLinks();
-    });
   await loadReceivers(items);
-  const sendNow = (row) => element("button", { type: "button", "data-needs": "operator", disabled: row.unsent === 0, onclick: sending(row) }, "Send now");
+  const sendNow = (row) => button("Send now", () => order(row).then(loadLinks), { disabled: row.unsent === 0 });
   showTable(
     "links",
     "Links",

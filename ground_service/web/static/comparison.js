@@ -1,7 +1,7 @@
 // Two or more passes side by side: figures, position error over the time since their start, requirements.
 import { bind, restore, statedAll } from "./address.js";
 import { get } from "./api.js";
-import { chart, columns } from "./charts.js";
+import { chart, errorColumns } from "./charts.js";
 import { byId, element, figure, lengthText, loading, on, seconds, show, stateMark, table, timeText } from "./page.js";
 
 const asked = [...new Set(statedAll("pass"))];
@@ -101,17 +101,7 @@ function showDrift() {
     const { pass, overview } = one;
     const found = overview?.navigation.find((each) => each.name === solution);
     if (!found?.time_s.length) return [];
-    const begin = seconds(pass.start);
-    const buckets = found.time_s.map((time, row) => ({
-      start: time - begin,
-      stop: time - begin,
-      // A logarithmic axis has no zero, which is the error at a reset.
-      min: found.min_m[row] || null,
-      max: found.max_m[row] || null,
-      mean: found.mean_m[row] || null,
-      after_gap: found.after_gap[row],
-    }));
-    return [{ label: nameOf(one), ...columns(buckets, (time) => time) }];
+    return [{ label: nameOf(one), ...errorColumns(found, seconds(pass.start)) }];
   });
   show("drift");
   if (series.length) chart(byId("drift"), `error of ${solution}`, "m", series, { logarithmic: true, elapsed: true, group: "comparison", height: 320 });

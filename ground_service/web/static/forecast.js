@@ -1,5 +1,6 @@
 // Conditions and resources of the plan over time: lanes of the timeline, values at a time, ground track.
 import { get } from "./api.js";
+import { style } from "./charts.js";
 import { byId, element, figure, isoText, missionNow, show, svg, timeText } from "./page.js";
 import { densityLayer, layerItem, legendItem, moonMap, terrain, track } from "./moon.js";
 
@@ -43,11 +44,7 @@ function curves() {
 
 export const lanesHeight = () => (found?.time_s.length ? SUN_PX + 3 * CURVE_PX : 0);
 
-function text(x, y, words, kind) {
-  const made = svg("text", { x, y, class: kind });
-  made.textContent = words;
-  return made;
-}
+const text = (x, y, words, kind) => svg("text", { x, y, class: kind }, words);
 
 // Runs of equal values: [value, first index, index after the last].
 function runs(values) {
@@ -111,11 +108,8 @@ export function valuesAt(time) {
   );
 }
 
-const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-
 let map = null;
 let drawnFor = null; // spacecraft of the map
-const layers = [];
 let tracks = null;
 
 // The map of a spacecraft: its terrain, and the density of the craters of its catalogue.
@@ -123,7 +117,7 @@ export async function showMap(spacecraft, document) {
   if (drawnFor === spacecraft.spacecraft_id) return;
   drawnFor = spacecraft.spacecraft_id;
   const density = await get("plan/crater-density", { spacecraft_id: spacecraft.spacecraft_id });
-  const over = document ? terrain(document) : { albedo: false, text: "Terrain: not stated, since no mission description is in force." };
+  const over = terrain(document);
   map?.remove();
   map = moonMap(byId("map"), over);
   show("map-legend");

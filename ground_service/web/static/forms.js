@@ -15,8 +15,16 @@ const stated = (schema) => ({ ...schema.anyOf?.find((one) => one.type !== "null"
 const choices = (one) => one.enum ?? one.items?.enum ?? (one.type === "boolean" ? [true, false] : null);
 const isNumber = (one) => ["number", "integer"].includes(one.type);
 
+const ENDS = { min: "least", max: "greatest" };
+const isPair = (schema) => schema.anyOf?.some((one) => one.$ref?.endsWith("/Limits")) ?? false;
+const pair = (id, name, title) => {
+  const end = ([key, word]) => element("input", { id: `${id}-${key}`, name: `${name}.${key}`, type: "number", step: "any", "aria-label": `${word} ${labelled(name)}` });
+  return element("label", { title }, labelled(name), element("span", { class: "pair" }, Object.entries(ENDS).map(end)));
+};
+
 // The control of a property of a schema; `none` is the text of no value.
 export function property(id, name, schema, { required = false, value, none = "not stated" } = {}) {
+  if (isPair(schema)) return pair(id, name, schema.description);
   const one = stated(schema);
   const options = choices(one)?.map((each) => [String(each), typeof each === "boolean" ? (each ? "yes" : "no") : words(each)]);
   const numeric = isNumber(one) ? { type: "number", step: one.type === "integer" ? 1 : "any", min: one.minimum ?? one.exclusiveMinimum, max: one.maximum ?? one.exclusiveMaximum } : {};
@@ -42,7 +50,12 @@ export function entered(place, properties) {
     if (one.type === "boolean") return text === "true";
     return one.type === "array" ? text.split(",").map((each) => each.trim()).filter(Boolean) : text;
   };
-  return Object.fromEntries(
-    [...place.querySelectorAll("input, select")].filter((each) => each.name in properties && each.value.trim()).map((each) => [each.name, value(each.value.trim(), stated(properties[each.name]))]),
-  );
+  const found = {};
+  for (const each of place.querySelectorAll("input, select")) {
+    const [name, end] = each.name.split(".");
+    if (!(name in properties) || !each.value.trim()) continue;
+    if (end) found[name] = { ...found[name], [end]: each.valueAsNumber };
+    else found[name] = value(each.value.trim(), stated(properties[name]));
+  }
+  return found;
 }

@@ -1,6 +1,6 @@
 import { get, send } from "./api.js";
 import { list } from "./lists.js";
-import { acting, byId, element, on, show, showTable, svg, timeText } from "./page.js";
+import { button, byId, element, on, show, showTable, svg, timeText } from "./page.js";
 
 const CROP = 3; // diameters of the crater that a picture shows
 let chosen = null;
@@ -8,8 +8,7 @@ let chosen = null;
 const metres = (value) => `${Math.round(value)}`;
 const place = (row) => `${row.latitude_deg.toFixed(4)}°, ${row.longitude_deg.toFixed(4)}°`;
 
-const opener = (row) =>
-  element("button", { type: "button", "aria-label": `Sightings of landmark ${row.id}`, onclick: acting(() => open(row.id)) }, String(row.id));
+const opener = (row) => button(String(row.id), () => open(row.id), { name: `Sightings of landmark ${row.id}`, needs: null });
 
 const columns = [
   ["No", opener, "num"],

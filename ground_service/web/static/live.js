@@ -1,6 +1,6 @@
 // A payload flown live: what its camera sees, what it finds, where it believes to be.
 import { chart, solutionStyle } from "./charts.js";
-import { dot, legendItem, moonMap, track } from "./moon.js";
+import { dot, legendItem, moonMap, track, wrapped } from "./moon.js";
 import { byId, element, figure, notice, show, timeText, words } from "./page.js";
 
 const KEPT = 600;
@@ -40,19 +40,10 @@ const say = (text) => {
 };
 
 function take(message) {
-  if (message.kind === "error") {
-    if (!ended) say(message.text);
-    return;
-  }
+  if (message.kind === "error") return ended || say(message.text);
   ended = message.kind === "end";
-  if (ended) {
-    say("the scenario has ended");
-    return;
-  }
-  if (message.kind === "connected") {
-    say("connected");
-    return;
-  }
+  if (ended) return say("the scenario has ended");
+  if (message.kind === "connected") return say("connected");
   if (message.kind === "fault") log(`${timeText(message.utc)} ${message.text}`);
   if (message.kind !== "frame" && message.kind !== "turn") return;
   say(message.paused ? "paused" : "running");
@@ -156,7 +147,7 @@ function remember(message) {
   }
   for (const [name, place] of [["reference", reference], ...Object.entries(estimates)]) {
     if (place?.latitude_deg === undefined || place.latitude_deg === null || !paths[name]) continue;
-    const here = [place.latitude_deg, ((((place.longitude_deg + 180) % 360) + 360) % 360) - 180];
+    const here = [place.latitude_deg, wrapped(place.longitude_deg)];
     // No line goes across the whole map where a track passes 180 degrees.
     if (Math.abs(here[1] - paths[name].at(-1).at(-1)[1]) > 180) paths[name].push([]);
     paths[name].at(-1).push(here);
@@ -178,7 +169,7 @@ function begin(names, reference, terrain) {
   show("map-legend");
   for (const [index, name] of ["reference", ...names].entries()) {
     const css = name === "reference" ? over : solutionStyle(name, "estimate", index).colour;
-    const first = [[reference.latitude_deg], [((((reference.longitude_deg + 180) % 360) + 360) % 360) - 180]];
+    const first = [[reference.latitude_deg], [wrapped(reference.longitude_deg)]];
     paths[name] = [[first.flat()]];
     lines[name] = track(map, ...first, { color: css, weight: name === "reference" ? 2 + 3 * names.length : 2 + 3 * (names.length - index), lineCap: "butt" });
     dots[name] = dot(map, ...first.flat(), { color: css });

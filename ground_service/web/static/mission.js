@@ -1,6 +1,6 @@
 import { get, request } from "./api.js";
 import { entered, property } from "./forms.js";
-import { acting, byId, confirmed, element, figure, labelled, loading, mayOperate, on, plural, schemas, session, show, table, timeText, trouble, words } from "./page.js";
+import { acting, button, buttons, byId, confirmed, element, figure, labelled, loading, mayOperate, on, plural, schemas, session, show, table, timeText, trouble, words } from "./page.js";
 import { tables, without, written } from "./toml.js";
 
 const revision = location.pathname.split("/").at(-1);
@@ -81,7 +81,7 @@ function edit(kind, row = null) {
       "form",
       { onsubmit: acting(write) },
       element("div", { class: "row" }, Object.entries(fields).map(([name, schema]) => property(`part-${name}`, name, schema, { required: required.includes(name), value: row?.[name] }))),
-      element("p", { class: "actions" }, element("button", { class: "primary" }, "Write into the text"), element("button", { type: "button", onclick: () => show("part") }, "Cancel")),
+      element("p", { class: "actions" }, element("button", { class: "primary" }, "Write into the text"), button("Cancel", () => show("part"))),
     ),
   );
   byId("part").querySelector("input").focus();
@@ -89,17 +89,17 @@ function edit(kind, row = null) {
 
 function showParts() {
   show("part");
-  const act = (label, kind, row, deed) => element("button", { type: "button", "data-needs": "operator", "aria-label": `${label} ${kind} ${row.name}`, onclick: deed }, label);
+  const act = (label, kind, row, deed) => button(label, deed, { name: `${label} ${kind} ${row.name}` });
   for (const [kind, part] of Object.entries(PARTS)) {
     const rows = stated(part);
     const [first, ...others] = part.shown;
-    const buttons = (row) => element("span", { class: "actions" }, act("Change", kind, row, () => edit(kind, row)), act("Remove", kind, row, () => change(without(byId("document").value, row.table))));
+    const changes = (row) => buttons(act("Change", kind, row, () => edit(kind, row)), act("Remove", kind, row, () => change(without(byId("document").value, row.table))));
     const cell = (name) => [labelled(name), (row) => (typeof row[name] === "number" ? figure(row[name], 8) : row[name])];
     const elsewhere = !rows.length && part.inline.test(byId("document").value);
     show(
       `${kind}s`,
-      table(part.caption, [cell(first), ["", buttons], ...others.map(cell)], rows, elsewhere ? "Stated as an inline table: change it in the text." : "None stated."),
-      element("p", {}, element("button", { type: "button", "data-needs": "operator", onclick: () => edit(kind) }, `Add a ${kind}`)),
+      table(part.caption, [cell(first), ["", changes], ...others.map(cell)], rows, elsewhere ? "Stated as an inline table: change it in the text." : "None stated."),
+      element("p", {}, button(`Add a ${kind}`, () => edit(kind))),
     );
   }
 }

@@ -45,7 +45,9 @@ export function moonMap(place, { albedo = true } = {}) {
 }
 
 // The terrain of a mission description: the picture of the Moon is of the Moon only.
-export function terrain({ evidence }) {
+export function terrain(description) {
+  if (!description) return { albedo: false, text: "Terrain: not stated, since no mission description was in force." };
+  const { evidence } = description;
   const world = evidence?.world;
   if (!world) return { albedo: false, text: "Terrain: not stated in the mission description." };
   if (world === "real-terrain" || world === "photographs") return { albedo: true, text: "Terrain: the Moon; the background is its albedo." };
@@ -67,7 +69,7 @@ export function densityLayer(map, { rows, cell_deg: cell }, css) {
   return { layer, most };
 }
 
-const wrapped = (longitude) => ((((longitude + 180) % 360) + 360) % 360) - 180;
+export const wrapped = (longitude) => ((((longitude + 180) % 360) + 360) % 360) - 180;
 
 // A track in parts, so that no line crosses the whole map at the 180 degree meridian or bridges a missing value.
 export function parts(latitudes, longitudes) {

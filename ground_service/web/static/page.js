@@ -12,6 +12,10 @@ export const schemas = embedded("schemas"); // of what the page lists and enters
 
 export const byId = (id) => document.getElementById(id);
 
+// A date stays in one line.
+const DATE = /(\d{4}-\d\d-\d\d(?:T\d\d:\d\d)?)/;
+const unbroken = (child) => (typeof child === "string" ? child.split(DATE).map((part, index) => (index % 2 ? element("span", { class: "keep" }, part) : part)) : child);
+
 // element("a", {href: "/"}, "text", child...); properties that start with "on" are listeners.
 export function element(name, attributes = {}, ...children) {
   const made = document.createElement(name);
@@ -20,7 +24,8 @@ export function element(name, attributes = {}, ...children) {
     if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
     else made.setAttribute(key, value === true ? "" : value);
   }
-  made.append(...children.flat().filter((child) => child !== null && child !== undefined));
+  const parts = ["a", "td"].includes(name) ? children.flat().flatMap(unbroken) : children.flat();
+  made.append(...parts.filter((child) => child !== null && child !== undefined));
   return made;
 }
 
@@ -35,25 +40,28 @@ export function svg(name, attributes = {}, ...children) {
   return made;
 }
 
-// What the user has in hand in a place that is drawn again: keyboard focus, scroll positions, and text not yet sent.
+// What the user has in hand in a place that is drawn again: keyboard focus, scroll positions, and what was typed or ticked.
 const FOCUSABLE = "a[href], button, input, select, textarea, summary, [tabindex]";
-const TEXTS = "input:not([type=checkbox], [type=radio], [type=file]), textarea";
+const HELD = "input:not([type=radio], [type=file]), textarea";
 const rowOf = (one) => one.closest("[data-row]")?.dataset.row ?? "";
 const nameOf = (one) => [rowOf(one), one.tagName, one.id, one.name ?? "", one.getAttribute("aria-label") ?? one.textContent].join("\n");
+// The property that the user changes, and the value with which it was made.
+const heldBy = (one) => (one.type === "checkbox" ? ["checked", one.defaultChecked] : ["value", one.defaultValue]);
 
 function inHand(place) {
   const active = document.activeElement;
   const focused = active !== place && place.contains(active) ? { name: nameOf(active), row: rowOf(active), isRow: active.matches("[data-row]") } : null;
   const scrolled = [...place.querySelectorAll(".scroll")].map((one) => [one.getAttribute("aria-label"), one.scrollLeft, one.scrollTop]);
-  const typed = [...place.querySelectorAll(TEXTS)].filter((one) => one.value !== one.defaultValue).map((one) => [nameOf(one), one.defaultValue, one.value]);
-  return { focused, scrolled, typed };
+  const changed = [...place.querySelectorAll(HELD)].map((one) => [one, ...heldBy(one)]).filter(([one, key, made]) => one[key] !== made);
+  return { focused, scrolled, held: changed.map(([one, key, made]) => [nameOf(one), made, one[key]]) };
 }
 
-function giveBack(place, { focused, scrolled, typed }) {
+function giveBack(place, { focused, scrolled, held }) {
   for (const [label, left, top] of scrolled) place.querySelector(`.scroll[aria-label="${CSS.escape(label)}"]`)?.scrollTo(left, top);
-  for (const one of typed.length ? place.querySelectorAll(TEXTS) : []) {
-    const kept = typed.find(([name, before]) => name === nameOf(one) && before === one.defaultValue);
-    if (kept) one.value = kept[2];
+  for (const one of held.length ? place.querySelectorAll(HELD) : []) {
+    const [key, made] = heldBy(one);
+    const kept = held.find(([name, before]) => name === nameOf(one) && before === made);
+    if (kept) one[key] = kept[2];
   }
   if (!focused) return;
   const row = focused.row && [...place.querySelectorAll("[data-row]")].find((one) => one.dataset.row === focused.row);
@@ -136,15 +144,15 @@ export function notice(text, kind = "good") {
   if (kind === "good") setTimeout(() => shown.remove(), 8000);
 }
 
-// Ask before something leaves the service: the lines say what. True if the person confirms.
-export function confirmed(title, lines, deed) {
+// Ask before something leaves the service: the lines say what. Returns the deed that the person chooses, or null.
+export function confirmed(title, lines, ...deeds) {
   const dialog = byId("confirm");
   byId("confirm-title").textContent = title;
-  byId("confirm-deed").textContent = deed;
   show("confirm-text", lines.map((line) => (line instanceof Node ? line : element("p", {}, line))));
+  show("confirm-deeds", deeds.map((deed) => element("button", { class: deed === deeds.at(-1) ? "primary" : null, value: deed }, deed)));
   dialog.returnValue = "";
   dialog.showModal();
-  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "confirmed"), { once: true }));
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(deeds.find((deed) => deed === dialog.returnValue) ?? null), { once: true }));
 }
 
 export const trouble = (error) => notice(error.message, "bad");
@@ -165,6 +173,11 @@ export function acting(task) {
     }
   };
 }
+
+// A button for operators, unless `needs` states another role or none; `name` is what it is called outside of its row.
+export const button = (label, task, { name, needs = "operator", kind, disabled } = {}) =>
+  element("button", { type: "button", class: kind, disabled, "data-needs": needs, "aria-label": name, onclick: acting(task) }, label);
+export const buttons = (...all) => element("span", { class: "actions" }, ...all);
 
 export const on = (id, event, task) => byId(id).addEventListener(event, acting(task));
 
@@ -297,26 +310,27 @@ byId("caller").addEventListener("click", async () => {
   else location.reload();
 });
 
-// Mission time: the clock of the service, which a simulated mission sets.
+// Mission time: the clock of the service, which a simulated mission sets and which may then run at any speed.
 const SIMULATED_MS = 60_000; // further from the clock of the browser, the time is simulated
 const ASK_AGAIN_MS = 10_000;
-let offsetMs = null;
-export const missionNow = () => (Date.now() + (offsetMs ?? 0)) / 1000;
+let clock = null; // time of the service and of the browser at the last answer, and speed between the last two
+const missionMs = () => (clock ? clock.time + clock.speed * (Date.now() - clock.at) : Date.now());
+export const missionNow = () => missionMs() / 1000;
 
-function setClock(time) {
-  offsetMs = Date.parse(time) - Date.now();
-  if (Math.abs(offsetMs) > SIMULATED_MS) {
-    // It may run at any speed.
-    setTimeout(() => get("session").then((session) => setClock(session.time), () => {}), ASK_AGAIN_MS);
-  }
+function setClock(text) {
+  const [time, at] = [Date.parse(text), Date.now()];
+  const simulated = Math.abs(time - at) > SIMULATED_MS;
+  const speed = simulated && clock && at > clock.at ? (time - clock.time) / (at - clock.at) : 1;
+  // The second answer tells the speed.
+  if (simulated) setTimeout(() => get("session").then((session) => setClock(session.time), () => {}), clock ? ASK_AGAIN_MS : 1000);
+  clock = { time, at, speed, simulated };
   tick();
 }
 
 function tick() {
-  if (offsetMs === null) return;
-  const now = new Date(1000 * missionNow()).toISOString();
-  const simulated = Math.abs(offsetMs) > SIMULATED_MS ? ", simulated" : "";
-  byId("clock").textContent = `${now.slice(0, 10)} ${now.slice(11, 19)} UTC${simulated}`;
+  if (!clock) return;
+  const now = new Date(missionMs()).toISOString();
+  byId("clock").textContent = `${now.slice(0, 10)} ${now.slice(11, 19)} UTC${clock.simulated ? ", simulated" : ""}`;
   byId("clock").dateTime = now;
 }
 setInterval(tick, 1000);

@@ -1,9 +1,9 @@
 import { bind } from "./address.js";
 import { finished, get, request, send } from "./api.js";
-import { chart, columns, solutionStyle } from "./charts.js";
+import { chart, columns, errorColumns, solutionStyle } from "./charts.js";
 import { craterRims, layerItem, moonMap, terrain, track } from "./moon.js";
 import { drawParameters } from "./parameters.js";
-import { acting, byId, dictionary, element, figure, lengthText, loading, notice, on, parameterName, parameterOptions, seconds, show, showTable, stateClass, stateMark, table, timeText, unitText, words } from "./page.js";
+import { button, byId, dictionary, element, figure, lengthText, loading, notice, on, parameterName, parameterOptions, seconds, show, showTable, stateClass, stateMark, table, timeText, unitText, words } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
@@ -19,23 +19,14 @@ async function showExports() {
   const formats = await get("exports/formats");
   show("export-states", ["reference", ...dictionary.estimators].map((name) => element("option", { value: name }, name)));
   bind("export-states");
-  const button = (one) =>
-    element(
-      "button",
-      {
-        type: "button",
-        disabled: !one.available,
-        onclick: acting(() =>
-          save("exports", `pass-${passId}${one.ending === "zip" ? `-${one.name}` : ""}.${one.ending}`, {
-            method: "POST",
-            json: { pass_id: passId, format: one.name, states: byId("export-states").value },
-          }),
-        ),
-      },
-      one.name,
-    );
+  const exported = (one) =>
+    save("exports", `pass-${passId}${one.ending === "zip" ? `-${one.name}` : ""}.${one.ending}`, {
+      method: "POST",
+      json: { pass_id: passId, format: one.name, states: byId("export-states").value },
+    });
+  const start = (one) => button(one.name, () => exported(one), { disabled: !one.available, needs: null });
   const contents = (one) => one.description + (one.available ? "" : ` (the server lacks linna[${one.extra}])`);
-  showTable("exports", "Formats", [["Format", button], ["Contents", contents], ["States", (one) => (one.states ? "as chosen" : "")]], formats, "None.");
+  showTable("exports", "Formats", [["Format", start], ["Contents", contents], ["States", (one) => (one.states ? "as chosen" : "")]], formats, "None.");
 }
 
 function showReport(report, id) {
@@ -86,22 +77,7 @@ function headline(value) {
 function showErrors(report) {
   const series = report.navigation
     .filter((one) => one.time_s.length)
-    .map((one, index) => ({
-      label: one.name,
-      ...solutionStyle(one.name, one.kind, index),
-      ...columns(
-        one.time_s.map((time, row) => ({
-          start: time,
-          stop: time,
-          // A logarithmic axis has no zero, which is the error at a reset.
-          min: one.min_m[row] || null,
-          max: one.max_m[row] || null,
-          mean: one.mean_m[row] || null,
-          after_gap: one.after_gap[row],
-        })),
-        (time) => time,
-      ),
-    }));
+    .map((one, index) => ({ label: one.name, ...solutionStyle(one.name, one.kind, index), ...errorColumns(one) }));
   show("errors");
   if (series.length) chart(byId("errors"), "distance from the reference", "m", series, { logarithmic: true, group: "pass", height: 300 });
 }
@@ -161,10 +137,7 @@ function receptionTable(receptions) {
   return element("details", {}, element("summary", {}, `Link quality: ${figure(receptions.length)} receptions, ${figure(good)} of ${figure(frames)} frames good`), listed);
 }
 
-async function terrainOf(pass) {
-  if (!pass.mission_revision) return { albedo: false, text: "Terrain: not stated, since no mission description was in force." };
-  return terrain((await get(`missions/${pass.mission_revision.slice(0, 16)}`)).document);
-}
+const terrainOf = async (pass) => terrain(pass.mission_revision && (await get(`missions/${pass.mission_revision.slice(0, 16)}`)).document);
 
 const CRATERS_SHOWN = 1000;
 
@@ -215,12 +188,8 @@ async function showParameters() {
   show("parameter", parameterOptions(parameters));
   byId("parameter").value = "temperature_c";
   bind("parameter");
-  const link = (packet, format) =>
-    element(
-      "button",
-      { type: "button", onclick: acting(() => save(`passes/${passId}/packets/${encodeURIComponent(packet)}?format=${format}`, `pass-${passId}-${packet}.${format}`)) },
-      format === "csv" ? "CSV" : "Parquet",
-    );
+  const file = (packet, format) => save(`passes/${passId}/packets/${encodeURIComponent(packet)}?format=${format}`, `pass-${passId}-${packet}.${format}`);
+  const link = (packet, format) => button(format === "csv" ? "CSV" : "Parquet", () => file(packet, format), { needs: null });
   const columns = [["Packet", (row) => row.packet], ["Source", (row) => row.source], ["Packets", (row) => figure(row.packets), "num"], ["Files", (row) => element("span", {}, link(row.packet, "csv"), " ", link(row.packet, "parquet"))]];
   if (packets.length) show("packets", table("Packets that the mission description defines", columns, packets, "None."));
   await showParameter();

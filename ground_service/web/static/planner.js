@@ -1,13 +1,14 @@
 import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
-import { acting, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { acting, button, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
-import { contactOf, release, sequenceTable, transmit, uplinkOf } from "./chain.js";
+import { sequenceTable, uplink } from "./chain.js";
 
 const ROW_PX = 34;
 const HEAD_PX = 24;
 const LABEL_PX = 16; // name of a section, above its bars
+const LETTER_PX = 7; // of a name, which is left out where it would cover the next one
 const DAY_S = 86400;
 let windows = [];
 let candidates = [];
@@ -96,17 +97,13 @@ function drawTimeline() {
   let day = null; // the first tick of a day states its date
   for (let time = Math.ceil(view[0] / step) * step; time < view[1]; time += step) {
     drawn.append(svg("line", { x1: x(time), x2: x(time), y1: HEAD_PX - 6, y2: height, class: "tick" }));
-    const text = svg("text", { x: x(time) + 3, y: 13, class: "when" });
     const iso = isoText(time);
-    text.textContent = step >= DAY_S ? iso.slice(0, 10) : day === iso.slice(0, 10) ? iso.slice(11, 16) : `${iso.slice(5, 10)} ${iso.slice(11, 16)}`;
+    const text = step >= DAY_S ? iso.slice(0, 10) : day === iso.slice(0, 10) ? iso.slice(11, 16) : `${iso.slice(5, 10)} ${iso.slice(11, 16)}`;
     day = iso.slice(0, 10);
-    drawn.append(text);
+    drawn.append(svg("text", { x: x(time) + 3, y: 13, class: "when" }, text));
   }
   for (const { name, top } of sections) {
-    drawn.append(svg("line", { x1: 0, x2: width, y1: top, y2: top, class: "edge" }));
-    const text = svg("text", { x: 4, y: top + 12, class: "lane" });
-    text.textContent = name;
-    drawn.append(text);
+    drawn.append(svg("line", { x1: 0, x2: width, y1: top, y2: top, class: "edge" }), svg("text", { x: 4, y: top + 12, class: "lane" }, name));
   }
   drawLanes(drawn, x, width, lanesTop);
   for (const one of linked) {
@@ -123,7 +120,11 @@ function drawTimeline() {
     if (mayOperate()) pressable(made, acting(() => plan(one)));
     drawn.append(made);
   }
-  ordered.forEach((row, index) => drawn.append(windowBar(row, x, sections[1].bars + lane[index] * ROW_PX, scale)));
+  ordered.forEach((row, index) => {
+    const next = ordered.find((_, other) => other > index && lane[other] === lane[index]);
+    const room = scale * ((next ? seconds(next.start) : view[1]) - seconds(row.start));
+    drawn.append(windowBar(row, x, sections[1].bars + lane[index] * ROW_PX, scale, room));
+  });
   drawn.addEventListener("pointermove", (event) => readAt(view[0] + (event.clientX - drawn.getBoundingClientRect().left) / scale));
   const cursor = svg("line", { y1: HEAD_PX - 6, y2: height, class: "cursor" });
   drawn.append(cursor);
@@ -147,12 +148,8 @@ function readAt(time) {
 }
 
 function bar(left, right, top, kind, label) {
-  const made = svg("g", { class: `span ${kind}` });
-  made.append(svg("rect", { x: left, y: top, width: Math.max(6, right - left), height: ROW_PX - 8, rx: 3 }));
-  const title = svg("title");
-  title.textContent = label;
-  made.append(title);
-  return made;
+  const rect = svg("rect", { x: left, y: top, width: Math.max(6, right - left), height: ROW_PX - 8, rx: 3 });
+  return svg("g", { class: `span ${kind}` }, rect, svg("title", {}, label));
 }
 
 function pressable(made, deed) {
@@ -170,12 +167,10 @@ function pressable(made, deed) {
 // Steps of the start and of the stop by key.
 const KEYS = { ArrowLeft: [-1, -1], ArrowRight: [1, 1], ArrowUp: [0, 1], ArrowDown: [0, -1], "[": [-1, 0], "]": [1, 0] };
 
-function windowBar(row, x, top, scale) {
+function windowBar(row, x, top, scale, room) {
   const { start, stop } = selectable(row);
   const made = bar(x(start), x(stop), top, `window ${row.state}${chosen === row.id ? " chosen" : ""}${conflictsOf(row.id).length ? " conflict" : ""}`, `${row.name}, ${row.state}, ${timeText(row.start)} to ${timeText(row.stop)}${conflictsOf(row.id).map((reason) => `; conflict: ${reason}`).join("")}`);
-  const text = svg("text", { x: x(start) + 5, y: top + 17, class: "name" });
-  text.textContent = row.name;
-  made.append(text);
+  if (room > LETTER_PX * row.name.length) made.append(svg("text", { x: x(start) + 5, y: top + 17, class: "name" }, row.name));
   made.dataset.window = row.id;
   made.dataset.row = row.id;
   pressable(made, () => choose(row.id));
@@ -248,7 +243,7 @@ function choose(id) {
   showChosen();
 }
 
-const deed = (name, task, kind) => element("button", { type: "button", class: kind, "data-needs": "operator", onclick: acting(async () => { await task(); await load(); }) }, name);
+const deed = (name, task, kind) => button(name, () => task().then(load), { kind });
 
 function showChosen() {
   const row = windows.find((one) => one.id === chosen);
@@ -259,7 +254,7 @@ function showChosen() {
   const path = `windows/${row.id}`;
   const deeds = {
     draft: [deed("Approve", () => send("PATCH", path, { state: "approved" }), "primary"), deed("Delete", () => send("DELETE", path))],
-    approved: [row.telecommands.length ? deed("Send now…", () => uplink(row), "primary") : deed("Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
+    approved: [deed(row.telecommands.length ? "Send now…" : "Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
   }[row.state] ?? [];
   const span = (value, unit) => (value ? `${figure(value.min)} to ${figure(value.max)} ${unit}` : "–");
   const predicted = row.predicted ?? {};
@@ -283,7 +278,7 @@ function showChosen() {
     refusal?.id === row.id ? reasonList(`Not changed to ${refusal.what}:`, refusal.reasons) : null,
     conflictsOf(row.id).length ? reasonList("Conflicts of the plan:", conflictsOf(row.id)) : null,
     row.state === "draft" ? timesForm(row) : null,
-    element("p", { class: "actions" }, deeds, element("button", { type: "button", onclick: acting(() => showSequence(row)) }, "Telecommands")),
+    element("p", { class: "actions" }, deeds, button("Telecommands", () => showSequence(row), { needs: null })),
     listed?.id === row.id ? sequenceTable(listed.items) : null,
   );
 }
@@ -298,17 +293,6 @@ function timesForm(row) {
   const [start, stop] = [field("start", row.start), field("stop", row.stop)];
   const change = acting(() => move(row, seconds(start.value), seconds(stop.value)));
   return element("form", { class: "row", "data-needs": "operator", "data-row": row.id, onsubmit: change }, element("label", {}, "Start, UTC ", start), element("label", {}, "Stop, UTC ", stop), element("button", {}, "Change"));
-}
-
-// Release the telecommands of a window, or send those that are released.
-async function uplink(row) {
-  const [links, ahead, released] = await Promise.all([get("links"), get("contacts", { since: isoText(missionNow() - 3600) }), get("telecommands", { limit: 200, state: "released" })]);
-  const contact = contactOf(row, ahead.contacts);
-  const link = uplinkOf(row, links.items, contact);
-  if (!row.telecommands.length) return release(row, link, contact);
-  if (!link) throw new Error("No link can send: linna command uplink writes the octets to a file.");
-  const waiting = released.items.filter((one) => one.spacecraft_id === row.spacecraft_id && one.instance === row.instance && one.carrier_id === null);
-  return transmit(link, waiting.reverse());
 }
 
 // The window whose telecommands are shown, and these; they stay through messages of the live feed.
@@ -376,7 +360,7 @@ async function search() {
         ["Craters a frame", (row) => (row.craters_per_frame ? `${figure(row.craters_per_frame.min)} to ${figure(row.craters_per_frame.max)}` : "–"), "num"],
         ["Battery left", (row) => `${Math.round(100 * row.battery_minimum)} %`, "num"],
         ["Data down by", (row) => (row.downlinked_by ? timeText(row.downlinked_by) : "not within the span")],
-        ["", (row) => element("button", { type: "button", "data-needs": "operator", onclick: acting(() => plan(row)) }, "Plan")],
+        ["", (row) => button("Plan", () => plan(row))],
       ],
       candidates,
       `${found.reason ?? "No span fulfils all constraints"}.`,
@@ -391,7 +375,7 @@ async function load() {
   drawTimeline();
   if (windows.some((one) => one.id === listed?.id)) await showSequence(listed);
   else showChosen();
-  const link = (row) => element("button", { type: "button", class: "link", onclick: () => choose(row.id) }, row.name);
+  const link = (row) => button(row.name, () => choose(row.id), { kind: "link", needs: null });
   showTable("windows", "Windows", [["Window", link], "start", LENGTH, "state", ["By", "created_by"]], windows, "No window planned: find some above.");
 }
 

@@ -1,6 +1,6 @@
 import { keep, restore, state, stated } from "./address.js";
 import { finished, get, request, send } from "./api.js";
-import { byId, element, figure, loading, notice, on, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
+import { button, buttons, byId, element, figure, later, loading, notice, on, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
 
 const LATEST = 12;
 let open = stated("gates");
@@ -88,33 +88,35 @@ function outcomeOf({ job, verdict }) {
 let builds = [];
 const titleOf = (row, role) => row[`${role}_title`] ?? builds.filter((one) => one.digest === row[role]).map(buildName)[0] ?? String(row[role] ?? "").slice(0, 12);
 
+async function openedGates() {
+  const [verdict, changes] = await Promise.all([get(`regressions/${open}`), changesOf(open)]);
+  return [element("h3", {}, `Gates of ${timeText(verdict.created)}`), gateRows(verdict), changes];
+}
+
 async function loadRegressions() {
   const { rows, total } = await regressionRows();
-  showTable(
+  const opened = rows.some((row) => row.verdict?.id === open) ? await openedGates() : null;
+  const actions = ({ verdict }) => verdict && buttons(button("Gates and craters", () => toggle(verdict.id), { needs: null }), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report"));
+  const columns = [
+    ["Candidate", (row) => titleOf(row, "candidate")],
+    ["", actions],
+    ["Verdict", (row) => stateMark(row.verdict?.verdict ?? row.job.state)],
+    ["Outcome", outcomeOf],
+    ["Baseline", (row) => titleOf(row, "baseline")],
+    ["Entered", "created"],
+  ];
+  show(
     "regressions",
-      "Regressions",
-      [
-        ["Candidate", (row) => titleOf(row, "candidate")],
-        ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates and craters"), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report")) : "")],
-        ["Verdict", (row) => stateMark(row.verdict?.verdict ?? row.job.state)],
-        ["Outcome", outcomeOf],
-        ["Baseline", (row) => titleOf(row, "baseline")],
-        ["Entered", "created"],
-      ],
-      rows,
-      "No regression has been run.",
+    table("Regressions", columns, rows, "No regression has been run."),
+    total > LATEST ? element("p", { class: "hint" }, `The ${LATEST} newest of ${figure(total)} verdicts.`) : null,
+    opened,
   );
-  if (total > LATEST) byId("regressions").append(element("p", { class: "hint" }, `The ${LATEST} newest of ${figure(total)} verdicts.`));
-  if (rows.some((row) => row.verdict?.id === open)) {
-    const [chosen, changes] = await Promise.all([get(`regressions/${open}`), changesOf(open)]);
-    byId("regressions").append(element("h3", {}, `Gates of ${timeText(chosen.created)}`), gateRows(chosen), changes);
-  }
 }
 
 function toggle(id) {
   open = open === id ? null : id;
   state({ gates: open });
-  loadRegressions().catch(trouble);
+  return loadRegressions();
 }
 
 // Without frames the detector is not judged: such an archive is chosen only on purpose.
@@ -178,11 +180,6 @@ on("bring", "submit", async () => {
   await load();
 });
 
-let pending = null;
-watch((message) => {
-  if (!message.kind.startsWith("job")) return;
-  clearTimeout(pending);
-  pending = setTimeout(() => loadRegressions().catch(trouble), 400);
-}, loadRegressions);
+watch(later(loadRegressions, (message) => message.kind.startsWith("job")), loadRegressions);
 for (const name of ["candidate", "baseline"]) byId(name).addEventListener("change", () => keep(name));
 loading(load);

@@ -1,7 +1,8 @@
 // Standing requests on the planner: their windows, their last plan with its reasons, and changes of them.
 import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
-import { acting, byId, element, figure, notice, on, show, showTable, table, timeText } from "./page.js";
+import { entered, property } from "./forms.js";
+import { button, buttons, byId, element, figure, notice, on, schemas, show, showTable, table, timeText } from "./page.js";
 
 let spacecraft = null;
 
@@ -21,22 +22,16 @@ function termsText(terms) {
 
 const windowsText = (counts) => Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", ") || "none";
 
-const changing = (task) =>
-  acting(async () => {
-    await task();
+const change = (label, ...request) =>
+  button(label, async () => {
+    await send(...request);
     await loadRequests(spacecraft);
   });
 
 function actions(row) {
   const path = `requests/${row.id}`;
   const next = row.state === "active" ? "paused" : "active";
-  return element(
-    "span",
-    { class: "actions" },
-    element("button", { type: "button", onclick: acting(() => showPlan(row.id)) }, "Plan"),
-    element("button", { type: "button", "data-needs": "operator", onclick: changing(() => send("PATCH", path, { state: next })) }, next === "paused" ? "Pause" : "Resume"),
-    element("button", { type: "button", "data-needs": "operator", onclick: changing(() => send("DELETE", path)) }, "Delete"),
-  );
+  return buttons(button("Plan", () => showPlan(row.id), { needs: null }), change(next === "paused" ? "Pause" : "Resume", "PATCH", path, { state: next }), change("Delete", "DELETE", path));
 }
 
 async function showPlan(id) {
@@ -74,27 +69,15 @@ export async function loadRequests(chosen) {
   else show("request-plan");
 }
 
-function limits(name) {
-  const [min, max] = ["min", "max"].map((end) => byId(`request-${name}-${end}`).valueAsNumber);
-  if (Number.isNaN(min) && Number.isNaN(max)) return null;
-  if (Number.isNaN(min) || Number.isNaN(max)) throw new Error(`State both limits of the ${name === "sun" ? "Sun elevation" : name}, or none.`);
-  return { min, max };
-}
-
+const FIELDS = ["name", "windows", "period_days", "horizon_days", "sun_elevation_deg", "altitude_km", "minimum_duration_s", "maximum_duration_s", "priority"];
+const { properties, required } = schemas.StandingRequestIn;
+show(
+  "add-request",
+  FIELDS.map((name) => property(`request-${name}`, name, properties[name], { required: required.includes(name) })),
+  element("button", { class: "primary" }, "Add"),
+);
 on("add-request", "submit", async () => {
-  const number = (name) => byId(`request-${name}`).valueAsNumber;
-  const made = await send("POST", "requests", {
-    name: byId("request-name").value,
-    ...spacecraft,
-    windows: number("windows"),
-    period_days: number("period"),
-    horizon_days: number("horizon"),
-    sun_elevation_deg: limits("sun"),
-    altitude_km: limits("altitude"),
-    minimum_duration_s: number("shortest"),
-    maximum_duration_s: number("longest"),
-    priority: number("priority"),
-  });
+  const made = await send("POST", "requests", { ...entered(byId("add-request"), properties), ...spacecraft });
   notice(`Standing request ${made.name} is added as number ${made.id}`);
   await loadRequests(spacecraft);
 });

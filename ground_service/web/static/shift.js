@@ -1,7 +1,7 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
-import { chainOf, contactOf, inTime, release, transmit, uplinkOf } from "./chain.js";
-import { acting, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
+import { chainOf, contactOf, inTime, uplink } from "./chain.js";
+import { acting, button, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "executing", "executed", "downlinked"];
 const SHOWN = 5;
@@ -13,8 +13,7 @@ const mine = (list, craft) => list.filter((one) => one.spacecraft_id === craft.s
 const query = (craft) => `spacecraft/${craft.spacecraft_id}`;
 const instance = (craft) => `?instance=${encodeURIComponent(craft.instance)}`;
 
-const deed = (label, task, name = label) =>
-  element("button", { type: "button", "data-needs": "operator", "aria-label": name, onclick: acting(async () => { await task(); await load(); }) }, label);
+const deed = (label, task, name = label) => button(label, () => task().then(load), { name });
 
 const link = (href, text) => element("a", { href }, text);
 const further = (...parts) => element("p", { class: "hint" }, parts.filter(Boolean).flatMap((one, index) => (index ? [" · ", one] : [one])));
@@ -37,18 +36,13 @@ function ageFigure(newest) {
   return last ? number("Age of data", lengthText(last.age_s), `newest telemetry of ${timeText(last.time)}`) : number("Age of data", "none", "no telemetry received");
 }
 
-function continuation(window, chain, craft, data) {
+function continuation(window, chain) {
   const named = (label) => `${label} ${window.name}`;
   if (chain.waiting === "approved") return deed("Approve", () => send("PATCH", `windows/${window.id}`, { state: "approved" }), named("Approve"));
-  const contact = contactOf(craft, data.contacts.contacts);
-  const link = uplinkOf(craft, data.links, contact);
-  if (chain.waiting === "released") return deed("Release…", () => release(window, link, contact), named("Release"));
-  if (chain.waiting === "sent") {
-    const waiting = mine(data.released, craft).filter((one) => one.carrier_id === null).reverse();
-    return link ? deed("Send now…", () => transmit(link, waiting), named("Send")) : element("a", { href: "/commands" }, "Commands");
-  }
+  if (chain.waiting === "released") return deed("Release…", () => uplink(window), named("Release"));
+  if (chain.waiting === "sent") return deed("Send now…", () => uplink(window), named("Send"));
   if (chain.waiting === "reported" && window.pass_id) return deed("Make a report", () => send("POST", `passes/${window.pass_id}/reports`), named("Report"));
-  return window.pass_id ? element("a", { href: `/passes/${window.pass_id}` }, "Pass") : element("a", { href: `/planner?window=${window.id}` }, "Plan");
+  return window.pass_id ? link(`/passes/${window.pass_id}`, "Pass") : link(`/planner?window=${window.id}`, "Plan");
 }
 
 function chainLights(chain) {
@@ -74,7 +68,7 @@ function windowsOf(craft, data) {
         ["Window", ({ window }) => element("a", { href: `/planner?window=${window.id}` }, window.name)],
         ["Start", ({ window }) => timeText(window.start).slice(5, 16)],
         ["Chain", ({ chain }) => [chainLights(chain), element("span", { class: "note" }, chain.text)]],
-        ["", ({ window, chain }) => continuation(window, chain, craft, data)],
+        ["", ({ window, chain }) => continuation(window, chain)],
       ],
       rows.slice(0, SHOWN),
       "No window begins within a day.",
@@ -188,7 +182,7 @@ document.addEventListener("pointerdown", () => {
 });
 
 async function load() {
-  const [spacecraft, windows, links, contacts, alarms, passes, handovers, released, jobs] = await Promise.all([
+  const [spacecraft, windows, links, contacts, alarms, passes, handovers, jobs] = await Promise.all([
     get("spacecraft"),
     get("windows", { limit: 100, state: OPEN }),
     get("links"),
@@ -196,7 +190,6 @@ async function load() {
     get("alarms", { limit: 50, state: ["raised", "acknowledged", "shelved"] }),
     get("passes", { limit: 30 }),
     get("handovers"),
-    get("telecommands", { limit: 200, state: "released" }),
     get("jobs", { limit: 8 }),
   ]);
   const ids = windows.items.map((one) => one.id);
@@ -208,7 +201,7 @@ async function load() {
     passIds.length ? get("reports", { pass_id: passIds }) : { items: [] },
     ...crafts.map((one) => get("parameters", { live: true, spacecraft_id: one.spacecraft_id, instance: one.instance }).then((answer) => answer.items)),
   ]);
-  const data = { windows: windows.items, links: links.items, contacts, alarms: alarms.items, passes: passes.items, handovers: handovers.items, released: released.items, telecommands: telecommands.items, reports: reports.items };
+  const data = { windows: windows.items, links: links.items, contacts, alarms: alarms.items, passes: passes.items, handovers: handovers.items, telecommands: telecommands.items, reports: reports.items };
   await pressEnded; // a button that is drawn again while it is pressed is not clicked
   show("spacecraft", crafts.length ? crafts.map((craft, index) => spacecraftOf(craft, data, newest[index])) : element("p", { class: "hint" }, "No spacecraft yet: register a mission description on the page ", element("a", { href: "/missions" }, "Missions"), ", or upload a downlink."));
   showJobs(jobs.items);

@@ -1,10 +1,7 @@
 import { get, send } from "./api.js";
-import { acting, byId, element, loading, notice, on, show, showTable, timeText } from "./page.js";
+import { acting, button, buttons, byId, element, loading, notice, on, show, showTable, timeText } from "./page.js";
 
 const ROLES = ["viewer", "operator", "admin"];
-
-const button = (text, task, label) =>
-  element("button", { type: "button", onclick: acting(task), "aria-label": label ?? null }, text);
 
 function daysValid() {
   const text = byId("days").value.trim();
@@ -23,7 +20,7 @@ function showToken(made) {
     "given",
     element("p", {}, `Token of ${made.user.name}; copy it now, it cannot be shown again:`),
     element("p", { class: "breakable" }, element("code", {}, made.token)),
-    button("Hide", () => show("given")),
+    button("Hide", () => show("given"), { needs: "admin" }),
   );
 }
 
@@ -52,11 +49,9 @@ function userActions(user) {
     showToken(await send("POST", `${path}/tokens`, { days_valid: daysValid() }));
     await load();
   };
-  return element(
-    "span",
-    { class: "actions" },
-    button(verb, changing(() => send("PATCH", path, { state: next }), () => `${user.name} is ${next} now.`), `${verb} ${user.name}`),
-    button("New token", newToken, `New token for ${user.name}`),
+  return buttons(
+    button(verb, changing(() => send("PATCH", path, { state: next }), () => `${user.name} is ${next} now.`), { name: `${verb} ${user.name}`, needs: "admin" }),
+    button("New token", newToken, { name: `New token for ${user.name}`, needs: "admin" }),
   );
 }
 
@@ -68,7 +63,7 @@ function kindOf(token) {
 function tokenAction(token) {
   if (token.state !== "active") return "";
   const revoke = changing(() => send("DELETE", `tokens/${token.id}`), () => `Token ${token.id} of ${token.user} is revoked.`);
-  return button("Revoke", revoke, `Revoke token ${token.id} of ${token.user}`);
+  return button("Revoke", revoke, { name: `Revoke token ${token.id} of ${token.user}`, needs: "admin" });
 }
 
 async function load() {

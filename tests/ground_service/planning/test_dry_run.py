@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from ground_service.errors import Stopping
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.store import list_missions
-from ground_service.planning import standing
-from ground_service.planning.dry_run import NO_EPHEMERIS, DryRun, fly, rehearsed
+from ground_service.planning import dry_run, standing
+from ground_service.planning.dry_run import NO_EPHEMERIS, TOO_LONG, DryRun, fly, rehearsed
 from ground_service.planning.request_model import StandingRequestIn
 from lunar.datafolder import DataFolder
 from tests.ground_service.conftest import START, Clock, save_circle
@@ -100,7 +101,7 @@ def test_windows_that_persons_approve_are_approved_and_released_by_two(flown) ->
 
 
 def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
-    ground: Ground, oem: Path, mission_time: Clock
+    ground: Ground, oem: Path, mission_time: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def rehearse(extra: str = "") -> tuple[int, tuple[str, ...]]:
         text = MISSION.format(extra=AUTOMATIC + LINKS + extra).encode()
@@ -118,3 +119,18 @@ def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
     assert ground.read(list_missions, Paging()).total == 0
     standing.delete_request(ground, added.id, actor="ann")
     assert rehearse() == (10, ())
+    monkeypatch.setattr(dry_run, "MOST_S", 0.0)
+    assert rehearse() == (0, (TOO_LONG,))
+
+
+@pytest.mark.parametrize("place", [1, 2, 4])  # a request, a day of its horizon, the release of a window
+def test_a_dry_run_that_takes_too_long_ends(flown, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
+    asked = []
+
+    def check(_: Ground) -> None:
+        asked.append(None)
+        if len(asked) == place:
+            raise Stopping
+
+    monkeypatch.setattr(Ground, "check_stopping", check)
+    assert flown(UPLOADS + LINKS).faults == (TOO_LONG,)

@@ -53,6 +53,8 @@ window.fetch = async (...given) => {
   }
 };
 """
+NOTE_VIOLATIONS = """document.addEventListener("securitypolicyviolation", (event) =>
+    console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"""
 FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -164,7 +166,6 @@ class Service:
     def __init__(
         self,
         home: Path,
-        log: Path,
         console_port: int,
         openmct: Path | None = None,
         settings: dict[str, str] | None = None,
@@ -175,13 +176,14 @@ class Service:
         environment["XDG_DATA_HOME"] = str(home / "nothing")
         environment["LINNA_OPENMCT"] = str(openmct or home / "nothing")
         environment.update(settings or {})
+        log = home.with_suffix(".log")
         self._log = log.open("wb")
         command = [sys.executable, "-m", "linna", "serve", "--port", "0", "--home", str(home)]
         self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT, env=environment)
         try:
             self.url = self._wait_for_address(log)
         except BaseException:
-            self.stop()
+            self.__exit__()
             raise
 
     def _wait_for_address(self, log: Path) -> str:
@@ -195,7 +197,10 @@ class Service:
             time.sleep(0.1)
         raise RuntimeError(f"the service did not start:\n{log.read_text(errors='replace')}")
 
-    def stop(self) -> None:
+    def __enter__(self) -> Service:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._process.terminate()
         self._process.wait(PATIENCE_S)
         self._log.close()
@@ -215,14 +220,13 @@ def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
     home = tmp_path_factory.mktemp("web") / "home"
     with open_ground(home) as ground:
         import_archive(ground, synthetic_pass.folder)
-    running = Service(home, home / "serve.log", console.port)
-    yield running
-    running.stop()
+    with Service(home, console.port) as running:
+        yield running
 
 
 @pytest.fixture(scope="session")
 def serve() -> type[Service]:
-    """Start another service: ``serve(home, log, console_port, openmct, settings)``."""
+    """Start another service: ``with serve(home, console_port, openmct, settings)``."""
     return Service
 
 
@@ -280,18 +284,19 @@ def patient(context: BrowserContext) -> BrowserContext:
 
 
 @contextmanager
-def strict_page(browser: Browser, url: str) -> Iterator[Page]:
-    """Open a page that permits no error in the console, no violation of the policy and no request to another host."""
+def strict_page(browser: Browser, url: str, *, strict: bool = True) -> Iterator[Page]:
+    """Open a page that permits no failure of a script and no request to another host.
+
+    A strict one permits no error in the console and no violation of the policy; others count their requests.
+    """
     context = patient(browser.new_context(base_url=url, viewport={"width": 1280, "height": 900}))
     opened = context.new_page()
-    opened.add_init_script(
-        "document.addEventListener('securitypolicyviolation', (event) =>"
-        " console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"
-    )
+    opened.add_init_script(NOTE_VIOLATIONS if strict else COUNT_REQUESTS)
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
-    opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     opened.on("request", lambda request: _note_foreign(request.url, url, errors))
+    if strict:
+        opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     try:
         yield opened
     finally:
@@ -301,16 +306,9 @@ def strict_page(browser: Browser, url: str) -> Iterator[Page]:
 
 @pytest.fixture
 def page(browser: Browser, service: Service) -> Iterator[Page]:
-    """A fresh page of the service; the test fails if a script of it did, or if it asked another host."""
-    context = patient(browser.new_context(base_url=service.url, viewport={"width": 1280, "height": 900}))
-    opened = context.new_page()
-    opened.add_init_script(COUNT_REQUESTS)
-    errors: list[str] = []
-    opened.on("pageerror", lambda error: errors.append(str(error)))
-    opened.on("request", lambda request: _note_foreign(request.url, service.url, errors))
-    yield opened
-    context.close()
-    assert errors == []
+    """A fresh page of the service."""
+    with strict_page(browser, service.url, strict=False) as opened:
+        yield opened
 
 
 def _note_foreign(url: str, own: str, errors: list[str]) -> None:

@@ -16,9 +16,8 @@ def managed(tmp_path_factory, serve, console):
     with open_ground(home) as ground:
         token = add_user(ground, "ann", "admin")
         add_user(ground, "vic", "viewer")
-    running = serve(home, home / "serve.log", console.port)
-    yield running.url, home, token
-    running.stop()
+    with serve(home, console.port) as running:
+        yield running.url, home, token
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
-from tests.ground_service.web.conftest import patient
+from tests.ground_service.web.conftest import strict_page
 
 
 def test_the_api_page_shows_and_calls_operations_without_console_errors(page):
@@ -25,10 +25,10 @@ def test_the_api_page_shows_and_calls_operations_without_console_errors(page):
 def test_the_api_page_uses_the_session_of_the_signed_in_user(browser, serve, console, tmp_path):
     with open_ground(tmp_path / "home") as ground:
         token = add_user(ground, "ann", "viewer")
-    running = serve(tmp_path / "home", tmp_path / "serve.log", console.port)
-    context = patient(browser.new_context(base_url=running.url))
-    try:
-        page = context.new_page()
+    with (
+        serve(tmp_path / "home", console.port) as running,
+        strict_page(browser, running.url, strict=False) as page,
+    ):
         page.goto("/licences")
         page.get_by_label("Token").fill(token)
         page.locator("dialog").get_by_role("button", name="Sign in").click()
@@ -39,6 +39,3 @@ def test_the_api_page_uses_the_session_of_the_signed_in_user(browser, serve, con
         with page.expect_response("**/api/v1/passes*") as answered:
             page.locator("#operations-passes-list_passes .execute").click()
         assert answered.value.status == 200
-    finally:
-        context.close()
-        running.stop()

@@ -10,7 +10,7 @@ from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
-from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
+from tests.ground_service.web.conftest import strict_page
 from tests.ground_service.web.test_in_browser import answered, colour_of, settled
 
 
@@ -26,22 +26,15 @@ def compared(tmp_path_factory, make_pass, console, serve):
         define_pass(
             ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 60 * 10**9, spacecraft_id=76
         )
-    running = serve(home, home / "serve.log", console.port)
-    yield running
-    running.stop()
+    with serve(home, console.port) as running:
+        yield running
 
 
 @pytest.fixture
 def view(browser, compared):
-    """A page of the service; the test fails if a script of it fails."""
-    context = patient(browser.new_context(base_url=compared.url, viewport={"width": 1280, "height": 900}))
-    page = context.new_page()
-    page.add_init_script(COUNT_REQUESTS)
-    errors = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    yield page
-    context.close()
-    assert errors == []
+    """A page of the service."""
+    with strict_page(browser, compared.url, strict=False) as page:
+        yield page
 
 
 def row(page, name):

@@ -44,9 +44,8 @@ def shown(tmp_path_factory, synthetic_pass, serve, openmct):
     home = tmp_path_factory.mktemp("displays") / "home"
     with open_ground(home) as ground:
         import_archive(ground, synthetic_pass.folder)
-    running = serve(home, home / "serve.log", 1, openmct)
-    yield running
-    running.stop()
+    with serve(home, 1, openmct) as running:
+        yield running
 
 
 @pytest.fixture

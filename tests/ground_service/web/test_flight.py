@@ -129,9 +129,9 @@ def flown(
     thread = threading.Thread(target=payload.run, daemon=True)
     home = prepared_home(folder, payload.ports["telemetry earth"])
     thread.start()
-    service = serve(home, home / "serve.log", payload.ports["console"], openmct)
     try:
         with (
+            serve(home, payload.ports["console"], openmct) as service,
             strict_page(browser, service.url) as layout,
             strict_page(browser, service.url) as live,
             socket.create_connection(("127.0.0.1", payload.ports["telecommand earth"])) as station,
@@ -152,7 +152,6 @@ def flown(
             follow(found)
             yield found
     finally:
-        service.stop()
         payload.stopping.set()
         thread.join(PATIENCE_S)
     assert not thread.is_alive()

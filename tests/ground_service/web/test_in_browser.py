@@ -198,10 +198,13 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
 def test_an_alarm_is_acknowledged_on_its_page_and_keeps_its_history(page):
     receive(page, [camera_fault(second) for second in range(3)])
     settled(page, "/alarms?state=open")
-    row = page.locator("#alarms tbody tr", has_text="camera fault")
-    expect(row).to_contain_text("77, flight")
+    row = page.locator("#alarms tbody tr", has_text="camera fault").filter(has_text="77, flight")
     expect(row.locator(".state.raised")).to_have_css("border-top-color", colour_of(page, "--vermillion"))
-    row.get_by_role("button", name="Acknowledge").click()
+    row.get_by_role("checkbox").check()
+    receive(page, [camera_fault(0)], spacecraft_id=78)
+    expect(page.locator("#alarms")).to_contain_text("78, flight")  # drawn again
+    expect(row.get_by_role("checkbox")).to_be_checked()
+    press(page, "Acknowledge the chosen")
     expect(row).to_have_count(0)
     page.get_by_label("State").select_option("cleared")
     expect(page).to_have_url(re.compile("state=cleared"))

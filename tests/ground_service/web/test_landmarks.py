@@ -37,9 +37,8 @@ def searched(tmp_path_factory, make_flyable, console, serve):
             update_landmarks(ground, import_archive(ground, folder))
         assert ground.read(list_landmarks, LandmarkFilter(state="proposed")).total > 25  # more than a page
         tokens = {role: add_user(ground, f"ann-{role}", role) for role in ("viewer", "operator")}
-    running = serve(home, home / "serve.log", console.port)
-    yield running.url, tokens
-    running.stop()
+    with serve(home, console.port) as running:
+        yield running.url, tokens
 
 
 @pytest.fixture

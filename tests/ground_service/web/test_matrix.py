@@ -109,9 +109,8 @@ def empty_service(tmp_path_factory: pytest.TempPathFactory, console: Any, serve:
     """A service without any data."""
     home = tmp_path_factory.mktemp("empty") / "home"
     home.mkdir()
-    running = serve(home, home / "serve.log", console.port)
-    yield running
-    running.stop()
+    with serve(home, console.port) as running:
+        yield running
 
 
 class Worked:
@@ -154,8 +153,7 @@ def worked(
         add_ephemeris(ground, stored, name="reference.oem", precedence=0, actor="root")
         keep_archive(ground, flyable.folder)
         register_build(ground, load_build(build.parent), actor="root")
-    running = serve(home, home / "serve.log", console.port)
-    try:
+    with serve(home, console.port) as running:
         with Client(running.url, token) as api:
             live = work(api, spacecraft, received.packets)
         revision = mission.revision[:16]
@@ -170,9 +168,7 @@ def worked(
                 "/landmarks": "/landmarks",
             },
         )
-    finally:
-        running.stop()
-        spacecraft.close()
+    spacecraft.close()
 
 
 def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:

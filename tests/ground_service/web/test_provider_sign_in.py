@@ -28,9 +28,8 @@ def signed_in_elsewhere(tmp_path_factory, serve, console, provider):
         "LINNA_OIDC_CLIENT_SECRET_FILE": str(home.parent / "secret"),
         "LINNA_OIDC_ROLES": "admin=linna-admins",
     }
-    running = serve(home, home.parent / "serve.log", console.port, settings=settings)
-    yield running.url.replace("127.0.0.1", "localhost")
-    running.stop()
+    with serve(home, console.port, settings=settings) as running:
+        yield running.url.replace("127.0.0.1", "localhost")
 
 
 def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(

@@ -14,9 +14,8 @@ def guarded(tmp_path_factory, console, serve):
     home = tmp_path_factory.mktemp("guarded") / "home"
     with open_ground(home) as ground:
         token = add_user(ground, "ada", "viewer")
-    running = serve(home, home / "serve.log", console.port)
-    yield running.url, token
-    running.stop()
+    with serve(home, console.port) as running:
+        yield running.url, token
 
 
 @pytest.fixture
