@@ -4,8 +4,10 @@
 their outputs in FOLDER. A build of the site with `NOTEBOOK_OUTPUTS=FOLDER` shows these outputs; without it, text and
 code only.
 
-`python docs_site.py tour FOLDER` takes the pictures of the README from `linna-demo` and `demo.txt` in FOLDER, which are
-the output folder and the printed text of `linna demo`: PNG files, and `tour.gif`, whose comment is the text it shows.
+`python docs_site.py tour FOLDER` takes the pictures of the README and of the pages of one pass from `linna-demo` and
+`demo.txt` in FOLDER, which are the output folder and the printed text of `linna demo`: PNG files, and `tour.gif`, whose
+comment is the text it shows. `python docs_site.py shift FOLDER` takes those of a shift from `linna demo --live` in the
+new FOLDER. Each PNG file states its source and evidence level as its text.
 
 `python docs_site.py figures` writes the generated blocks of the pages again.
 """
@@ -26,6 +28,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
 from collections.abc import Iterator
 from datetime import date
@@ -53,6 +56,26 @@ source = "procedural"
 filter_gravity = "builtin"
 filter_degree = 8
 """
+TOUR_PAGES = {
+    "pass-map": ("/passes/1", "section[aria-labelledby=map-title]"),
+    "charts": ("/telemetry?pass=1&chart=1:temperature_c,bus_voltage_v&chart=1:mode", "#charts"),
+    "passes": ("/passes", "body"),
+    "regression": ("/regression", "body"),
+}
+SHIFT_PAGES = {
+    "shift": ("/", "body"),
+    "planner": ("/planner?window=1", "body"),
+    "links": ("/commands", "section[aria-labelledby=links-title]"),
+    "commands": ("/commands", "section[aria-labelledby=queue-title]"),
+    "telemetry": ("/telemetry?packet=housekeeping", "section[aria-labelledby=live-title]"),
+    "alarms": ("/alarms?state=any", "body"),
+    "events": ("/events", "body"),
+}
+"""Pictures of the documentation: address and part of a page of `linna demo`, and of `linna demo --live`."""
+
+FILLED_MS = 8000
+"""Time in which a page is filled; messages of a living demo go on."""
+
 _STYLE = re.compile(r"<style.*?</style>\s*", re.DOTALL)
 
 
@@ -140,48 +163,85 @@ def main(arguments: list[str]) -> int:
             save_executed_notebooks(Path(folder))
         case ["tour", folder]:
             save_tour(Path(folder), ROOT / "docs" / "pictures")
+        case ["shift", folder]:
+            save_shift(Path(folder), ROOT / "docs" / "pictures")
         case ["figures"]:
             write_figures()
         case _:
-            print("docs_site.py: expected 'notebooks FOLDER', 'tour FOLDER' or 'figures'", file=sys.stderr)
+            print(
+                "docs_site.py: expected 'notebooks FOLDER', 'tour FOLDER', 'shift FOLDER' or 'figures'",
+                file=sys.stderr,
+            )
             return 2
     return 0
 
 
 def save_tour(folder: Path, out: Path) -> None:
-    """Save the pass and the report of a demo as PNG files, and with its text and the shift page as an animation."""
+    """Save pages of a demo as PNG files; its text, the saved shift, its pass and its report are an animation."""
     from PIL import Image
 
     from benchmarks.pages import open_chromium, served
 
     text = tour_text((folder / "demo.txt").read_text(encoding="utf-8"))
-    home = folder / "linna-demo" / "ground"
+    source = f"linna demo, {text.splitlines()[-1]}"
     (report,) = (folder / "linna-demo").rglob("report.html")
     terminal = (
         "<body style='margin:0;background:#1d2529;color:#e8eef0;padding:28px;font:19px/1.45 DejaVu Sans Mono'>"
         f"<pre style='margin:0;white-space:pre-wrap'><b>$ linna demo --out linna-demo</b>\n{html.escape(text)}</pre>"
     )
-    frames = []
-    with served(home) as url, open_chromium() as browser:
+    with served(folder / "linna-demo" / "ground") as url, open_chromium() as browser:
         page = browser.new_page(viewport={"width": 1200, "height": 800}, color_scheme="light")
-        for name, address in (
-            ("", "about:blank"),
-            ("shift", f"{url}/"),
-            ("pass", f"{url}/passes/1"),
-            ("report", report.resolve().as_uri()),
-        ):
-            page.goto(address, wait_until="networkidle")
-            if not name:
-                page.set_content(terminal)
-            page.wait_for_timeout(1500)
-            picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-            if name in ("pass", "report"):
-                picture.quantize(128).save(out / f"{name}.png", optimize=True)
-            frames.append(picture.resize((900, 600), Image.Resampling.LANCZOS).quantize(96))
+        page.set_content(terminal)
+        shown = [page.screenshot(), (out / "shift.png").read_bytes()]
+        for name, address in (("pass", f"{url}/passes/1"), ("report", report.resolve().as_uri())):
+            page.goto(address)
+            shown.append(_picture(page, out / f"{name}.png", source))
+        for name, (address, part) in TOUR_PAGES.items():
+            page.goto(url + address)
+            _picture(page, out / f"{name}.png", source, part)
+    pictures = [Image.open(io.BytesIO(one)).convert("RGB") for one in shown]
+    small = [one.resize((900, 600), Image.Resampling.LANCZOS) for one in pictures]
+    frames = [one.quantize(128, Image.Quantize.MAXCOVERAGE) for one in small]
     frames[0].save(
         out / "tour.gif", save_all=True, append_images=frames[1:], duration=[6000, 4000, 4000, 4000], loop=0,
         optimize=True, comment=text.encode(),
     )  # fmt: skip
+
+
+def save_shift(folder: Path, out: Path) -> None:
+    """Save pages of a living demo with a fault as PNG files, when it has reports of two windows."""
+    from benchmarks.pages import open_chromium
+    from studies.harness.parts import Part, answers_http, free_port
+
+    port = free_port()
+    url, command = f"http://127.0.0.1:{port}", [sys.executable, "-m", "linna", "demo", "--live"]
+    command += ["--scenario", "live-pictures", "--out", str(folder), "--port", str(port)]
+    reports: list[dict[str, Any]] = []
+    with Part(command, folder.with_suffix(".log"), lambda: True, 1) as demo, open_chromium() as browser:
+        page = browser.new_page(viewport={"width": 1200, "height": 800}, color_scheme="light")
+        while len(reports) < 2 and not demo.has_ended:
+            time.sleep(2.0)
+            if answers_http(f"{url}/readyz"):
+                reports = page.request.get(f"{url}/api/v1/reports?pass_id=1&pass_id=2").json()["items"]
+        source = f"linna demo --live, evidence: level {reports[0]['evidence_level']}"
+        for name, (address, part) in SHIFT_PAGES.items():
+            page.goto(url + address)
+            _picture(page, out / f"{name}.png", source, part)
+
+
+def _picture(page: Any, file: Path, source: str, part: str = "body") -> bytes:
+    """Return the upper 800 px of a part of a page that has been filled, and save them with their source."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    page.wait_for_timeout(FILLED_MS)
+    octets: bytes = page.screenshot() if part == "body" else page.locator(part).screenshot()
+    told = PngInfo()
+    told.add_text("Source", source)
+    picture = Image.open(io.BytesIO(octets)).convert("RGB")
+    picture = picture.crop((0, 0, picture.width, min(picture.height, 800)))
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE).save(file, optimize=True, pnginfo=told)
+    return octets
 
 
 def tour_text(printed: str) -> str:

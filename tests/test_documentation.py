@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text()
 TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
+TUTORIAL_TEXTS = [(DOCS / "tutorials" / name).read_text() for name in TUTORIALS]
 MARK = re.compile(
     r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n"
     r" *```\w+\n(?P<text>.*?)^ *```$",
@@ -212,6 +213,15 @@ def test_the_animation_of_the_readme_shows_the_figures_of_the_text() -> None:
         shown = picture.info["comment"].decode()
     told = (DOCS / "tutorials" / "first-pass.md").read_text().split("```text\n")[1].split("```")[0].strip()
     assert shown == told
+    median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[
+        0
+    ]
+    assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in README
+    for name in ("pass", "report", *docs_site.TOUR_PAGES, *docs_site.SHIFT_PAGES):
+        with Image.open(DOCS / "pictures" / f"{name}.png") as picture:
+            assert f"evidence: level {level}" in picture.info["Source"], name
+        shown_on = [text for text in TUTORIAL_TEXTS if f"pictures/{name}.png" in text]
+        assert shown_on and all(f"level {level}" in text for text in shown_on), name
     assert (DOCS / "pictures" / "tour.gif").stat().st_size < 1e6 and "pictures/tour.gif" in README
 
 
