@@ -254,7 +254,8 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
         found, truth = _detect(
             case, true_map, states[k, :3], camera_from_icrf, rotations[k], lasting, shifts_px[k], rng
         )
-        measured = _turned(camera_from_icrf, tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3))
+        tilt_rad = tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3)
+        measured = np.asarray(_rotation(tilt_rad) @ camera_from_icrf, dtype=np.float64)
         if case.kidnap is not None and case.kidnap.announced and k == case.kidnap.frame:
             state = anchored.widened(state, case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
         shown = bool(case.imaging[k])
@@ -597,7 +598,3 @@ def _rotation(vector_rad: FloatArray) -> FloatArray:
         return np.eye(3)
     quaternion = np.concatenate([[np.cos(0.5 * angle)], np.sin(0.5 * angle) / angle * vector_rad])
     return matrix_from_quaternion(quaternion)
-
-
-def _turned(camera_from_icrf: FloatArray, error_rad: FloatArray) -> FloatArray:
-    return np.asarray(_rotation(error_rad) @ camera_from_icrf, dtype=np.float64)

@@ -77,7 +77,7 @@ def make_paper(shop: Workshop, *, quick: bool) -> PaperReport:
             paper_steps.load_png(shop.out / "samples.png"),
             "Form of the paper's Fig. 5: samples of the data set with labels (cyan: class 0, lime: class 1, yellow: "
             "class 2).",
-            _level(shop),
+            "3s (real terrain)" if shop.real else "2 (procedural Moon)",
         ),
         dataset=DatasetCounts(
             samples["frames"], _three(samples["instances"]), "GLD100" if shop.real else "procedural Moon"
@@ -152,10 +152,6 @@ def _region(shop: Workshop, region: dict[str, Any]) -> PaperPicture:
         "on it, rendered from 110 km."
     )
     return PaperPicture(paper_steps.load_png(shop.out / "region.png"), caption, "2 (procedural Moon)")
-
-
-def _level(shop: Workshop) -> str:
-    return "3s (real terrain)" if shop.real else "2 (procedural Moon)"
 
 
 def _three(values: Sequence[int]) -> tuple[int, int, int]:

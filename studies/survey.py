@@ -35,6 +35,10 @@ Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 SETTLED_FRAMES = 20
 """Frames at the start of a session that do not count."""
 
+TRACK_FRAMES = (5, 2)
+"""A crater is counted on its track with so many frames that have it in the image, and as found with so many that
+detect it."""
+
 
 class SurveyWindow(BaseModel):
     """One window; errors of the position in metres, and the share of frames within 2 sigma along each axis."""
@@ -62,6 +66,8 @@ class SurveySession(BaseModel):
     findable: int
     craters: int
     found: int
+    tracks: int
+    tracked: int
     pairs: int
     wrong_pairs: int
     wrong_fixes: int
@@ -129,12 +135,13 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
     navigation = world.scenario.navigation
     if distortion_m := navigation.catalogue_distortion_m:
         level += f", map distorted by {distortion_m:g} m over {navigation.catalogue_distortion_deg:g}°"
+    counts = ("detections", "findable", "craters", "found")
+    tracks = judged.tracks[judged.tracks[:, 0] >= TRACK_FRAMES[0], 1]
     return SurveySession(
         windows=_windows(world, judged),
-        detections=judged.detections.sum(),
-        findable=judged.findable.sum(),
-        craters=judged.craters.sum(),
-        found=judged.found.sum(),
+        **dict(zip(counts, judged.seen.sum(axis=0).tolist(), strict=True)),
+        tracks=tracks.size,
+        tracked=(tracks >= TRACK_FRAMES[1]).sum(),
         pairs=judged.pairs.sum(),
         wrong_pairs=judged.pairs[:, 1].sum(),
         wrong_fixes=judged.wrong_fixes,
@@ -201,7 +208,8 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
     low, high = chi2.ppf((0.025, 0.975), 6 * len(windows)) / len(windows)
     sums = {
         name: sum(getattr(session, name) for session in sessions)
-        for name in ("detections", "findable", "craters", "found", "pairs", "wrong_pairs", "wrong_fixes")
+        for name in SurveySession.model_fields
+        if name not in ("windows", "registered_share", "level", "data")
     }
     return {
         "windows": [window.model_dump(exclude={"position_m"}) for window in windows],
@@ -220,6 +228,7 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
         "fixed_share": sum(window.fixed for window in windows) / max(int(frames.sum()), 1),
         "catalogued_share": sums["findable"] / max(sums["detections"], 1),
         "recall_5_30_km": sums["found"] / max(sums["craters"], 1),
+        "track_recall_5_30_km": sums["tracked"] / max(sums["tracks"], 1),
         "wrong_pairs_share": sums["wrong_pairs"] / max(sums["pairs"], 1),
         "wrong_fixes": sums["wrong_fixes"],
         "registered_share": min(session.registered_share for session in sessions),
@@ -255,7 +264,8 @@ def format_survey(figures: dict[str, Any]) -> str:
             f"fixed {100 * figures['fixed_share']:.1f} %; wrong pairs {100 * figures['wrong_pairs_share']:.2f} %, "
             f"wrong fixes {figures['wrong_fixes']}; crater list {stated}",
             f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters, and "
-            f"{100 * figures['recall_5_30_km']:.0f} % of the catalogued craters of 5 to 30 km in view are detected",
+            f"{100 * figures['recall_5_30_km']:.0f} % of the catalogued craters of 5 to 30 km in view are detected "
+            f"(on their tracks {100 * figures['track_recall_5_30_km']:.0f} %)",
             f"level {figures['level']}",
         ]
     )

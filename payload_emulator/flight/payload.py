@@ -494,7 +494,8 @@ class Payload:
         """What TM/TC takes of the store; a time report at the commanded interval of frames."""
         machine = self._machine
         takes = machine.board.downlink_octets()
-        kinds = StoreClass if self._sends_all else _SMALL_CLASSES
+        sends_all = machine.mode in (PayloadMode.observing, PayloadMode.downlinking)
+        kinds = StoreClass if sends_all else _SMALL_CLASSES
         if (
             machine.time_exponent >= 0
             and takes
@@ -508,7 +509,3 @@ class Payload:
         packets = machine.store.take(takes, kinds)
         self._sent_octets += sum(map(len, packets))
         return packets
-
-    @property
-    def _sends_all(self) -> bool:
-        return self._machine.mode in (PayloadMode.observing, PayloadMode.downlinking)

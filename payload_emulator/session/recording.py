@@ -265,10 +265,6 @@ def _array(values: list[float | None]) -> FloatArray:
     return np.array([math.nan if value is None else float(value) for value in values], dtype=np.float64)
 
 
-def _table(rows: list[list[float | None]]) -> FloatArray:
-    return np.stack([_array(row) for row in rows]) if rows else np.zeros((0, 0))
-
-
 def _parse(line: str, path: Path, index: int) -> StepInput:
     try:
         row = json.loads(line)
@@ -283,7 +279,10 @@ def _parse(line: str, path: Path, index: int) -> StepInput:
             _array(row["sensors"]),
             int(row["uptime_ticks"]),
             int(row["downlink_octets"]),
-            {name: _table(rows) for name, rows in row.get("instruments", {}).items()},
+            {
+                name: np.stack([_array(one) for one in rows]) if rows else np.zeros((0, 0))
+                for name, rows in row.get("instruments", {}).items()
+            },
         )
     except (ValueError, KeyError, TypeError) as error:
         raise RecordError(

@@ -92,10 +92,11 @@ class JudgedSession:
         Outcome of each frame (-1: none), NIS and number of matched craters of its fix.
     pairs
         Right and wrong pairs of the fix, shape (n, 2).
-    detections, findable
-        Detections, and those that are catalogued craters.
-    craters, found
-        Catalogued craters of 5 to 30 km in the image, and those that are detected.
+    seen
+        Detections, those that are catalogued craters, catalogued craters of 5 to 30 km in the image, and those that
+        are detected, shape (n, 4).
+    tracks
+        Frames with each of these craters in the image, and frames that detect it, shape (craters of the list, 2).
     arcs
         First and last frame of each stretch of images.
     """
@@ -105,10 +106,8 @@ class JudgedSession:
     nis: FloatArray
     matched: IntArray
     pairs: IntArray
-    detections: IntArray
-    findable: IntArray
-    craters: IntArray
-    found: IntArray
+    seen: IntArray
+    tracks: IntArray
     arcs: tuple[tuple[int, int], ...]
 
     @property
@@ -156,10 +155,8 @@ def judge_session(
     outcomes, nis, matched = _outcomes(tables, frame_ticks)
     imaging = (outcomes >= 0) & (outcomes != Outcome.no_image)
     errors = _errors(world, loaded, estimates, frame_ticks, imaging)
-    pairs, seen = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
-    arcs = tuple(_arcs(world.frame_utc_ns, imaging))
-    detections, findable, craters, found = seen.T
-    return JudgedSession(errors, outcomes, nis, matched, pairs, detections, findable, craters, found, arcs)
+    judged = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
+    return JudgedSession(errors, outcomes, nis, matched, *judged, tuple(_arcs(world.frame_utc_ns, imaging)))
 
 
 def score_navigation(world: World, judged: JudgedSession | None) -> dict[str, Any]:
@@ -311,13 +308,14 @@ def _judged_pairs(
     camera_from_mcmf: FloatArray,
     tables: dict[str, Table],
     frame_ticks: IntArray,
-) -> tuple[IntArray, IntArray]:
-    """Right and wrong pairs of each frame's fix, shape (n, 2), and the counts of detections and craters (n, 4).
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Right and wrong pairs of each frame's fix, shape (n, 2), and `seen` and `tracks` of the session.
 
     Landmarks that the payload mapped itself are in no catalogue and are not judged.
     """
     frames = world.frame_utc_ns.size
     judged, counts = np.zeros((frames, 2), dtype=np.int64), np.zeros((frames, 4), dtype=np.int64)
+    tracks = np.zeros((len(catalogue), 2), dtype=np.int64)
     corner = np.array([world.camera.width_px, world.camera.height_px]) - 1.0
     sized = (catalogue.diameter_m >= 5e3) & (catalogue.diameter_m <= 30e3)
     seen = tables["detections"]
@@ -343,7 +341,9 @@ def _judged_pairs(
         limit = np.maximum(_RIGHT_PX, _RIGHT_OF_DIAMETER * mine[:, 2])
         same = alike & (away < limit[:, None])
         wanted = sized[near] & np.all((uv >= 0.0) & (uv <= corner), axis=1)
-        counts[number] = len(mine), same.any(axis=1).sum(), wanted.sum(), (wanted & same.any(axis=0)).sum()
+        met = np.stack([wanted, wanted & same.any(axis=0)], axis=1)
+        counts[number] = len(mine), same.any(axis=1).sum(), *met.sum(axis=0)
+        tracks[near] += met
         if used is None or number not in used_row:
             continue
         pairs = _rows_of(used.item_owner, used_row[number])
@@ -354,7 +354,7 @@ def _judged_pairs(
         at, _ = _seen(world, camera_from_mcmf[number], position[number], rim, catalogue, crater)
         right = np.linalg.norm(mine[detection, :2] - at, axis=1) < limit[detection]
         judged[number] = np.count_nonzero(right), np.count_nonzero(~right)
-    return judged, counts
+    return judged, counts, tracks
 
 
 def _rows_of(owner: IntArray, value: int) -> slice:

@@ -126,7 +126,7 @@ class DistributedGround(MissionGround):
                 partial(worker_answers, settings, timeout_s=ANSWER_S),
             ),
             "scheduler": (["scheduler"], self._has_scheduler),
-            "link": (["link", "run"], self._are_links_operated),
+            "link": (["link", "run"], lambda: all(map(_is_here, links.owners(self.ground).values()))),
         }
         for name, (words, ready) in commands.items():
             command = [sys.executable, "-m", "linna", *words]
@@ -139,9 +139,6 @@ class DistributedGround(MissionGround):
     def _has_scheduler(self) -> bool:
         with self.ground.database.reading() as connection:
             return _is_here(leases.owner_of(connection, LEASE))
-
-    def _are_links_operated(self) -> bool:
-        return all(_is_here(one) for one in links.owners(self.ground).values())
 
 
 def _is_here(owner: str | None) -> bool:

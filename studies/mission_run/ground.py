@@ -65,7 +65,10 @@ class MissionGround:
     def add_mission(self, text: bytes) -> None:
         """Add the mission description, and wait for its links."""
         self.client.add_mission(text)
-        self._wait(self._has_links, "links of the mission description")
+        self._wait(
+            lambda: all(one.owner is not None for one in self.client.list_links()),
+            "links of the mission description",
+        )
 
     def deliver_reference(self, path: Path, day: int) -> None:
         """Add the orbit determination of a day as flight dynamics; later ones are preferred."""
@@ -109,9 +112,6 @@ class MissionGround:
     def repeat_actions(self) -> bool:
         """Return whether failed actions are to be repeated."""
         return has_repetitions(self.ground)
-
-    def _has_links(self) -> bool:
-        return all(one.owner is not None for one in self.client.list_links())
 
     def _spooled_octets(self) -> int:
         return sum(spooled_octets(one) for one in (self.ground.home / INCOMING).glob("link-*"))

@@ -58,6 +58,8 @@ def session(*windows: SurveyWindow) -> SurveySession:
         findable=50,
         craters=40,
         found=30,
+        tracks=10,
+        tracked=8,
         pairs=20,
         wrong_pairs=1,
         wrong_fixes=0,
@@ -87,6 +89,7 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
     assert figures["coast_end_p95_m"] == 100.0
     assert figures["fixed_share"] == 18 / 20
     assert (figures["catalogued_share"], figures["recall_5_30_km"]) == (0.25, 0.75)
+    assert figures["track_recall_5_30_km"] == 0.8
     assert figures["wrong_pairs_share"] == 0.05
     assert "position_m" not in figures["windows"][0]
     assert "registered in 50 % of the frames" in format_survey(figures)
@@ -129,8 +132,8 @@ def test_windows_over_the_region_are_flown_and_a_finished_seed_is_not_flown_agai
     assert figures["seeds"] == [5] and len(figures["windows"]) == 2
     assert figures["frames"] == sum(row["frames"] for row in figures["windows"]) > 40
     assert all(300.0 <= row["longitude_deg"] <= 330.0 for row in figures["windows"])
-    # Simulated detections: recall of 0.7, all of them craters.
-    assert 0.5 < figures["recall_5_30_km"] < 0.8
+    # Simulated detections: recall of 0.7, all of them craters; what is missed once is missed again more often.
+    assert 0.5 < figures["recall_5_30_km"] < 0.8 < figures["track_recall_5_30_km"] < 0.95
     assert figures["windows"][0]["coast_end_m"] is None and figures["windows"][1]["coast_end_m"] > 0.0
     assert figures["level"].startswith("2") and figures["registered_share"] == 0.0
     with monkeypatch.context() as forbidden:

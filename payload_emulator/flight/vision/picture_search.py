@@ -144,9 +144,7 @@ def enlarge(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Pixel x of the plane lies at 2 x + 0.5 of the enlarged one.
     """
-    for axis in (0, 1):
-        plane = _enlarge_rows(plane) if axis == 0 else _enlarge_rows(plane.T).T
-    return np.ascontiguousarray(plane)
+    return np.ascontiguousarray(_enlarge_rows(_enlarge_rows(plane).T).T)
 
 
 def _enlarge_rows(plane: NDArray[np.float32]) -> NDArray[np.float32]:

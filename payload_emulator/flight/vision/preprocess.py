@@ -69,7 +69,11 @@ def prepare_image(
     gray = _square_root_gray(image)
     if gray is None:
         return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
-    quality = _judge(gray)
+    quality = _verdict(
+        float(np.mean(gray > np.float32(np.sqrt(_SATURATED_LEVEL)))),
+        float(np.mean(gray > np.float32(np.sqrt(_DARK_LEVEL)))),
+        float(gray.std(dtype=np.float64)),
+    )
     if quality is not ImageQuality.OK:
         return PreparedImage(np.zeros(gray.shape, np.float32), quality)
     return PreparedImage(_mean_of_channels(image) if by_channel else normalise(gray), ImageQuality.OK)
@@ -179,14 +183,6 @@ def _square_root_gray(image: NDArray[np.generic]) -> NDArray[np.float32] | None:
     if not np.isfinite(mean).all():
         return None
     return np.sqrt(np.clip(mean, 0.0, 1.0, out=mean), out=mean)
-
-
-def _judge(square_root_gray: NDArray[np.float32]) -> ImageQuality:
-    return _verdict(
-        float(np.mean(square_root_gray > np.float32(np.sqrt(_SATURATED_LEVEL)))),
-        float(np.mean(square_root_gray > np.float32(np.sqrt(_DARK_LEVEL)))),
-        float(square_root_gray.std(dtype=np.float64)),
-    )
 
 
 def _verdict(saturated_share: float, lit_share: float, deviation: float) -> ImageQuality:
