@@ -24,7 +24,8 @@ import numpy as np
 from benchmarks._rows import Row
 from tmtc import reed_solomon
 from tmtc.downlink import LinkSettings, decode, encode_cadus
-from tmtc.schema import Dictionary, Field, Group, PacketDefinition
+from tmtc.fields import Field
+from tmtc.schema import Dictionary, Group, PacketDefinition
 from tmtc.stream import cut_packets
 from tmtc.xtce.export import format_xtce
 

@@ -17,9 +17,9 @@ from ground_service.errors import ServerError
 from ground_service.ground import ground_from_settings
 from ground_service.http.origins import LOOPBACK
 from ground_service.logs import logging_config
-from ground_service.memory import limit_heaps
 from ground_service.settings import Settings
 from ground_service.worker.presence import present
+from kernels.memory import limit_heaps
 
 if TYPE_CHECKING:
     from types import FrameType

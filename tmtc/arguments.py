@@ -14,8 +14,9 @@ from tmtc.dictionary import DICTIONARY
 from tmtc.effects import CARRIER, FUNCTION
 from tmtc.errors import TmtcError, ValueRefused
 from tmtc.event_texts import number_text, time_text
+from tmtc.fields import Field
 from tmtc.onboard_parameters import BY_NAME, find_parameter
-from tmtc.schema import Field, encode
+from tmtc.schema import encode
 
 _YEAR_S = 86_400.0 * 366.0
 _WIDEST = 1e6

@@ -8,7 +8,8 @@ from dataclasses import asdict
 from typing import Any
 
 from tmtc.errors import MalformedPacket
-from tmtc.schema import Dictionary, Field, Group, PacketDefinition
+from tmtc.fields import Field
+from tmtc.schema import Dictionary, Group, PacketDefinition
 
 
 def format_dictionary(dictionary: Dictionary) -> str:

@@ -15,8 +15,9 @@ import numpy as np
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import UnknownPacket
+from tmtc.fields import Field
 from tmtc.parquet import parquet_octets
-from tmtc.schema import Field, Table
+from tmtc.schema import Table
 
 FORMATS = ("json", "csv", "parquet")
 

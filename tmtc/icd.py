@@ -6,8 +6,9 @@ from tmtc.codes import EVENTS
 from tmtc.dictionary import DICTIONARY
 from tmtc.effects import EFFECTS
 from tmtc.event_texts import EVENT_TEXTS
+from tmtc.fields import Field
 from tmtc.packets import TYPE_TELEMETRY
-from tmtc.schema import Dictionary, Field, PacketDefinition
+from tmtc.schema import Dictionary, PacketDefinition
 
 _TABLE_HEAD = """\
 | octet | field | type | unit | scale | range and limits | meaning |

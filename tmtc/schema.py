@@ -24,6 +24,7 @@ import numpy.typing as npt
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.crc import CRC_LENGTH, append_crc, check_crc
 from tmtc.errors import MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
+from tmtc.fields import Field
 from tmtc.packets import (
     PRIMARY_HEADER_LENGTH,
     TYPE_TELECOMMAND,
@@ -76,70 +77,6 @@ WITHIN_LIMITS, WARNING, ALARM = 0, 1, 2
 
 NOT_A_TM_PACKET = -1
 WRONG_LENGTH = -2
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """One number of a packet, or `size` numbers of one kind.
-
-    `minimum` and `maximum` are engineering values refused on packing; `warning` and `alarm` are (low, high)
-    limits for monitoring on the ground. `saturate` clips what does not fit instead of refusing it.
-    `missing` is the raw code of "not known" (engineering NaN).
-    """
-
-    name: str
-    type: str
-    description: str
-    unit: str = ""
-    size: int = 1
-    scale: float = 1.0
-    offset: float = 0.0
-    labels: tuple[tuple[int, str], ...] = ()
-    minimum: float | None = None
-    maximum: float | None = None
-    missing: int | None = None
-    saturate: bool = False
-    warning: tuple[float, float] | None = None
-    alarm: tuple[float, float] | None = None
-
-    @property
-    def is_float(self) -> bool:
-        """Whether it is stored as an IEEE 754 number."""
-        return self.type[0] == "f"
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether the engineering value differs from the raw one."""
-        return self.scale != 1.0 or self.offset != 0.0 or self.missing is not None
-
-    @property
-    def octets(self) -> int:
-        """Octets on the link."""
-        return self.size * int(self.type[1:]) // 8
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """The big-endian numpy type of one element."""
-        return np.dtype(f">{self.type[0]}{int(self.type[1:]) // 8}")
-
-    @property
-    def raw_limits(self) -> tuple[int, int]:
-        """Least and greatest raw integer (integer types only)."""
-        bits = int(self.type[1:])
-        return (0, (1 << bits) - 1) if self.type[0] == "u" else (-(1 << bits - 1), (1 << bits - 1) - 1)
-
-    def limit_states(self, values: npt.ArrayLike) -> npt.NDArray[np.int8]:
-        """`WITHIN_LIMITS`, `WARNING` or `ALARM` for each engineering value; NaN breaks no limit."""
-        numbers = np.asarray(values, dtype=np.float64)
-        states = np.full(numbers.shape, WITHIN_LIMITS, dtype=np.int8)
-        for state, limits in ((WARNING, self.warning), (ALARM, self.alarm)):
-            if limits is not None:
-                states[(numbers < limits[0]) | (numbers > limits[1])] = state
-        return states
-
-    def label(self, code: int) -> str:
-        """The name of a raw code, or the number itself where it has none."""
-        return dict(self.labels).get(int(code), str(int(code)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,6 +363,16 @@ class Dictionary:
         return self._compiled[definition.name]
 
 
+def limit_states(field: Field, values: npt.ArrayLike) -> npt.NDArray[np.int8]:
+    """`WITHIN_LIMITS`, `WARNING` or `ALARM` for each engineering value; NaN breaks no limit."""
+    numbers = np.asarray(values, dtype=np.float64)
+    states = np.full(numbers.shape, WITHIN_LIMITS, dtype=np.int8)
+    for state, limits in ((WARNING, field.warning), (ALARM, field.alarm)):
+        if limits is not None:
+            states[(numbers < limits[0]) | (numbers > limits[1])] = state
+    return states
+
+
 def gather(octets: OctetArray, starts: IntArray, dtype: np.dtype[Any]) -> RecordArray:
     """Records of `dtype` beginning at `starts` (n,), copied out of `octets`."""
     if not starts.size:
@@ -480,7 +427,7 @@ class _Compiled:
             places = self.base_dtype.fields
             assert places is not None
             self.count_offset = definition.data_start + int(places[group.count][1])
-            self.count_dtype = count.dtype
+            self.count_dtype = np.dtype(count.dtype)
 
     def packet(self, header: bytes, values: Mapping[str, object], sequence_count: int) -> bytes:
         """The whole packet with checksum."""
@@ -642,7 +589,7 @@ def _columns(
     """(raw, engineering) columns of big-endian `records`."""
     raw, engineering = {}, {}
     for f in fields:
-        column = np.ascontiguousarray(records[f.name], dtype=f.dtype.newbyteorder("="))
+        column = np.ascontiguousarray(records[f.name], dtype=np.dtype(f.dtype).newbyteorder("="))
         raw[f.name] = column
         engineering[f.name] = _decode_column(f, column)
     return raw, engineering

@@ -8,8 +8,9 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from reports.values import InstrumentReport, QuantityStatistics, ResidualStatistics
+from tmtc.fields import Field
 from tmtc.instruments import SAMPLE_STATUSES, InstrumentTelemetry, Residual, instrument_telemetry
-from tmtc.schema import Field, Table
+from tmtc.schema import Table
 
 _CODES = {name: code for code, name in SAMPLE_STATUSES}
 

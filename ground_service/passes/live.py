@@ -25,7 +25,8 @@ from ground_service.store import parameters as declared_values
 from ground_service.store import telemetry
 from ground_service.store.vehicles import FLOWN, Vehicle, all_vehicles, find_vehicle, get_vehicle
 from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.schema import DecodedPacket, Field
+from tmtc.fields import Field
+from tmtc.schema import DecodedPacket, limit_states
 
 LIVE_PACKETS = (
     *(one.name for one in STRUCTURES.values()),
@@ -141,7 +142,7 @@ def _values(packet: DecodedPacket) -> Iterator[LiveValue]:
                 name=field.name,
                 value=value,
                 text=_text(field, packet.raw[field.name], value),
-                limit_state=LIMIT_STATES[int(field.limit_states(value))] if limited else "none",
+                limit_state=LIMIT_STATES[int(limit_states(field, value))] if limited else "none",
             )
 
 

@@ -57,7 +57,8 @@ from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from reports.values import PacketAccounting
 from tmtc.dictionary import DICTIONARY
-from tmtc.schema import Field
+from tmtc.fields import Field
+from tmtc.schema import limit_states
 
 DAY_NS = 86_400_000_000_000
 LIMIT_STATES = ("within", "warning", "alarm")
@@ -331,7 +332,7 @@ def trend_of(field: Field, buckets: Buckets) -> Trend | None:
     if total == 0:
         return None
     low, high = float(buckets.low.min()), float(buckets.high.max())
-    worst = int(field.limit_states(np.array([low, high])).max())
+    worst = int(limit_states(field, [low, high]).max())
     return Trend(
         parameter=field.name,
         unit=field.unit,

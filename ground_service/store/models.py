@@ -32,7 +32,7 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-from tmtc.dictionary import DICTIONARY
+from tmtc.housekeeping import HOUSEKEEPING_FIELDS
 
 NO_TICKS = -1
 """On-board time of a packet that carries none."""
@@ -226,7 +226,7 @@ HOUSEKEEPING = samples(
     "housekeeping",
     *(
         column(one.name, Double if one.is_calibrated else _COLUMN_TYPES[one.type])
-        for one in DICTIONARY.packet("housekeeping").fields
+        for one in HOUSEKEEPING_FIELDS
         if one.name != "structure_id"
     ),
 )

@@ -30,13 +30,13 @@ from ground_service.jobs import store
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
-from ground_service.memory import give_back
 from ground_service.passes.archive_zip import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
 from ground_service.tracing import span
 from ground_service.worker.actions import run_actions
 from ground_service.worker.upkeep import nightly
+from kernels.memory import give_back
 from lunar.errors import LunarError
 from reports.errors import ReportError
 from tmtc.errors import TmtcError

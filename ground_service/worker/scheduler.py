@@ -20,13 +20,13 @@ from ground_service.errors import GroundError, fault_of
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.jobs.store import repeat_ingests
-from ground_service.memory import give_back
 from ground_service.planning.standing import needs_plan
 from ground_service.regression.jobs import nightly_placebo
 from ground_service.store import leases
 from ground_service.worker.actions import repeat_due
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
 from ground_service.worker.watch import Watch
+from kernels.memory import give_back
 
 log = logging.getLogger(__name__)
 

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from kernels.memory import give_back
 from lunar.errors import LunarError
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
@@ -214,8 +215,6 @@ class LiveSession:
                 self.utc_ns = self._slots[0].utc_ns
         if self._names == (ALWAYS_HEARD,) and not self._is_continued:
             self._begin_contact(self._always())
-        if scenario.camera.images != "reduced":
-            world.terrain.reserve()
         if self.journal_file is not None:
             left = [one for one in load_journal(self.journal_file) if one.number not in self._sent_up]
             self._to_repeat.extend(sorted(left, key=lambda one: one.utc_ns))
@@ -530,11 +529,12 @@ class LiveSession:
         self._last_heard_ns = self.utc_ns
 
     def _end_contact(self) -> None:
-        """End a contact: telecommands that are still on their way are lost."""
+        """End a contact: telecommands that are still on their way are lost. Free memory goes back to the system."""
         self.account.telecommand_octets_lost += sum(len(octets) for _, octets in self._uplinked)
         self._uplinked.clear()
         self._uplinks.clear()
         self.contact = None
+        give_back()
 
     def _take_orders(self, seconds: float | None) -> bytes:
         """Return the telecommand packets that reach the spacecraft in some seconds of uplink; None: all that wait."""

@@ -436,6 +436,7 @@ class MissionRun:
             self._deliver_reference(ground, dynamics, self._scenario.epoch_utc_ns)
             request = dynamics.request(self._terms.windows_per_day, self._terms.window_s, self._terms.days)
             self._progress.request_id = ground.client.add_request(request).id
+        dynamics.world.terrain.close()
         self._progress.posts.append((before + 1, ground.audit_head()))
 
     def _deliver_reference(self, ground: MissionGround, dynamics: FlightDynamics, now: int) -> None:

@@ -22,7 +22,7 @@ from tests.scenarios import short_scenario
 
 TELEMETRY = """
 from tmtc.instruments import InstrumentTelemetry, Residual, sample_packet
-from tmtc.schema import Field
+from tmtc.fields import Field
 
 TELEMETRY = InstrumentTelemetry(
     "plummet", "plummet", 9000,

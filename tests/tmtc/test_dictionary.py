@@ -8,15 +8,16 @@ from hypothesis import strategies as st
 
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
+from tmtc.fields import Field
 from tmtc.schema import (
     ALARM,
     WARNING,
     WITHIN_LIMITS,
     WRONG_LENGTH,
     Dictionary,
-    Field,
     Group,
     PacketDefinition,
+    limit_states,
 )
 from tmtc.stream import cut_packets
 
@@ -365,7 +366,7 @@ def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
 def test_limits_tell_warning_from_alarm():
     temperature = DICTIONARY.packet("housekeeping").field("temperature_c")
     values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, math.nan]
-    assert temperature.limit_states(values).tolist() == [
+    assert limit_states(temperature, values).tolist() == [
         ALARM,
         WARNING,
         0,
@@ -375,4 +376,4 @@ def test_limits_tell_warning_from_alarm():
         ALARM,
         WITHIN_LIMITS,
     ]
-    assert DICTIONARY.packet("housekeeping").field("mode").limit_states([3]).tolist() == [WITHIN_LIMITS]
+    assert limit_states(DICTIONARY.packet("housekeeping").field("mode"), [3]).tolist() == [WITHIN_LIMITS]

@@ -11,7 +11,8 @@ import pkgutil
 from dataclasses import dataclass
 
 from tmtc.codes import Labels
-from tmtc.schema import Field, Group, PacketDefinition
+from tmtc.fields import Field
+from tmtc.schema import Group, PacketDefinition
 
 APID_INSTRUMENTS = 0x0AE
 _SERVICE = 129

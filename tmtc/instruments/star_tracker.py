@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from tmtc.fields import Field
 from tmtc.instruments import ATTITUDE, InstrumentTelemetry, Residual, sample_packet
-from tmtc.schema import Field
 
 TELEMETRY = InstrumentTelemetry(
     "star_tracker",

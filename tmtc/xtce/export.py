@@ -16,7 +16,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 
 from tmtc.dictionary import DICTIONARY
-from tmtc.schema import Dictionary, Field, PacketDefinition
+from tmtc.fields import Field
+from tmtc.schema import Dictionary, PacketDefinition
 
 NAMESPACE = "http://www.omg.org/spec/XTCE/20180204"
 SCHEMA_LOCATION = f"{NAMESPACE} https://www.omg.org/spec/XTCE/20180204/SpaceSystem.xsd"

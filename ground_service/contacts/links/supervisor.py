@@ -13,7 +13,7 @@ from ground_service.contacts.links.runner import LEASE_NS, LinkRunner, ended_hol
 from ground_service.contacts.links.service import DeclaredLink
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
-from ground_service.memory import give_back, limit_heaps
+from kernels.memory import give_back, limit_heaps
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from lunar.arrays import IntArray
 from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.schema import Field, PacketDefinition, Table
+from tmtc.fields import Field
+from tmtc.schema import PacketDefinition, Table, limit_states
 from tmtc.stream import cut_packets
 
 WARNING, ALARM = 1, 2
@@ -127,7 +128,7 @@ def _conditions(tables: Mapping[str, Table]) -> Iterator[Condition]:
             continue
         for field in _limited(structure):
             values = table.columns[field.name]
-            states = field.limit_states(values)
+            states = limit_states(field, values)
             broken = np.flatnonzero(states)
             if broken.size:
                 last = broken[np.argmax(table.ticks[broken])]

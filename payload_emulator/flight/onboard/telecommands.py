@@ -20,8 +20,8 @@ from tmtc.arguments import FUNCTION_ARGUMENTS
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TableError
+from tmtc.fields import Field
 from tmtc.onboard_parameters import find_parameter
-from tmtc.schema import Field
 
 Values = Mapping[str, Any]
 _FUNCTIONS = DICTIONARY.labels("perform_function", "function_id")

@@ -45,6 +45,9 @@ ALBEDO_SHIFT = 6
 MEAN_ALBEDO = 0.12
 """Normal albedo of an average lunar surface (the maps of Hapke 2012 span about 0.06 to 0.2)."""
 
+KEPT_TILES = 64
+"""Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only."""
+
 RIM_AZIMUTHS = 48
 FLOOR_AZIMUTHS = 16
 POLE_LIMIT_RAD = math.radians(84.0)
@@ -128,6 +131,7 @@ class Terrain(ABC):
         finest = 180 * pixels_per_degree // TILE_PIXELS
         self._level_rows = tuple(round(finest / 2 ** (level / 2)) for level in range(LEVELS))
         self.cache_tiles = cache_tiles
+        self._room = min(KEPT_TILES, cache_tiles)
         self._pool: Heights | None = None
         self._albedo: Heights | None = None
         self._bounds = np.zeros((cache_tiles, 2))
@@ -212,6 +216,7 @@ class Terrain(ABC):
                 f"terrain {self.name}: expected a window of at most {self.cache_tiles} tiles, found {count}: "
                 "the view is too wide or too near a pole"
             )
+        self._room = max(self._room, count)
         table = np.full(wanted.shape, -1, np.int32)
         places = [(int(row), int(column)) for row, column in np.argwhere(wanted)]
         keys = [(level, top + row, (left + column) % tile_columns) for row, column in places]
@@ -324,18 +329,16 @@ class Terrain(ABC):
         self._pool = np.empty((self.cache_tiles, size, size), np.float32)
         self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
 
-    def reserve(self) -> None:
-        """Take the memory of all tiles now, so that a long session does not grow as it comes to other ground."""
-        if self._pool is None or self._albedo is None:
-            self._open_pool()
-            assert self._pool is not None and self._albedo is not None
-            self._pool.fill(0.0)
-            self._albedo.fill(0.0)
-
     def release_ground(self) -> None:
         """Drop the tiles; they are made again when they are needed."""
         self._pool = self._albedo = None
         self._slots.clear()
+
+    def close(self) -> None:
+        """Drop the ground and the craters: nothing is asked of this terrain any more."""
+        self.release_ground()
+        self.listed = self.catalogue = self.catalogue.select(slice(0))
+        self._rims_m = np.zeros((0, 4))
 
     def release_thread(self) -> None:
         """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
@@ -363,9 +366,7 @@ class Terrain(ABC):
         step = TILE_PIXELS >> ALBEDO_SHIFT
         albedo = self.make_albedo(latitude[APRON::step], longitude[APRON::step])
         assert self._pool is not None and self._albedo is not None
-        slot = (
-            self._slots.popitem(last=False)[1] if len(self._slots) == self.cache_tiles else len(self._slots)
-        )
+        slot = self._slots.popitem(last=False)[1] if len(self._slots) >= self._room else len(self._slots)
         self._pool[slot] = heights
         self._albedo[slot] = albedo
         self._bounds[slot] = heights.min(), heights.max()

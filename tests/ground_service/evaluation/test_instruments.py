@@ -16,8 +16,9 @@ from reports.document import Absent, Table
 from reports.sections.instruments import instruments
 from reports.values import InstrumentReport, PassReport, QuantityStatistics, ResidualStatistics
 from tests.ground_service.evaluation.test_pass_evaluation import inputs
+from tmtc.fields import Field
 from tmtc.instruments import InstrumentTelemetry, Residual, sample_packet
-from tmtc.schema import Dictionary, Field
+from tmtc.schema import Dictionary
 from tmtc.stream import cut_packets
 
 PACKET = sample_packet(

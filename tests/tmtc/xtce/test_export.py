@@ -9,7 +9,8 @@ import space_packet_parser as spp
 from space_packet_parser.xtce.validation import validate_xtce
 
 from tmtc.dictionary import DICTIONARY
-from tmtc.schema import Field, PacketDefinition
+from tmtc.fields import Field
+from tmtc.schema import PacketDefinition
 from tmtc.stream import whole_packets
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.export import format_xtce, parameter_name

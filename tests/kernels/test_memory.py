@@ -7,11 +7,11 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ground_service import memory
+from kernels import memory
 
 RESIDENT = """
 import sys
-from ground_service import memory
+from kernels import memory
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4 // 1024
 blocks = [b"." * 60_000 + bytes([k % 256]) for k in range(4000)]
