@@ -16,7 +16,7 @@ import operator
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,18 +43,7 @@ from tmtc.pus import (
     unpack_tc_header,
     unpack_tm_header,
 )
-
-
-class PacketPlaces(Protocol):
-    """Places (n,) of packets in a buffer; `tmtc.stream.PacketCut` is one."""
-
-    @property
-    def offsets(self) -> IntArray: ...
-    @property
-    def lengths(self) -> IntArray: ...
-    @property
-    def crc_ok(self) -> BoolArray: ...
-
+from tmtc.stream import PacketCut
 
 _STRUCT_CODES = {
     "u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i", "u64": "Q", "i64": "q",
@@ -301,7 +290,7 @@ class Dictionary:
             header.acknowledgements, header.source, values,
         )  # fmt: skip
 
-    def identify(self, buffer: Octets, cut: PacketPlaces) -> IntArray:
+    def identify(self, buffer: Octets, cut: PacketCut) -> IntArray:
         """Index into `telemetry` of every packet of `cut`, negative where there is none.
 
         `NOT_A_TM_PACKET` (-1): bad checksum or not in this dictionary; `WRONG_LENGTH` (-2): in the
@@ -327,7 +316,7 @@ class Dictionary:
         return result
 
     def unpack_many(
-        self, buffer: Octets, cut: PacketPlaces, only: Collection[str] | None = None
+        self, buffer: Octets, cut: PacketCut, only: Collection[str] | None = None
     ) -> dict[str, Table]:
         """A table for every kind of telemetry packet in `cut`; damaged and unknown ones are left out.
 

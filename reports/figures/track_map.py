@@ -136,7 +136,7 @@ def _craters(axes: Axes, craters: CraterMap, middle: float) -> None:
         y = craters.latitude_deg[index][:, None] + radius * np.sin(angle)
         disks = Path.make_compound_path_from_polys(np.stack([x, y], axis=-1))
         inside = (color(role), 0.25) if role == "blue" else "none"
-        axes.add_patch(PathPatch(disks, facecolor=inside, edgecolor=color(role), linewidth=0.9))
+        axes.add_artist(PathPatch(disks, facecolor=inside, edgecolor=color(role), linewidth=0.9))
 
 
 def _found(craters: CraterMap) -> BoolArray:

@@ -86,13 +86,13 @@ def squared_normalised_errors(error: ArrayLike, sigma: ArrayLike) -> FloatArray:
 
 def bounds(degrees: ArrayLike, probability: float = PROBABILITY) -> tuple[FloatArray, FloatArray]:
     """Return the two-sided bounds of one chi-square value; NaN for zero degrees of freedom."""
-    # Imported here because the import takes a second, and most commands that import this module do not need it.
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv  # imported here: most commands that import this module do not need it
 
     freedom = np.asarray(degrees, dtype=np.float64)
     freedom = np.where(freedom > 0.0, freedom, np.nan)
     tail = 0.5 * (1.0 - probability)
-    return np.asarray(chi2.ppf(tail, freedom)), np.asarray(chi2.ppf(1.0 - tail, freedom))
+    shape = 0.5 * freedom
+    return np.asarray(2.0 * gammaincinv(shape, tail)), np.asarray(2.0 * gammaincinv(shape, 1.0 - tail))
 
 
 def bounds_per_degree(degrees: float, samples: float, probability: float) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
-CHUNK_LIMIT_OCTETS = 96 << 20
+CHUNK_LIMIT_OCTETS = 48 << 20
 """Decoded pixels that a terrain keeps of all its files: those under some consecutive frames."""
 
 RADIUS_TOLERANCE = 0.01

@@ -136,16 +136,15 @@ class Terrain(ABC):
         self._albedo: Heights | None = None
         self._bounds = np.zeros((cache_tiles, 2))
         self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
-        flat = np.zeros(len(catalogue))
-        self._rims_m = np.column_stack([catalogue.rim_height_m, catalogue.depth_m, flat, flat])
-        self._measured = np.zeros(len(catalogue), dtype=bool)
+        self._row = np.full(len(catalogue), -1, dtype=np.int32)
+        self._rims_m = np.zeros((0, 4))
         self._owner: int | None = None
 
     def register(self, registration: Registration) -> None:
         """Move the listed craters to where the heights show them; before any of them is measured."""
         from payload_emulator.sim.terrain.registration import registered
 
-        assert not self._measured.any()
+        assert not len(self._rims_m)
         self.catalogue = registered(self.listed, registration)
         self.registration = registration
 
@@ -277,23 +276,26 @@ class Terrain(ABC):
 
         The floor is the mean within 0.4 radius.  Craters whose surroundings this terrain cannot give keep NaN.
         """
-        self._measure(indices[~self._measured[indices]])
-        chosen = self.catalogue.select(indices)
-        return replace(chosen, rim_height_m=self._rims_m[indices, 0], depth_m=self._rims_m[indices, 1])
+        self._measure(indices[self._row[indices] < 0])
+        rims_m = self.measurements_m(indices)
+        return replace(self.catalogue.select(indices), rim_height_m=rims_m[:, 0], depth_m=rims_m[:, 1])
 
     def measurements_m(self, indices: IntArray) -> FloatArray:
         """Rim height, depth, and tilts to the north and to the east, (n, 4); as listed where not measured."""
-        return self._rims_m[indices]
+        listed, row, flat = self.catalogue, self._row[indices], np.zeros(len(indices))
+        found = np.column_stack([listed.rim_height_m[indices], listed.depth_m[indices], flat, flat])
+        found[row >= 0] = self._rims_m[row[row >= 0]]
+        return found
 
     def take_measurements(self, indices: IntArray, values_m: FloatArray) -> None:
         """Take the measurements that an equal terrain made of these craters."""
-        self._rims_m[indices] = values_m
-        self._measured[indices] = True
+        self._row[indices] = len(self._rims_m) + np.arange(len(indices))
+        self._rims_m = np.concatenate([self._rims_m, values_m])
 
     def rim_tilts_m(self, indices: IntArray) -> FloatArray:
         """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""
-        self._measure(indices[~self._measured[indices]])
-        return self._rims_m[indices, 2:]
+        self._measure(indices[self._row[indices] < 0])
+        return self.measurements_m(indices)[:, 2:]
 
     def _measure(self, indices: IntArray) -> None:
         if indices.size == 0:
@@ -321,13 +323,7 @@ class Terrain(ABC):
             ]
             # Rings stand for equal-width annuli of the inner 0.4 radius: weights are their areas.
             floor = (1.0 * rings[0] + 2.2 * rings[1] + 3.4 * rings[2]) / 6.6
-            self._rims_m[part] = np.column_stack([rim, rim - floor, tilt])
-            self._measured[part] = True
-
-    def _open_pool(self) -> None:
-        size, small = TILE_PIXELS + 3, (1 << ALBEDO_SHIFT) + 1
-        self._pool = np.empty((self.cache_tiles, size, size), np.float32)
-        self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
+            self.take_measurements(part, np.column_stack([rim, rim - floor, tilt]))
 
     def release_ground(self) -> None:
         """Drop the tiles; they are made again when they are needed."""
@@ -338,7 +334,6 @@ class Terrain(ABC):
         """Drop the ground and the craters: nothing is asked of this terrain any more."""
         self.release_ground()
         self.listed = self.catalogue = self.catalogue.select(slice(0))
-        self._rims_m = np.zeros((0, 4))
 
     def release_thread(self) -> None:
         """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
@@ -359,13 +354,14 @@ class Terrain(ABC):
         if slot is not None:
             self._slots.move_to_end(key)
             return slot
-        if self._pool is None:
-            self._open_pool()
+        if self._pool is None or self._albedo is None:
+            size, small = TILE_PIXELS + 3, (1 << ALBEDO_SHIFT) + 1
+            self._pool = np.empty((self.cache_tiles, size, size), np.float32)
+            self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
         latitude, longitude = tile_angles(key[1], key[2], self._level_rows[key[0]] * TILE_PIXELS / 180.0)
         heights = self.make_heights(latitude, longitude)
         step = TILE_PIXELS >> ALBEDO_SHIFT
         albedo = self.make_albedo(latitude[APRON::step], longitude[APRON::step])
-        assert self._pool is not None and self._albedo is not None
         slot = self._slots.popitem(last=False)[1] if len(self._slots) >= self._room else len(self._slots)
         self._pool[slot] = heights
         self._albedo[slot] = albedo

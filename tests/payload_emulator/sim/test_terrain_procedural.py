@@ -27,12 +27,16 @@ def test_neighbouring_tiles_repeat_each_others_edges(procedural, level, row, col
     np.testing.assert_allclose(west[512:515, :], south[0:3, :], atol=1e-2, rtol=0.0)
 
 
-def test_heights_do_not_depend_on_what_was_asked_before():
+def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_are_kept(monkeypatch):
     latitude, longitude = np.radians(np.linspace(8.0, 12.0, 7)), np.radians(np.linspace(358.0, 362.0, 7))
-    first, second = ProceduralTerrain(5, cache_tiles=8), ProceduralTerrain(5, cache_tiles=8)
+    first = ProceduralTerrain(5, cache_tiles=8)
+    monkeypatch.setattr("payload_emulator.sim.terrain.tiles.KEPT_TILES", 1)
+    second = ProceduralTerrain(5, cache_tiles=8)
     forward = [first.height_m(a, b) for a, b in zip(latitude, longitude, strict=True)]
     backward = [second.height_m(a, b) for a, b in zip(latitude[::-1], longitude[::-1], strict=True)]
     np.testing.assert_array_equal(forward, backward[::-1])
+    np.testing.assert_array_equal(first.height_m(latitude, longitude), second.height_m(latitude, longitude))
+    assert len(second._slots) <= 4 < len(first._slots)
 
 
 def test_there_is_no_step_at_the_prime_meridian(procedural):
