@@ -86,7 +86,7 @@ def squared_normalised_errors(error: ArrayLike, sigma: ArrayLike) -> FloatArray:
 
 def bounds(degrees: ArrayLike, probability: float = PROBABILITY) -> tuple[FloatArray, FloatArray]:
     """Return the two-sided bounds of one chi-square value; NaN for zero degrees of freedom."""
-    from scipy.special import gammaincinv  # imported here: most commands that import this module do not need it
+    from scipy.special import gammaincinv  # imported here: few commands need it
 
     freedom = np.asarray(degrees, dtype=np.float64)
     freedom = np.where(freedom > 0.0, freedom, np.nan)
