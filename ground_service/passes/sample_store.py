@@ -106,7 +106,7 @@ def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, 
     table = repository.SAMPLES["detections"]
     query = (
         select(table.c.ticks, table.c.frame_number, func.length(table.c["items"]))
-        .where(telemetry.within(table, span.where))
+        .where(repository.within(table, span.where))
         .order_by(table.c.ticks, table.c.frame_number)
     )
     rows = telemetry.whole_numbers(connection, query)
@@ -152,7 +152,9 @@ def event_page(
     content, whatever the order in which they came.
     """
     table = repository.SAMPLES["events"]
-    query = select(*(table.c[column] for column in _EVENT_COLUMNS)).where(telemetry.within(table, span.where))
+    query = select(*(table.c[column] for column in _EVENT_COLUMNS)).where(
+        repository.within(table, span.where)
+    )
     if severities:
         codes = [code for code, one in _SEVERITIES.items() if one in severities]
         query = query.where(table.c.severity.in_(codes))

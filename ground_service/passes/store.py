@@ -10,7 +10,6 @@ from sqlalchemy import Connection, ScalarSelect, bindparam, func, insert, select
 from ground_service.http.model import PageOf
 from ground_service.passes.model import PassDetail, PassFilter, PassRecord, PassSummary
 from ground_service.store import repository
-from ground_service.store.telemetry import within
 
 _PASSES = repository.PASSES
 _FRAMES = repository.PASS_FRAMES
@@ -212,7 +211,7 @@ def received_frames(
     tables = [repository.SAMPLES[kind] for kind in ("detections", "navigation_states", "frame_outcomes")]
     queries = [
         select(func.count(func.distinct(table.c.ticks))).where(
-            within(table, (vehicle, start_ticks, stop_ticks, version))
+            repository.within(table, (vehicle, start_ticks, stop_ticks, version))
         )
         for table in tables
     ]

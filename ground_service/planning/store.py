@@ -24,9 +24,8 @@ from ground_service.planning.model import (
 )
 from ground_service.planning.window_states import COMMITTED, PlannedSpan
 from ground_service.store import repository
-from ground_service.store.repository import page
+from ground_service.store.repository import page, within
 from ground_service.store.states import change_if
-from ground_service.store.telemetry import within
 
 WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
 

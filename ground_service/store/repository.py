@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
-from sqlalchemy import ColumnElement, Connection, Table, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Table, and_, func, insert, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.errors import NotFound
@@ -177,3 +177,13 @@ def _where(table: Table, equal: dict[str, Any]) -> Select[Any]:
     for name, value in equal.items():
         query = query.where(table.c[name] == value)
     return query
+
+
+def within(table: Table, where: tuple[int, int, int, int]) -> ColumnElement[bool]:
+    """Return the condition that samples of a table are in a span (`telemetry.Where`)."""
+    vehicle, start_ticks, stop_ticks, dictionary_version = where
+    return and_(
+        table.c.vehicle_id == vehicle,
+        table.c.dictionary_version == dictionary_version,
+        table.c.ticks.between(start_ticks, stop_ticks),
+    )

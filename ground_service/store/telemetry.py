@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Table, and_, func, select
+from sqlalchemy import Connection, func, select
 from sqlalchemy.sql import Select
 
-from ground_service.store.repository import PACKETS, SAMPLES
+from ground_service.store.repository import PACKETS, SAMPLES, within
 from lunar.arrays import IntArray
 
 
@@ -115,14 +115,4 @@ def _samples(kind: str, where: Where, columns: Sequence[str], equal: dict[str, i
         select(*(table.c[name] for name in columns))
         .where(within(table, where), *(table.c[name] == value for name, value in equal.items()))
         .order_by(table.c.ticks, table.c.packet_id)
-    )
-
-
-def within(table: Table, where: Where) -> ColumnElement[bool]:
-    """Return the condition that samples of a table are in a span."""
-    vehicle, start_ticks, stop_ticks, dictionary_version = where
-    return and_(
-        table.c.vehicle_id == vehicle,
-        table.c.dictionary_version == dictionary_version,
-        table.c.ticks.between(start_ticks, stop_ticks),
     )
