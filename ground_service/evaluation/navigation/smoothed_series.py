@@ -21,7 +21,7 @@ from reports.values import NavigationSeries
 
 SMOOTHED = "smoothed"
 SMOOTHER_DEGREE = 100
-MAP_SIGMA_RTN_M, MAP_CORRELATION_RAD = (10.0, 15.0, 15.0), float(np.radians(30.0))
+MAP_SIGMA_RTN_M, MAP_CORRELATION_RAD = (10.0, 40.0, 40.0), float(np.radians(30.0))
 """Remainder of the registration of the catalogue, as in the filter (`CommonErrors`)."""
 
 

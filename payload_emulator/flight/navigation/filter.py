@@ -52,8 +52,8 @@ class CommonErrors:
         cannot show it and it is nearly the same as a shift of the position: a larger value lets position and bias
         wander together.
     catalogue_offset_m, catalogue_correlation_rad
-        What the registration of the catalogue leaves, east, north, up: a Gauss-Markov process over the ground, and the
-        angle at the Moon's centre over which it is similar (1/e).
+        What registration and raster leave, east, north, up: a Gauss-Markov process over the ground, and the angle at
+        the Moon's centre over which it is similar (1/e). Chosen on tuning ground, with a distorted map and without.
     scale, scale_sigma
         Stretch of all detections about the image centre as calibrated, and how well it is known; it does not change.
         A single pass cannot tell it from an error of altitude: the periods of several orbits can.
@@ -64,7 +64,7 @@ class CommonErrors:
     attitude_correlation_s: float = 14_400.0
     pixel_bias_px: float = 0.1
     pixel_correlation_s: float = 14_400.0
-    catalogue_offset_m: tuple[float, float, float] = (15.0, 15.0, 10.0)
+    catalogue_offset_m: tuple[float, float, float] = (40.0, 40.0, 10.0)
     catalogue_correlation_rad: float = float(np.radians(30.0))
     scale: float = 0.0
     scale_sigma: float = 5e-4

@@ -223,16 +223,8 @@ def test_detections_that_are_no_numbers_are_left_out() -> None:
 
 
 def test_a_detection_on_a_catalogued_crater_of_its_size_is_not_free() -> None:
-    nothing = np.zeros((1, 2, 3))
-    seen = Sighting(
-        np.arange(1),
-        np.array([[100.0, 100.0]]),
-        np.array([30.0]),
-        nothing,
-        nothing,
-        nothing,
-        nothing[:, :, 0],
-    )
+    nothing, uv, size_px = np.zeros((1, 2, 3)), np.array([[100.0, 100.0]]), np.array([30.0])
+    seen = Sighting(np.arange(1), uv, size_px, nothing, nothing, nothing, nothing[:, :, 0])
     u = np.array([105.0, 105.0, 300.0, 400.0])
     found = Detections(u, np.full(4, 100.0), np.array([28.0, 60.0, 30.0, 30.0]), np.ones(4), np.ones(4))
     assert unclaimed(found, seen, np.array([3])).tolist() == [False, True, True, False]
