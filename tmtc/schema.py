@@ -406,8 +406,8 @@ class _Compiled:
         group = definition.group
         codes = "".join(f"{f.size}{_STRUCT_CODES[f.type]}" for f in definition.fields)
         self.struct = struct.Struct(">" + codes)
-        self.base_dtype = _record_dtype(definition.fields)
-        self.item_dtype = _record_dtype(group.fields) if group else None
+        self.base_dtype = np.dtype(_dtype_fields(definition.fields))
+        self.item_dtype = np.dtype(_dtype_fields(group.fields)) if group else None
         self.settable = {f.name for f in definition.fields} | ({group.name} if group else set())
         if definition.packet_type == TYPE_TELEMETRY:
             self.tm_dtype = np.dtype([("header", _TM_HEADER_DTYPE), *_dtype_fields(definition.fields)])
@@ -566,10 +566,6 @@ class _Compiled:
 
 def _dtype_fields(fields: tuple[Field, ...]) -> list[Any]:
     return [(f.name, f.dtype) if f.size == 1 else (f.name, f.dtype, (f.size,)) for f in fields]
-
-
-def _record_dtype(fields: tuple[Field, ...]) -> np.dtype[Any]:
-    return np.dtype(_dtype_fields(fields))
 
 
 def _columns(
