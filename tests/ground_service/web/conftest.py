@@ -74,6 +74,10 @@ def wait_until(reached: Callable[[], bool], otherwise: str) -> None:
         time.sleep(0.02)
 
 
+def shows(page: Page, place: str, text: str) -> None:
+    expect(page.locator(place)).to_contain_text(text)
+
+
 def end_socket(one: socket.socket) -> None:
     """Close a socket, and wake a thread that waits on it."""
     with suppress(OSError):

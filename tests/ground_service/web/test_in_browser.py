@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 
 from ground_service.regression.archives import pack_archive
 from tests.ground_service.regression.test_regressions import with_detections
-from tests.ground_service.web.conftest import wait_until
+from tests.ground_service.web.conftest import shows, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -168,7 +168,7 @@ def test_passes_are_searched_and_show_their_verdict(page):
     )
     page.get_by_label("Search").fill("no such pass")
     press(page, "Search")
-    expect(page.locator("#passes")).to_contain_text("No pass matches.")
+    shows(page, "#passes", "No pass matches.")
     expect(page).to_have_url(re.compile("search=no"))
 
 
@@ -176,13 +176,13 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     settled(page, "/passes")
     page.get_by_role("link", name="synthetic pass").click()
     expect(page.get_by_role("heading", name="synthetic pass")).to_be_visible()
-    expect(page.locator("#completeness")).to_contain_text("0 lost")
+    shows(page, "#completeness", "0 lost")
     expect(page.locator("#mission").get_by_role("link")).to_contain_text("synthetic, revision")
     expect(page.get_by_label("chart: altitude, m")).to_be_visible()
-    expect(page.locator("#map-legend")).to_contain_text("spherical")
+    shows(page, "#map-legend", "spherical")
     press(page, "Make a report")
     expect(page.locator("#verdict .verdict")).not_to_be_empty()
-    expect(page.locator("#verdict")).to_contain_text("Median position error")
+    shows(page, "#verdict", "Median position error")
     with page.expect_popup() as opened:
         page.get_by_role("link", name="Open report").click()
     report = opened.value
@@ -202,15 +202,15 @@ def test_an_alarm_is_acknowledged_on_its_page_and_keeps_its_history(page):
     expect(row.locator(".state.raised")).to_have_css("border-top-color", colour_of(page, "--vermillion"))
     row.get_by_role("checkbox").check()
     receive(page, [camera_fault(0)], spacecraft_id=78)
-    expect(page.locator("#alarms")).to_contain_text("78, flight")  # drawn again
+    shows(page, "#alarms", "78, flight")  # drawn again
     expect(row.get_by_role("checkbox")).to_be_checked()
     press(page, "Acknowledge the chosen")
     expect(row).to_have_count(0)
     page.get_by_label("State").select_option("cleared")
     expect(page).to_have_url(re.compile("state=cleared"))
     row.get_by_role("button", name="Detail").click()
-    expect(page.locator("#detail")).to_contain_text("3 packets from")
-    expect(page.locator("#history")).to_contain_text("acknowledged")
+    shows(page, "#detail", "3 packets from")
+    shows(page, "#history", "acknowledged")
 
 
 def test_newest_values_follow_the_telemetry(page):
@@ -252,7 +252,7 @@ def test_a_mission_description_is_shown_and_changed_on_its_page(page):
     row = page.locator("#items tbody tr").first
     expect(row).to_contain_text("shown")
     expect(row).to_contain_text(entered.json()["revision"][:12])
-    expect(page.locator("#range")).to_contain_text("1 to 2 of 2")
+    shows(page, "#range", "1 to 2 of 2")
     row.get_by_role("link", name="shown").click()
     expect(page.get_by_role("heading", level=1)).to_have_text("shown")
     sections = page.locator("#sections")
@@ -260,22 +260,22 @@ def test_a_mission_description_is_shown_and_changed_on_its_page(page):
     expect(sections.locator("tr", has_text="recall")).to_contain_text("not stated")
     sections.locator("summary", has_text="approval").click()
     expect(sections.locator("tr", has_text="second person for")).to_contain_text("perform_function/set_mode")
-    expect(page.locator("#unknown")).to_contain_text("camera.width_px")
+    shows(page, "#unknown", "camera.width_px")
     editor = page.get_by_label("mission.toml")
     text = editor.input_value()
     enter = page.get_by_role("button", name="Enter as a revision")
     expect(enter).to_be_disabled()
     editor.fill(text.replace("median_error_m", "medain_error_m"))
-    expect(page.locator("#faults")).to_contain_text("expected 'median_error_m', found unknown key")
+    shows(page, "#faults", "expected 'median_error_m', found unknown key")
     editor.fill(text.replace("median_error_m = 100.0", "median_error_m = 80.0"))
-    expect(page.locator("#faults")).to_contain_text("+median_error_m = 80.0")
+    shows(page, "#faults", "+median_error_m = 80.0")
     enter.click()
-    expect(page.locator("#confirm-text")).to_contain_text("-median_error_m = 100.0")
+    shows(page, "#confirm-text", "-median_error_m = 100.0")
     page.get_by_role("button", name="Enter", exact=True).click()
     expect(sections.locator("tr", has_text="median error, m")).to_contain_text("80")
     page.goto("/missions/new")
     editor.fill('name = "')
-    expect(page.locator("#faults")).to_contain_text("mission.toml: expected TOML")
+    shows(page, "#faults", "mission.toml: expected TOML")
 
 
 def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_run(page):
@@ -286,7 +286,7 @@ def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_
     part.get_by_label("Longitude, °").fill("")
     part.get_by_label("Latitude, °").fill("-10.5")
     part.get_by_role("button", name="Write into the text").click()
-    expect(page.locator("#faults")).to_contain_text("latitude_deg and longitude_deg together")
+    shows(page, "#faults", "latitude_deg and longitude_deg together")
     assert editor.input_value().endswith("[link.stations.here] # the mast\nlatitude_deg = -10.5\n")
     press(page, "Change station here")
     part.get_by_label("Longitude, °").fill("61")
@@ -298,7 +298,7 @@ def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_
     part.get_by_label("Station").select_option("New here")
     part.get_by_label("Uplink").fill("127.0.0.1:9")
     part.get_by_role("button", name="Write into the text").click()
-    expect(page.locator("#faults")).to_contain_text('+[link.stations."New here"]')
+    shows(page, "#faults", '+[link.stations."New here"]')
     assert editor.input_value().endswith(
         '[link.stations."New here"]\nlatitude_deg = -10.5\nlongitude_deg = 61\n\n[[links]]\nname = "mast"\n'
         'kind = "tcp"\nstation = "New here"\nuplink = "127.0.0.1:9"\n'
@@ -309,7 +309,7 @@ def test_links_and_stations_are_forms_over_the_text_and_the_planner_makes_a_dry_
     expect(flight.locator("tbody tr")).to_contain_text("2029-08-07 06:")
     press(page, "Remove link mast")
     assert "[[links]]" not in editor.input_value()
-    expect(page.locator("#links")).to_contain_text("None stated.")
+    shows(page, "#links", "None stated.")
     press(page, "Dry run")
     expect(flight).to_contain_text("1 window, and what contradicts the flight")
     expect(flight).to_contain_text("found no link with an uplink")
@@ -334,7 +334,7 @@ def test_a_list_has_the_columns_and_filters_of_its_operation(page):
 
 def test_a_mission_description_that_is_not_entered_is_told(page):
     page.goto("/missions/" + "0" * 16)
-    expect(page.locator("#notices .bad")).to_contain_text("mission revision")
+    shows(page, "#notices .bad", "mission revision")
 
 
 def test_a_chart_is_zoomed_with_the_keyboard(page):
@@ -404,7 +404,7 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     page.locator("#file").set_input_files(day_of_orbits)
     page.locator("#kind").select_option("ephemerides")
     press(page, "Upload")
-    expect(page.locator("#notices")).to_contain_text("361 states")
+    shows(page, "#notices", "361 states")
 
     settled(page, "/planner")
     page.locator("#ephemeris").select_option(label="orbits.oem, 2030-01-01 00:00:00")
@@ -419,30 +419,30 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     expect(page.locator("#windows tbody td").nth(1)).not_to_have_text(start)
 
     press(page, "Approve")
-    expect(page.locator("#selected")).to_contain_text("approved")
+    shows(page, "#selected", "approved")
     press(page, "Uplink")
     question = page.get_by_role("dialog", name=re.compile("^Release the telecommands of"))
     expect(question).to_contain_text("on reception")
     expect(question).to_contain_text("function start observation, duration")
     question.get_by_role("button", name="Release").click()
-    expect(page.locator("#notices")).to_contain_text("telecommands released")
+    shows(page, "#notices", "telecommands released")
     expect(page.get_by_role("button", name="Send now")).to_be_visible()
     expect(page.get_by_role("button", name="Uplink")).to_be_hidden()
 
     page.locator("#altitude-max").fill("10")
     press(page, "Search")
-    expect(page.locator("#candidates")).to_contain_text("excluded by altitude at most 10 km")
+    shows(page, "#candidates", "excluded by altitude at most 10 km")
     page.get_by_text("Enter a window").click()
     page.locator("#enter-name").fill("by hand")
     page.locator("#enter-start").fill("2030-01-01T05:00:00Z")
     page.locator("#enter-stop").fill("2030-01-01T05:10:00Z")
     page.get_by_role("button", name="Enter", exact=True).click()
-    expect(page.locator("#selected")).to_contain_text("2030-01-01 05:10:00")
+    shows(page, "#selected", "2030-01-01 05:10:00")
     press(page, "Telecommands")
     sequence = page.get_by_role("table", name="Telecommands of the window").locator("tbody tr")
     expect(sequence.last).to_contain_text("2030-01-01 05:10:00")
     _draft(page, "of another user", "04")
-    expect(page.locator("#windows")).to_contain_text("of another user")
+    shows(page, "#windows", "of another user")
     expect(sequence.last).to_contain_text("2030-01-01 05:10:00")
     settled(page, "/commands")
     expect(page.locator("#commands tbody tr", has_text="insert activity").first).to_contain_text("released")
@@ -473,8 +473,8 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
     expect(page.locator("#state")).to_have_text("connected")
     for message in live_frames:
         console.say(message)
-    expect(page.locator("#numbers")).to_contain_text("fixed, error 84 m")
-    expect(page.locator("#log")).to_contain_text("medium: image dark: mean grey level 1")
+    shows(page, "#numbers", "fixed, error 84 m")
+    shows(page, "#log", "medium: image dark: mean grey level 1")
     expect(page.get_by_label("chart: distance from the reference, m")).to_be_visible()
     grey = page.evaluate(
         "Array.from(document.getElementById('frame').getContext('2d').getImageData(300, 300, 1, 1).data).slice(0, 3)"

@@ -15,7 +15,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue
 from tests.ground_service.conftest import write_manifest
-from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
+from tests.ground_service.web.conftest import COUNT_REQUESTS, patient, shows
 from tests.ground_service.web.test_in_browser import answered
 from tests.ground_service.web.test_sign_in import sign_in
 
@@ -107,7 +107,7 @@ def test_an_operator_reviews_landmarks_with_the_keyboard(review):
         expect(one.get_by_role("button", name=f"Sightings of landmark {number}", exact=True)).to_have_count(0)
     page.get_by_label("State").select_option("rejected")
     expect(page.locator("#landmarks tbody tr")).to_have_count(1)
-    expect(page.locator("#landmarks tbody tr")).to_contain_text("no rim")
+    shows(page, "#landmarks tbody tr", "no rim")
 
 
 def test_a_viewer_sees_landmarks_and_does_not_decide(review):
@@ -118,7 +118,7 @@ def test_a_viewer_sees_landmarks_and_does_not_decide(review):
         expect(page.get_by_role("button", name=name)).to_be_hidden()
     expect(page.get_by_label("Reason")).to_be_hidden()
     page.get_by_role("button", name="Next").click()
-    expect(page.locator("#range")).to_contain_text("26 to ")
+    shows(page, "#range", "26 to ")
     answered(page)
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

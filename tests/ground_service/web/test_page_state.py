@@ -17,7 +17,14 @@ from ground_service.planning.service import add_window
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc
-from tests.ground_service.web.conftest import COUNT_REQUESTS, Pictures, patient, strict_page, wait_until
+from tests.ground_service.web.conftest import (
+    COUNT_REQUESTS,
+    Pictures,
+    patient,
+    shows,
+    strict_page,
+    wait_until,
+)
 from tests.ground_service.web.test_in_browser import answered, camera_fault, receive, settled
 from tmtc.downlink import encode_cadus
 
@@ -86,7 +93,7 @@ def test_codes_are_steps_with_their_names_and_hashes_are_listed(page):
 def test_a_csv_file_has_every_sample(page):
     settled(page, "/telemetry")
     link = page.get_by_role("link", name="CSV of all samples")
-    expect(page.locator("#charts")).to_contain_text("40 samples")
+    shows(page, "#charts", "40 samples")
     with page.expect_download() as started:
         link.click()
     with open(started.value.path(), newline="") as file:
@@ -104,7 +111,7 @@ def test_events_of_all_passes_are_filtered_in_the_address(page):
     expect(page.locator("#events tbody tr").first).to_contain_text("high")
     page.get_by_label("Event contains").fill("nothing of the kind")
     page.get_by_role("button", name="Show").click()
-    expect(page.locator("#events")).to_contain_text("No event matches.")
+    shows(page, "#events", "No event matches.")
 
 
 NOTE_ZOOMS = """
@@ -117,8 +124,8 @@ new MutationObserver(() => { window.zooms += document.querySelectorAll(".leaflet
 def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
     page.add_init_script(NOTE_ZOOMS)
     settled(page, "/passes/1")
-    expect(page.locator("#terrain")).to_contain_text("Terrain:")
-    expect(page.locator("#terrain")).to_contain_text("craters of the catalogue of the pass")
+    shows(page, "#terrain", "Terrain:")
+    shows(page, "#terrain", "craters of the catalogue of the pass")
     expect(page.locator("#map-legend li")).to_have_count(2)
     expect(page.locator("#map")).to_have_class(
         re.compile("bare")
@@ -243,7 +250,7 @@ def test_no_button_that_a_viewer_sees_is_refused(signed_in):
     expect(page.get_by_role("link", name="Audit")).to_be_hidden()
     expect(page.get_by_role("link", name="Users")).to_be_hidden()
     page.goto("/users")
-    expect(page.locator("main")).to_contain_text("Only administrators manage users.")
+    shows(page, "main", "Only administrators manage users.")
     expect(page.get_by_role("button", name="Add user")).to_be_hidden()
     page.goto("/commands")
     expect(page.get_by_role("heading", name="Enter")).to_be_hidden()
@@ -261,9 +268,9 @@ def test_the_planner_opens_in_the_time_of_the_ephemeris_and_searches_for_its_spa
     with serve(home, console.port) as running:
         page = browser.new_page(base_url=running.url, viewport={"width": 390, "height": 844})
         page.goto("/planner")
-        expect(page.locator("#timeline")).to_contain_text("01-01")
+        shows(page, "#timeline", "01-01")
         expect(page.locator("#from")).to_have_attribute("placeholder", "2030-01-01T00:00:00Z")
-        expect(page.locator("#daylight")).to_contain_text("Sun above the horizon")
+        shows(page, "#daylight", "Sun above the horizon")
         page.locator("#latitude-min").fill("-90")
         page.locator("#latitude-max").fill("90")
         page.get_by_role("button", name="Search").click()
@@ -287,7 +294,7 @@ def test_a_live_view_takes_matches_from_the_payload(page, console, live_frames):
     near = {"u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0, "score": 0.9}  # on a crater, not identified
     message["detections"] = [near, {**near, "u_px": 300.0, "crater_id": 7}]
     console.say(message)
-    expect(page.locator("#numbers")).to_contain_text("2, 1 matched")
+    shows(page, "#numbers", "2, 1 matched")
     expect(page.locator("#terrain")).to_have_text("Terrain: procedural (seed 5).")
     expect(page.locator("#frame")).to_have_attribute("data-shown", re.compile("[1-9]"))
     ring = "([u, v]) => Array.from(document.getElementById('frame').getContext('2d').getImageData(u, v, 1, 1).data)"
@@ -340,12 +347,12 @@ def test_the_planner_shows_sun_and_resources_of_the_plan(planner):
     assert battery == f"battery: {least:.3g} to {most:.3g} %, at least 30"
     slider = page.get_by_label("Time", exact=True)
     slider.press("Home")
-    expect(page.locator("#values")).to_contain_text("2030-01-01 00:30:00: Sun elevation")
+    shows(page, "#values", "2030-01-01 00:30:00: Sun elevation")
     slider.press("ArrowRight")
-    expect(page.locator("#values")).to_contain_text("2030-01-01 00:30:07")
+    shows(page, "#values", "2030-01-01 00:30:07")
     expect(page.locator("#bands li")).to_have_count(5)
     expect(page.locator("#map canvas")).to_be_visible()
-    expect(page.locator("#map-text")).to_contain_text("No crater density: ")
+    shows(page, "#map-text", "No crater density: ")
 
 
 def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(planner):
@@ -409,7 +416,7 @@ def test_conflicts_and_refused_changes_are_explained_on_the_planner(planner):
         page.locator('#timeline [data-window="1"]').press("ArrowRight")
         answered(page)
     expect(page.locator('#timeline [data-window="1"]')).to_have_class(re.compile("conflict"))
-    expect(page.locator("#selected .conflicts")).to_contain_text("window 2 (second, draft) covers part")
+    shows(page, "#selected .conflicts", "window 2 (second, draft) covers part")
     path = "/api/v1/windows/2"
     assert page.request.patch(path, data={"state": "approved"}).ok
     page.locator('#timeline [data-window="1"]').press("ArrowRight")

@@ -28,7 +28,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, end_socket, strict_page, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, end_socket, shows, strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
@@ -266,22 +266,22 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     go(page, "Planner", "Missions")
     page.get_by_role("link", name="selenita").click()
     page.locator("#sections summary", has_text="approval").click()
-    expect(page.locator("#sections")).to_contain_text("manual")
+    shows(page, "#sections", "manual")
 
     # A standing request becomes windows in mission time and in daylight.
     go(page, "Planner")
-    expect(page.locator("#daylight")).to_contain_text("Sun above the horizon")
+    shows(page, "#daylight", "Sun above the horizon")
     page.get_by_text("Add a standing request").click()
     page.locator("#request-name").fill("low Sun")
     page.locator("#request-windows").fill("3")
     page.locator("#request-period_days").fill("2")
     page.locator("#request-horizon_days").fill("1")
     page.locator("#add-request").get_by_role("button", name="Add").click()
-    expect(page.locator("#requests tbody tr")).to_contain_text("3 draft")
+    shows(page, "#requests tbody tr", "3 draft")
     page.locator("#requests").get_by_role("button", name="Plan", exact=True).click()
-    expect(page.locator("#request-plan")).to_contain_text("the number of windows of its period is planned")
+    shows(page, "#request-plan", "the number of windows of its period is planned")
     page.locator("#timeline .window.draft").first.click()
-    expect(page.locator("#selected")).to_contain_text("Sun elevation")
+    shows(page, "#selected", "Sun elevation")
     expect(page.locator("#timeline .curve")).to_have_count(3)
     expect(page.locator("#timeline .contact.predicted").first).to_be_attached()
     assert page.evaluate(COVERED_LABELS) == []
@@ -330,7 +330,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
             page.locator("#selected").get_by_role("button", name="Approve").click()
             page.locator("#selected").get_by_role("button", name="Uplink").click()
             page.get_by_role("button", name="Release and send").click()
-            expect(page.locator("#notices")).to_contain_text("sends what is released")
+            shows(page, "#notices", "sends what is released")
         assert int(page.evaluate("sessionStorage.n")) - before == 5
     go(page, "Shift", "Commands")
     # The planner uplinks approved windows that begin soon: the page has the name that the service recorded.
@@ -357,7 +357,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     # Series of a pass: two parameters in one chart, limits, and modes with their names.
     page.goto("/telemetry?pass=1&chart=1:temperature_c,bus_voltage_v&chart=1:mode")
     expect(page.locator("#charts canvas")).to_have_count(2)
-    expect(page.locator("#charts")).to_contain_text("CSV of all samples")
+    shows(page, "#charts", "CSV of all samples")
 
     # An alarm.
     spacecraft.report("event_high", event_id=20, frame_number=7)
@@ -377,7 +377,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
 
     # The report of a pass.
     craft.get_by_role("link", name="Monthly reports").click()
-    expect(page.locator("#monthly")).to_contain_text("There is no monthly report.")
+    shows(page, "#monthly", "There is no monthly report.")
     page.get_by_role("link", name="synthetic pass").click()
     page.get_by_role("button", name="Make a report").click()
     expect(page.locator("#verdict .verdict")).not_to_be_empty()
