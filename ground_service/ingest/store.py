@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
-from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, select
+from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, or_, select
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
@@ -407,9 +407,14 @@ def results_state(connection: Connection, vehicle: int, start_ticks: int, stop_t
 
 
 def _may_have_packets(vehicle: int, start_ticks: int, stop_ticks: int) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions of ingests that are done and may have packets of a vehicle in a time."""
+    """Return the conditions of ingests that are done and may have packets of a vehicle in a time.
+
+    Without a time of its packets, an ingest that has a packet, or octets that could be of one, may have them.
+    """
+    timeless = ("packets", "packets_joined", "crc_errors", "frames_bad", "octets_skipped", "octets_pending")
     return (
-        _INGESTS.c.last_ticks.is_(None)
+        or_(*(_INGESTS.c.accounting[name].as_integer() > 0 for name in timeless))
+        & _INGESTS.c.last_ticks.is_(None)
         | (_INGESTS.c.last_ticks >= start_ticks) & (_INGESTS.c.first_ticks <= stop_ticks),
         (_INGESTS.c.vehicle_id == vehicle)
         | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
