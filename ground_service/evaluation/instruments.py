@@ -26,12 +26,8 @@ def instrument_reports(tables: Mapping[str, Table]) -> tuple[InstrumentReport, .
     return tuple(
         _report(one, tables[one.name])
         for one in instrument_telemetry()
-        if one.name in tables and _samples(tables[one.name])
+        if one.name in tables and tables[one.name].items["sample_status"].size
     )
-
-
-def _samples(table: Table) -> int:
-    return int(table.items["sample_status"].size)
 
 
 def _report(instrument: InstrumentTelemetry, table: Table) -> InstrumentReport:

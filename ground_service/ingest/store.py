@@ -407,10 +407,7 @@ def results_state(connection: Connection, vehicle: int, start_ticks: int, stop_t
 
 
 def _may_have_packets(vehicle: int, start_ticks: int, stop_ticks: int) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions of ingests that are done and may have packets of a vehicle in a time.
-
-    Without a time of its packets, an ingest that has a packet, or octets that could be of one, may have them.
-    """
+    """Return the conditions of ingests that are done and may have packets, or octets of them, in a time."""
     timeless = ("packets", "packets_joined", "crc_errors", "frames_bad", "octets_skipped", "octets_pending")
     return (
         or_(*(_INGESTS.c.accounting[name].as_integer() > 0 for name in timeless))

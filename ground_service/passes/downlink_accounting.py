@@ -193,7 +193,7 @@ def _frames(
     frame_ticks[frame[known]] = ticks[known]
     # Octets between two markers belong to the frame of the first one, octets before the first marker to the first
     # frame.
-    edges = np.concatenate([table.offset, [_stream_octets(found)]])
+    edges = np.concatenate([table.offset, [sum(found.octets.values())]])
     edges[0] = 0
     corrected = np.where(table.corrected > 0, table.corrected, 0).sum(axis=1).astype(np.int64)
     return (
@@ -247,10 +247,6 @@ def _filled(ticks: IntArray) -> IntArray:
 
 def _none(count: int) -> IntArray:
     return np.full(count, NO_TICKS, dtype=np.int64)
-
-
-def _stream_octets(found: DownlinkDecode) -> int:
-    return sum(found.octets.values())
 
 
 def _digests(found: DownlinkDecode) -> NDArray[np.uint64]:

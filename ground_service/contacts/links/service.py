@@ -148,7 +148,7 @@ def list_contacts(
             vehicle: get_vehicle(connection, vehicle).ccsds_id for vehicle in {row.vehicle_id for row in rows}
         }
     rows = [row for row in rows if may_use(spacecraft[row.vehicle_id])]
-    contacts = [_contact(row, spacecraft[row.vehicle_id]) for row in rows]
+    contacts = [LinkContact.of(asdict(row), spacecraft_id=spacecraft[row.vehicle_id]) for row in rows]
     unpredicted = {}
     for name, one in declared.items():
         predicted, reason = predict(ground, one, start_utc_ns, stop_utc_ns)
@@ -540,10 +540,6 @@ def _unsent(connection: Connection, declared: DeclaredLink) -> int:
     if declared.link.uplink is None:
         return 0
     return count_released(connection, declared.spacecraft_id, declared.link.instance, mission_now_ns())
-
-
-def _contact(row: ContactRow, spacecraft_id: int) -> LinkContact:
-    return LinkContact.of(asdict(row), spacecraft_id=spacecraft_id)
 
 
 def _predicted(declared: DeclaredLink, contact: PredictedContact) -> LinkContact:

@@ -74,6 +74,10 @@ def wait_until(reached: Callable[[], bool], otherwise: str) -> None:
         time.sleep(0.02)
 
 
+def press(page: Page, name: str) -> None:
+    page.get_by_role("button", name=name).click()
+
+
 def shows(page: Page, place: str, text: str) -> None:
     expect(page.locator(place)).to_contain_text(text)
 

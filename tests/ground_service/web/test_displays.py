@@ -20,7 +20,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.web.conftest import Pictures, patient, strict_page, wait_until
+from tests.ground_service.web.conftest import Pictures, patient, press, strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -183,7 +183,7 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
 def choose_in_create_menu(page, name):
     """Choose an entry of the menu: the new object becomes part of the one that is shown."""
     page.wait_for_function("() => window.openmct?.router?.path?.length > 0", timeout=WAIT_MS)
-    page.get_by_role("button", name="Create").click()
+    press(page, "Create")
     page.get_by_role("menuitem", name=name, exact=True).click()
 
 

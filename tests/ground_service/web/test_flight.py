@@ -31,7 +31,7 @@ from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import build_world
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, Pictures, strict_page, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 
 NS = 1_000_000_000
@@ -229,7 +229,7 @@ def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Pat
     expect(value).to_contain_text("°C")
     expect(value).not_to_have_class(re.compile("is-limit"))  # the newest value is within the limits
     fault.get_by_role("checkbox").check()
-    page.get_by_role("button", name="Acknowledge").click()
+    press(page, "Acknowledge")
     page.get_by_label("Save", exact=True).click()
     expect(fault).to_have_count(0)
     swatches = page.locator(".plot-series-color-swatch").evaluate_all(

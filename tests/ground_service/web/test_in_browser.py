@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 
 from ground_service.regression.archives import pack_archive
 from tests.ground_service.regression.test_regressions import with_detections
-from tests.ground_service.web.conftest import shows, wait_until
+from tests.ground_service.web.conftest import press, shows, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -67,10 +67,6 @@ def settled(page, path):
         path = path.format(revision=newest_revision(page)[:16])
     page.goto(path)
     expect(page.locator("#feed-light")).to_have_class("light on")
-
-
-def press(page, name):
-    page.get_by_role("button", name=name).click()
 
 
 def answered(page):

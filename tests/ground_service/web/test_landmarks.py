@@ -15,7 +15,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue
 from tests.ground_service.conftest import write_manifest
-from tests.ground_service.web.conftest import COUNT_REQUESTS, patient, shows
+from tests.ground_service.web.conftest import COUNT_REQUESTS, patient, press, shows
 from tests.ground_service.web.test_in_browser import answered
 from tests.ground_service.web.test_sign_in import sign_in
 
@@ -117,7 +117,7 @@ def test_a_viewer_sees_landmarks_and_does_not_decide(review):
     for name in ("Accept", "Reject"):
         expect(page.get_by_role("button", name=name)).to_be_hidden()
     expect(page.get_by_label("Reason")).to_be_hidden()
-    page.get_by_role("button", name="Next").click()
+    press(page, "Next")
     shows(page, "#range", "26 to ")
     answered(page)
     page.set_viewport_size({"width": 390, "height": 844})

@@ -21,6 +21,7 @@ from tests.ground_service.web.conftest import (
     COUNT_REQUESTS,
     Pictures,
     patient,
+    press,
     shows,
     strict_page,
     wait_until,
@@ -56,7 +57,7 @@ def test_zoom_and_charts_are_in_the_address(page):
     expect(chart.locator("canvas")).to_be_visible()
     page.locator("#parameter").select_option("bus_voltage_v")
     page.locator("#chart").select_option("0")
-    page.get_by_role("button", name="Add").click()
+    press(page, "Add")
     expect(page.get_by_label("chart: temperature and bus voltage")).to_be_visible()
     expect(page.locator(".chart")).to_have_count(1)
     scales = page.evaluate("document.querySelector('.chart').plot.series.map((one) => one.scale)")
@@ -110,7 +111,7 @@ def test_events_of_all_passes_are_filtered_in_the_address(page):
     expect(page).to_have_url(re.compile("severity=medium"))
     expect(page.locator("#events tbody tr").first).to_contain_text("high")
     page.get_by_label("Event contains").fill("nothing of the kind")
-    page.get_by_role("button", name="Show").click()
+    press(page, "Show")
     shows(page, "#events", "No event matches.")
 
 
@@ -273,14 +274,14 @@ def test_the_planner_opens_in_the_time_of_the_ephemeris_and_searches_for_its_spa
         shows(page, "#daylight", "Sun above the horizon")
         page.locator("#latitude-min").fill("-90")
         page.locator("#latitude-max").fill("90")
-        page.get_by_role("button", name="Search").click()
+        press(page, "Search")
         rows = page.locator("#candidates tbody tr")
         expect(rows.first).to_be_visible()
         for row in range(rows.count()):
             least = rows.nth(row).locator("td").nth(4).inner_text().split(" to ")[0]
             assert float(least) >= -0.5, least  # degrees, rounded
         Pictures(tmp_path).take(page, "planner-telephone")
-        page.get_by_role("button", name="Closer").click()
+        press(page, "Closer")
         expect(page).to_have_url(re.compile("view=2030-01-01"))
         expect(page).to_have_url(re.compile("latitude-min=-90"))
         page.reload()

@@ -28,7 +28,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, end_socket, shows, strict_page, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page, wait_until
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
@@ -325,11 +325,11 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
         expect(page.locator("#spacecraft")).to_have_value("76 flight")
         before = int(page.evaluate("sessionStorage.n"))
         with during:
-            page.get_by_role("button", name="Search").click()
+            press(page, "Search")
             page.locator("#candidates").get_by_role("button", name="Plan").nth(window).click()
             page.locator("#selected").get_by_role("button", name="Approve").click()
             page.locator("#selected").get_by_role("button", name="Uplink").click()
-            page.get_by_role("button", name="Release and send").click()
+            press(page, "Release and send")
             shows(page, "#notices", "sends what is released")
         assert int(page.evaluate("sessionStorage.n")) - before == 5
     go(page, "Shift", "Commands")
@@ -379,7 +379,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     craft.get_by_role("link", name="Monthly reports").click()
     shows(page, "#monthly", "There is no monthly report.")
     page.get_by_role("link", name="synthetic pass").click()
-    page.get_by_role("button", name="Make a report").click()
+    press(page, "Make a report")
     expect(page.locator("#verdict .verdict")).not_to_be_empty()
     expect(page.locator("#completeness tbody tr").first).to_be_visible()
     expect(page.locator("#verdict tr", has_text="detector recall")).to_contain_text(
@@ -393,7 +393,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     opened.value.close()
     go(page, "Shift", "All passes")
     page.get_by_label("Search").fill("synthetic")
-    page.get_by_role("button", name="Search").click()
+    press(page, "Search")
     row = page.locator("#passes tbody tr", has_text="synthetic pass")
     expect(row.get_by_role("link", name="open")).to_be_visible()
     expect(row.locator(".state").first).not_to_be_empty()
