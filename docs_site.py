@@ -223,6 +223,10 @@ def save_shift(folder: Path, out: Path) -> None:
             time.sleep(2.0)
             if answers_http(f"{url}/readyz"):
                 reports = page.request.get(f"{url}/api/v1/reports?pass_id=1&pass_id=2").json()["items"]
+        if len(reports) < 2:
+            raise SystemExit(
+                f"{folder}: expected reports of two windows, found {len(reports)}; see {folder.with_suffix('.log')}"
+            )
         source = f"linna demo --live, evidence: level {reports[0]['evidence_level']}"
         for name, (address, part) in SHIFT_PAGES.items():
             page.goto(url + address)

@@ -81,7 +81,11 @@ def scope_of(route: APIRoute) -> Scope | None:
         if route.name in names:
             return Scope(decision)
     dependant = route.dependant
-    body = {name for one in dependant.body_params for name in _fields(one.field_info.annotation)}
+    body = {
+        name
+        for one in dependant.body_params
+        for name in getattr(one.field_info.annotation, "model_fields", ())
+    }
     places: tuple[tuple[Literal["path", "query", "body"], Collection[str]], ...] = (
         ("path", [one.name for one in dependant.path_params]),
         ("query", query_keys(dependant).known),
@@ -130,7 +134,3 @@ def _values(request: Request, scope: Scope) -> list[Any]:
         return request.query_params.getlist(scope.parameter)
     body = getattr(request, "_json", None)
     return [body.get(scope.parameter)] if isinstance(body, dict) else []
-
-
-def _fields(annotation: Any) -> Collection[str]:
-    return getattr(annotation, "model_fields", ())

@@ -218,7 +218,7 @@ class Planner:
     ) -> list[tuple[int, int]]:
         """Return the spans in which the constraints hold, cut at the maximum duration with the gap in between."""
         found = find_windows(
-            lambda epochs: self._holds(epochs, constraints),
+            lambda utc_ns: _hold(self._excess(self.conditions(utc_ns), constraints), len(utc_ns)),
             start_utc_ns,
             stop_utc_ns,
             step_s,
@@ -283,10 +283,6 @@ class Planner:
         elevation, _ = sun_elevation_azimuth(latitude, longitude, np.einsum("nij,nj->ni", rotation, sun))
         lit = sunlit_fraction(position, sun, np.asarray(earth_position_icrf_m(tdb_s)))
         return Conditions(place, latitude, longitude, altitude, elevation, lit)
-
-    def _holds(self, utc_ns: IntArray, constraints: Constraints) -> BoolArray:
-        """Whether the constraints hold at epochs (n,)."""
-        return _hold(self._excess(self.conditions(utc_ns), constraints), len(utc_ns))
 
     def _excess(self, at: Conditions, constraints: Constraints, *, everywhere: bool = False) -> list[Excess]:
         """Return by how much each constraint is broken (n,).

@@ -165,7 +165,9 @@ def _violations(grid: ResourceGrid, windows: Sequence[Window], options: dict[int
     # Committed windows come before drafts.
     for window in sorted(windows, key=lambda one: (one.state == "draft", one.start.utc_ns, one.id)):
         option = options.get(window.id)
-        if option is None or any(_overlap(option, one) for one in taken):
+        if option is None or any(
+            option.start_utc_ns < one.stop_utc_ns and one.start_utc_ns < option.stop_utc_ns for one in taken
+        ):
             continue
         reason = violation(grid, [*taken, option])
         if reason is None:
@@ -173,10 +175,6 @@ def _violations(grid: ResourceGrid, windows: Sequence[Window], options: dict[int
         elif window.state == "draft" or window.state in COMMITTED:
             reasons[window.id] = reason
     return reasons
-
-
-def _overlap(one: Option, other: Option) -> bool:
-    return one.start_utc_ns < other.stop_utc_ns and other.start_utc_ns < one.stop_utc_ns
 
 
 def _overlaps(windows: Sequence[Window], violations: dict[int, str]) -> list[WindowConflict]:

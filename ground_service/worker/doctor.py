@@ -23,7 +23,6 @@ from ground_service.worker.condition import broker_answers
 from ground_service.worker.outgoing import permitted_address
 from ground_service.worker.presence import (
     CLOCK_LIMIT_MS,
-    Process,
     disagreements,
     running_processes,
     statement_of,
@@ -77,14 +76,14 @@ def _processes(ground: Ground, settings: Settings) -> Result:
     if len(versions) > 1 or any(one.statement is None for one in processes):
         faults.append(f"expected one version, found {', '.join(sorted(versions)) or 'other ones'}")
     wanted = ["api", *(["worker"] if settings.resolved_broker_url() is not None else [])]
-    faults += [f"expected a running {kind}, found none" for kind in wanted if not _of(processes, kind)]
+    faults += [
+        f"expected a running {kind}, found none"
+        for kind in wanted
+        if all(one.kind != kind for one in processes)
+    ]
     if any(one.statement is not None and one.statement.runner == "no" for one in processes):
         faults.append("expected a runner of payload builds that responds, found none")
     return faults, ", ".join(map(str, processes))
-
-
-def _of(processes: list[Process], kind: str) -> list[Process]:
-    return [one for one in processes if one.kind == kind]
 
 
 def _clocks(ground: Ground, _settings: Settings) -> Result:

@@ -36,7 +36,8 @@ def runner_faults(exchange: Path) -> list[str]:
         "a /tmp in memory with a size limit": _limited_memory("/tmp"),
         "no other writable disk": not _writable_disks(exchange),
         "no network": not _routes(),
-        f"an exchange folder closed to others ({exchange})": _closed(exchange),
+        f"an exchange folder closed to others ({exchange})": exchange.is_dir()
+        and not exchange.stat().st_mode & 0o007,
     }
     return [name for name, holds in faults.items() if not holds]
 
@@ -94,7 +95,3 @@ def _routes() -> list[str]:
     if six.exists():
         found += [line.split()[-1] for line in six.read_text().splitlines()]
     return [name for name in found if name != "lo"]
-
-
-def _closed(exchange: Path) -> bool:
-    return exchange.is_dir() and not exchange.stat().st_mode & 0o007

@@ -29,7 +29,7 @@ EVIDENCE_POWER = 4.0
 LEAST_EVIDENCE = 0.3
 ODDS_POWER = 7.3
 """Evidence of two opposite turns, each plus `LEAST_EVIDENCE`, to this power are as their probabilities (maximum
-likelihood, 2,400 squares of 96 to 256 px of the validation frames)."""
+likelihood, squares of 96 to 256 px of the validation frames)."""
 LEAST_CONFIDENCE = 0.95
 """Of the half turn; below it the direction is undetermined."""
 

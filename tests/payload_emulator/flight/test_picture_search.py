@@ -15,6 +15,7 @@ from payload_emulator.flight.vision.picture_search import (
     SMALL_CRATERS_PX,
     _merge,
     _squares,
+    _walls,
     enlarge,
     find_sun,
     search_picture,
@@ -59,6 +60,12 @@ def test_craters_of_two_opposite_suns_leave_it_undetermined(detector):
     both = np.hstack([bowl_image(sun_azimuth_deg=azimuth) for azimuth in (0.0, 180.0)])
     sun = find_sun(detector, prepare_image(both).gray)
     assert not sun.determined and 0.5 <= sun.confidence < 0.95
+
+
+def test_a_slope_is_no_evidence_of_a_crater():
+    plane = np.mgrid[0:40, 0:40][0].astype(np.float32)
+    _, evidence = _walls(plane, Detections(*np.array([[20.0], [20.0], [16.0], [0.9], [1.0]])))
+    assert evidence.tolist() == [0.0]
 
 
 def test_nothing_to_be_seen_gives_no_sun(detector):
