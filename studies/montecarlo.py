@@ -59,16 +59,13 @@ _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 class CatalogueErrors:
     """Errors of the uploaded catalogue, one sigma, drawn once per run.
 
-    `offset_enu_m` is shared by all craters, with `offset_sigma_m` drawn on top. `regional_sigma_m` is the size of a
-    shift east, north, up that is similar over `regional_rad` (1/e, angle at the Moon's centre).
+    `regional_sigma_m` is the size of a shift east, north, up that is similar over `regional_rad` (1/e, angle at the
+    Moon's centre).
     `wrong_share` is the share of entries where there is no crater at all.
     """
 
     centre_of_diameter: float = 0.03
-    centre_floor_m: float = 0.0
     height_m: float = 100.0
-    offset_enu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    offset_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     regional_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     regional_rad: float = 1.0
     wrong_share: float = 0.0
@@ -150,8 +147,6 @@ class NavigationRun:
     ----------
     error_rtn_m, sigma_rtn_m
         Estimate minus truth, and one sigma, radial, transverse, normal.
-    velocity_error_m_s
-        Length of the velocity error.
     nees
         Of position and velocity: 6 degrees of freedom.
     nis, degrees
@@ -160,6 +155,8 @@ class NavigationRun:
         Mean innovation of each fix, right and down, over its standard deviation; NaN without one.
     matched, wrong
         Craters of the fix, and how many of them were taken for another.
+    own
+        Craters of the fix that the payload mapped itself.
     findable
         Detections in the frame of craters that are in the catalogue.
     attitude_noise_rad
@@ -171,13 +168,13 @@ class NavigationRun:
     outcome: IntArray
     error_rtn_m: FloatArray
     sigma_rtn_m: FloatArray
-    velocity_error_m_s: FloatArray
     nees: FloatArray
     nis: FloatArray
     degrees: IntArray
     innovation: FloatArray
     matched: IntArray
     wrong: IntArray
+    own: IntArray
     findable: IntArray
     altitude_m: FloatArray
     attitude_noise_rad: FloatArray
@@ -210,6 +207,8 @@ class Consistency:
         Position error, 3-D.
     fixed_share, wrong_share
         Frames fixed, of those with at least four findable craters; craters taken for others, of those matched.
+    own_share
+        Craters that the payload mapped itself, of those matched.
     degraded_share
         Frames in which the monitor judges the attitude noisier than declared.
     """
@@ -223,6 +222,7 @@ class Consistency:
     largest_m: float
     fixed_share: float
     wrong_share: float
+    own_share: float = 0.0
     degraded_share: float = 0.0
 
 
@@ -244,10 +244,8 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
     detector, slow = case.detector, np.random.default_rng((seed, 3))
     elapsed_s = np.diff(case.frame_utc_ns) / _NS
     tilts_rad = _wandering(bias_rad, case.attitude_bias_rad, case.attitude_correlation_s, elapsed_s, slow)
-    drawn_px = np.array(detector.bias_px) - given_px
-    shifts_px = given_px + _wandering(
-        drawn_px, detector.bias_sigma_px, detector.bias_correlation_s, elapsed_s, slow
-    )
+    first_px, sigma_px = np.array(detector.bias_px) - given_px, detector.bias_sigma_px
+    shifts_px = given_px + _wandering(first_px, sigma_px, detector.bias_correlation_s, elapsed_s, slow)
     rows = []
     for k in range(ticks.size):
         camera_from_icrf = nadir_camera_from_mcmf(rotations[k] @ states[k, :3]) @ rotations[k]
@@ -262,8 +260,7 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
         observation = Observation(int(ticks[k]), found if shown else None, measured)
         state, report = anchored.step(state, observation, setup)
         rows.append(_row(state, report, states[k], truth if shown else truth[:0]))
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return NavigationRun(case.frame_utc_ns, case.imaging, *columns)
+    return NavigationRun(case.frame_utc_ns, case.imaging, *map(np.array, zip(*rows, strict=True)))
 
 
 def fly_many(case: NavigationCase, seeds: Sequence[int], workers: int | None = None) -> list[NavigationRun]:
@@ -295,6 +292,7 @@ def consistency(runs: Iterable[NavigationRun], settle_frames: int = 20) -> Consi
         largest_m=float(np.max(length)),
         fixed_share=float(np.mean(fixed[findable >= 4.0])),
         wrong_share=float(np.sum(joined("wrong")) / max(np.sum(matched), 1.0)),
+        own_share=float(np.sum(joined("own")) / max(np.sum(matched), 1.0)),
         degraded_share=float(np.mean(joined("attitude_noise_rad") > 0.0)),
     )
 
@@ -352,16 +350,11 @@ def catalogue_table(craters: CraterCatalogue) -> CatalogueTable:
 
 
 def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> NavigationCase:
-    """The case with the errors that last for a run drawn into its given ones."""
-    detector, errors = case.detector, case.catalogue_errors
-    bias = np.array(detector.bias_px) + detector.bias_sigma_px * rng.standard_normal(2)
-    offset = np.array(errors.offset_enu_m) + np.array(errors.offset_sigma_m) * rng.standard_normal(3)
-    scale = detector.scale + detector.scale_sigma * float(rng.standard_normal())
-    return replace(
-        case,
-        detector=replace(detector, bias_px=(float(bias[0]), float(bias[1])), scale=scale),
-        catalogue_errors=replace(errors, offset_enu_m=(float(offset[0]), float(offset[1]), float(offset[2]))),
-    )
+    """The case with the errors of the detector that last for a run drawn into its given ones."""
+    detector, drawn = case.detector, rng.standard_normal(3)
+    right, down = np.array(detector.bias_px) + detector.bias_sigma_px * drawn[:2]
+    scale = detector.scale + detector.scale_sigma * float(drawn[2])
+    return replace(case, detector=replace(detector, bias_px=(float(right), float(down)), scale=scale))
 
 
 def _wandering(
@@ -400,9 +393,9 @@ def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> Navigati
 
 
 def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.Generator) -> CatalogueTable:
-    centre_m = np.maximum(errors.centre_of_diameter * table.diameter_m, errors.centre_floor_m)
+    centre_m = errors.centre_of_diameter * table.diameter_m
     sigma_m = np.stack([centre_m, centre_m, np.full(len(table), errors.height_m)], axis=1)
-    shift_m = sigma_m * rng.standard_normal(sigma_m.shape) + np.array(errors.offset_enu_m)
+    shift_m = sigma_m * rng.standard_normal(sigma_m.shape)
     if any(errors.regional_sigma_m):
         field = regional_field(table.latitude_rad, table.longitude_rad, errors.regional_rad, rng)
         shift_m = shift_m + np.array(errors.regional_sigma_m) * field
@@ -553,30 +546,29 @@ def _row(
     error = mean[:6] - true_state
     rtn = rtn_from_inertial(true_state[:3], true_state[3:])
     sigma = np.sqrt(np.diag(rtn @ covariance[:3, :3] @ rtn.T))
-    nees = float(error @ np.linalg.solve(covariance[:6, :6], error))
-    matched = wrong = 0
+    matched = wrong = own = 0
     innovation = np.full(2, np.nan)
     fix = report.fix
     if fix is not None:
         matched = int(fix.index.size)
         # Landmarks of the navigator's own map have identities that no true crater has.
         used = state.landmarks.ids[fix.index]
-        other = truth[fix.identification.detection] != used
-        wrong = int(np.count_nonzero(other & (used < FIRST_LANDMARK_ID)))
+        mapped = used >= FIRST_LANDMARK_ID
+        own = int(np.count_nonzero(mapped))
+        wrong = int(np.count_nonzero((truth[fix.identification.detection] != used) & ~mapped))
         innovation = fix.update.mean_innovation
-    findable = int(np.count_nonzero(truth >= 0))
     return (
         int(report.outcome),
         rtn @ error[:3],
         sigma,
-        float(np.linalg.norm(error[3:])),
-        nees,
+        float(error @ np.linalg.solve(covariance[:6, :6], error)),
         report.nis,
         2 * matched,
         innovation,
         matched,
         wrong,
-        findable,
+        own,
+        int(np.count_nonzero(np.isin(truth, state.landmarks.ids))),
         float(np.linalg.norm(true_state[:3])) - MOON_RADIUS_M,
         report.attitude_noise_rad,
     )

@@ -89,7 +89,9 @@ def crater_world() -> CraterCatalogue:
     return make_catalogue(np.arcsin(z), longitude, diameter, source="simulated", rim_height_m=height)
 
 
-def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0) -> NavigationCase:
+def standard_case(
+    data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0, catalogued: float = 1.0
+) -> NavigationCase:
     """Return the case of a track: start errors of 5 km and 5 m/s, a frame every 15 s.
 
     Each revolution has two imaging arcs of 37 minutes.
@@ -105,6 +107,9 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
     ----------
     noise_factor
         Factor on all process noise of the filter; 1 is the shipped value.
+    catalogued
+        Share of the craters that the uploaded catalogue holds. The payload maps the others, and uses them one
+        revolution (1.85 hours) later, when most of the ground in view is the same.
     """
     if data.gravity is not None and data.gravity_alternative is not None:
         gravity, other = load_gravity(data.gravity), load_gravity(data.gravity_alternative)
@@ -123,6 +128,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
     frames = round(hours * 240.0)
     # Two arcs of 37 minutes in each period of 111, with gaps of 18 over the poles.
     elapsed_s = np.arange(frames) * 15.0
+    craters = crater_world()
     return NavigationCase(
         epoch_utc_ns=epoch_utc_ns,
         position_icrf_m=position,
@@ -134,7 +140,8 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         orientation=IauOrientation(),
         filter_gravity=other.truncated(_FILTER_DEGREE),
         filter_orientation=IauOrientation(),
-        craters=crater_world(),
+        craters=craters,
+        on_board=np.random.default_rng(12).uniform(size=len(craters)) < catalogued,
         any_node=True,
         node_longitudes_deg=orbit.node_longitudes_deg,
         detector=SimulatedDetector(

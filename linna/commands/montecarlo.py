@@ -22,6 +22,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "test",
     )
     option(parser, "--noise-factor F", ABOVE_ZERO, "factor on the filter's process noise", 1.0)
+    catalogued = "share of the craters in the catalogue; the payload maps the others"
+    option(parser, "--catalogued S", number(above=0, most=1), catalogued, 1.0)
     option(
         parser,
         "--attitude-noise-deg A",
@@ -41,20 +43,17 @@ def run(arguments: argparse.Namespace) -> int:
     from studies.montecarlo import consistency, fly_many, verdict
     from studies.montecarlo_world import standard_case
 
-    case = standard_case(data_folder(), arguments.track, arguments.hours, arguments.noise_factor)
-    noise_deg = arguments.attitude_noise_deg
-    if noise_deg is not None:
-        case = replace(case, attitude_noise_rad=radians(noise_deg))
+    stated = ("track", "hours", "noise_factor", "catalogued", "attitude_noise_deg", "runs")
+    given = {name: getattr(arguments, name) for name in stated}
+    case = standard_case(data_folder(), *(given[name] for name in stated[:4]))
+    if given["attitude_noise_deg"] is not None:
+        case = replace(case, attitude_noise_rad=radians(given["attitude_noise_deg"]))
     seeds = list(range(arguments.seed, arguments.seed + arguments.runs))
     result = consistency(fly_many(case, seeds, arguments.workers), settle_frames=60)
     judged = verdict(result, arguments.runs)
     figures = {
-        "runs": arguments.runs,
+        **given,
         "seeds": [seeds[0], seeds[-1]],
-        "hours": arguments.hours,
-        "track": arguments.track,
-        "noise_factor": arguments.noise_factor,
-        "attitude_noise_deg": noise_deg,
         "gravity": {"truth": case.gravity.name, "filter": case.filter_gravity.name},
         "detections": "simulated",
         **asdict(result),
@@ -75,7 +74,7 @@ def describe(figures: dict[str, Any]) -> str:
             f"{figures['largest_m']:.0f} m",
             f"ANEES(6) {figures['anees']:.2f}, 95 % bounds {low:.2f} to {high:.2f}; NIS per degree "
             f"{figures['nis_per_degree']:.3f}; lag-one correlation {figures['innovation_correlation']:.3f}",
-            f"inside 1.96 sigma, radial, transverse, normal: {inside}",
+            f"inside 1.96 sigma, radial, transverse, normal: {inside}; {figures['own_share']:.0%} of the craters own",
             f"attitude judged noisier than declared in {figures['degraded_share']:.1%} of the frames",
             "consistent" if figures["consistent"] else f"not consistent: {'; '.join(figures['reasons'])}",
         ]

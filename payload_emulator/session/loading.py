@@ -63,10 +63,8 @@ _ORIENTATION_MARGIN_NS = 4 * _ORIENTATION_STEP_NS
 _CUT_DEGREE = 8
 # Craters shallower than this share of their diameter can hardly be seen by anyone; a quarter of a real list is so.
 _VISIBLE_DEPTH_RATIO = 0.025
-# Error of a catalogue's centres, 1 sigma per axis: 107 m (median) for fresh craters of 5 to 15 km on GLD100, growing
-# with size; of rim heights taken from a raster of 128 pixels per degree.
-_CENTRE_SIGMA_FLOOR_M = 90.0
-_CENTRE_SIGMA_OF_DIAMETER = 0.03
+# Error of rim heights taken from a raster of 128 pixels per degree, 1 sigma. That of a real list's centres is part of
+# what the detector states for its own: it was calibrated against the list.
 _HEIGHT_SIGMA_M = 50.0
 # Where the network places the centres of real craters: this far below the mean height of the listed rim circle, after
 # its correction of the parallax of the walls. Weighted mean of 16 +- 2 and 23 +- 3 m (1 sigma) on two sets of windows
@@ -294,11 +292,9 @@ def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> Catalog
     height_m = navigation.catalogue_height_error_m * rng.standard_normal(len(chosen))
     # Craters of the procedural Moon lie where their list says, but for the errors that the scenario adds.
     made = catalogue.source.startswith("synthetic")
-    listed_m = np.zeros_like(horizontal_m)
     if not made:
         height_m -= SEEN_BELOW_RIM_M
-        listed_m = np.maximum(_CENTRE_SIGMA_FLOOR_M, _CENTRE_SIGMA_OF_DIAMETER * chosen.diameter_m)
-    centre_sigma_m = np.maximum(np.hypot(listed_m, horizontal_m), _SMALLEST_SIGMA_M)
+    centre_sigma_m = np.maximum(horizontal_m, _SMALLEST_SIGMA_M)
     height_sigma_m = np.hypot(
         _SMALLEST_SIGMA_M if made else _HEIGHT_SIGMA_M, navigation.catalogue_height_error_m
     )
