@@ -16,6 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from lunar.arrays import IntArray
+from lunar.catalogue import NAVIGATION_CLASS, CraterCatalogue
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from payload_emulator.errors import ScenarioError
@@ -39,6 +41,14 @@ TRACK_FRAMES = (5, 2)
 """A crater is counted on its track with so many frames that have it in the image, and as found with so many that
 detect it."""
 
+RECALL_GROUPS = {
+    "5_30_km": "5 to 30 km",
+    "5_30_km_depth_06_10": "of these with depth/diameter .06 to .10",
+    "5_30_km_depth_above_10": "above .10",
+    "3_5_km": "3 to 5 km",
+}
+"""Groups of craters whose recall is counted."""
+
 
 class SurveyWindow(BaseModel):
     """One window; errors of the position in metres, and the share of frames within 2 sigma along each axis."""
@@ -59,15 +69,12 @@ class SurveyWindow(BaseModel):
 
 
 class SurveySession(BaseModel):
-    """The session of one seed; `registered_share` is that of the frames where the crater list is registered."""
+    """The session of one seed; `registered_share` is of the frames where the list is registered, `recall` by group."""
 
     windows: tuple[SurveyWindow, ...]
     detections: int
     findable: int
-    craters: int
-    found: int
-    tracks: int
-    tracked: int
+    recall: dict[str, tuple[int, int, int, int]]
     pairs: int
     wrong_pairs: int
     wrong_fixes: int
@@ -135,13 +142,12 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
     navigation = world.scenario.navigation
     if distortion_m := navigation.catalogue_distortion_m:
         level += f", map distorted by {distortion_m:g} m over {navigation.catalogue_distortion_deg:g}°"
-    counts = ("detections", "findable", "craters", "found")
-    tracks = judged.tracks[judged.tracks[:, 0] >= TRACK_FRAMES[0], 1]
+    detections, findable = judged.seen.sum(axis=0)
     return SurveySession(
         windows=_windows(world, judged),
-        **dict(zip(counts, judged.seen.sum(axis=0).tolist(), strict=True)),
-        tracks=tracks.size,
-        tracked=(tracks >= TRACK_FRAMES[1]).sum(),
+        detections=detections,
+        findable=findable,
+        recall=recall_counts(catalogue, judged.tracks),
         pairs=judged.pairs.sum(),
         wrong_pairs=judged.pairs[:, 1].sum(),
         wrong_fixes=judged.wrong_fixes,
@@ -149,6 +155,24 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
         level=level,
         data=world.data_names,
     )
+
+
+def recall_counts(catalogue: CraterCatalogue, tracks: IntArray) -> dict[str, tuple[int, int, int, int]]:
+    """Return by group of craters: frames that have one in the image and that detect it, tracks, tracks that find it.
+
+    `tracks` (n, 2) is that of `JudgedSession`. A crater of unknown depth is in no group by depth/diameter.
+    """
+    depth_ratio, paper = catalogue.depth_m / catalogue.diameter_m, np.isin(catalogue.size_class, (0, 1, 2))
+    groups = (
+        paper,
+        paper & (depth_ratio >= 0.06) & (depth_ratio < 0.10),
+        paper & (depth_ratio >= 0.10),
+        catalogue.size_class == NAVIGATION_CLASS,
+    )
+    lasting = tracks[:, 0] >= TRACK_FRAMES[0]
+    counted = np.stack([*tracks.T, lasting, lasting & (tracks[:, 1] >= TRACK_FRAMES[1])], axis=1)
+    sums = (tuple(counted[chosen].sum(axis=0).tolist()) for chosen in groups)
+    return dict(zip(RECALL_GROUPS, sums, strict=True))
 
 
 def _windows(world: World, judged: JudgedSession) -> tuple[SurveyWindow, ...]:
@@ -209,8 +233,13 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
     sums = {
         name: sum(getattr(session, name) for session in sessions)
         for name in SurveySession.model_fields
-        if name not in ("windows", "registered_share", "level", "data")
+        if name not in ("windows", "recall", "registered_share", "level", "data")
     }
+    recall: dict[str, float | None] = {}
+    for group in RECALL_GROUPS:
+        craters, found, tracks, tracked = np.sum([session.recall[group] for session in sessions], axis=0)
+        recall[f"recall_{group}"] = float(found / craters) if craters else None
+        recall[f"track_recall_{group}"] = float(tracked / tracks) if tracks else None
     return {
         "windows": [window.model_dump(exclude={"position_m"}) for window in windows],
         "frames": int(frames.sum()),
@@ -227,8 +256,7 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
         "nis": float(np.average(nis, axis=0, weights=[fixed for _, fixed in nis])[0]) if nis else None,
         "fixed_share": sum(window.fixed for window in windows) / max(int(frames.sum()), 1),
         "catalogued_share": sums["findable"] / max(sums["detections"], 1),
-        "recall_5_30_km": sums["found"] / max(sums["craters"], 1),
-        "track_recall_5_30_km": sums["tracked"] / max(sums["tracks"], 1),
+        **recall,
         "wrong_pairs_share": sums["wrong_pairs"] / max(sums["pairs"], 1),
         "wrong_fixes": sums["wrong_fixes"],
         "registered_share": min(session.registered_share for session in sessions),
@@ -253,6 +281,12 @@ def format_survey(figures: dict[str, Any]) -> str:
     stated = f"registered in {100 * registered:.0f} % of the frames" if registered else "not registered"
     nis = "unknown" if figures["nis"] is None else f"{figures['nis']:.2f}"
     coast = figures["coast_end_p95_m"]
+    shares = [
+        "unknown" if (share := figures[f"{kind}_{group}"]) is None else f"{100 * share:.0f} %"
+        for group in RECALL_GROUPS
+        for kind in ("recall", "track_recall")
+    ]
+    recall = zip(RECALL_GROUPS.values(), shares[::2], shares[1::2], strict=True)
     return "\n".join(
         [
             *lines,
@@ -263,9 +297,9 @@ def format_survey(figures: dict[str, Any]) -> str:
             f"NIS {nis}",
             f"fixed {100 * figures['fixed_share']:.1f} %; wrong pairs {100 * figures['wrong_pairs_share']:.2f} %, "
             f"wrong fixes {figures['wrong_fixes']}; crater list {stated}",
-            f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters, and "
-            f"{100 * figures['recall_5_30_km']:.0f} % of the catalogued craters of 5 to 30 km in view are detected "
-            f"(on their tracks {100 * figures['track_recall_5_30_km']:.0f} %)",
+            f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters; of these craters in "
+            "view are detected (on their tracks): "
+            + ", ".join(f"{text} {share} ({lasting})" for text, share, lasting in recall),
             f"level {figures['level']}",
         ]
     )

@@ -93,10 +93,9 @@ class JudgedSession:
     pairs
         Right and wrong pairs of the fix, shape (n, 2).
     seen
-        Detections, those that are catalogued craters, catalogued craters of 5 to 30 km in the image, and those that
-        are detected, shape (n, 4).
+        Detections, and those that are catalogued craters, shape (n, 2).
     tracks
-        Frames with each of these craters in the image, and frames that detect it, shape (craters of the list, 2).
+        Frames with each crater of the list in the image, and frames that detect it, shape (craters of the list, 2).
     arcs
         First and last frame of each stretch of images.
     """
@@ -314,10 +313,9 @@ def _judged_pairs(
     Landmarks that the payload mapped itself are in no catalogue and are not judged.
     """
     frames = world.frame_utc_ns.size
-    judged, counts = np.zeros((frames, 2), dtype=np.int64), np.zeros((frames, 4), dtype=np.int64)
+    judged, counts = np.zeros((2, frames, 2), dtype=np.int64)
     tracks = np.zeros((len(catalogue), 2), dtype=np.int64)
     corner = np.array([world.camera.width_px, world.camera.height_px]) - 1.0
-    sized = (catalogue.diameter_m >= 5e3) & (catalogue.diameter_m <= 30e3)
     seen = tables["detections"]
     places = np.stack([seen.items["u_px"], seen.items["v_px"], seen.items["diameter_px"]], axis=1)
     position = world.truth.positions_mcmf(world.frame_utc_ns)
@@ -340,10 +338,9 @@ def _judged_pairs(
             alike = np.abs(np.log(mine[:, None, 2] / diameter[None])) < _LOG_DIAMETER_GATE
         limit = np.maximum(_RIGHT_PX, _RIGHT_OF_DIAMETER * mine[:, 2])
         same = alike & (away < limit[:, None])
-        wanted = sized[near] & np.all((uv >= 0.0) & (uv <= corner), axis=1)
-        met = np.stack([wanted, wanted & same.any(axis=0)], axis=1)
-        counts[number] = len(mine), same.any(axis=1).sum(), *met.sum(axis=0)
-        tracks[near] += met
+        wanted = np.all((uv >= 0.0) & (uv <= corner), axis=1)
+        counts[number] = len(mine), same.any(axis=1).sum()
+        tracks[near] += np.stack([wanted, wanted & same.any(axis=0)], axis=1)
         if used is None or number not in used_row:
             continue
         pairs = _rows_of(used.item_owner, used_row[number])

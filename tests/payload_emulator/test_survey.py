@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from linna.cli import run
+from lunar.catalogue import make_catalogue
 from payload_emulator.errors import ScenarioError
 from studies import survey
-from studies.survey import SurveySession, SurveyWindow, format_survey, summary
+from studies.survey import SurveySession, SurveyWindow, format_survey, recall_counts, summary
 
 SCENARIO = """
 name = "plain"
@@ -56,10 +57,12 @@ def session(*windows: SurveyWindow) -> SurveySession:
         windows=windows,
         detections=200,
         findable=50,
-        craters=40,
-        found=30,
-        tracks=10,
-        tracked=8,
+        recall={
+            "5_30_km": (40, 30, 10, 8),
+            "5_30_km_depth_06_10": (20, 8, 4, 1),
+            "5_30_km_depth_above_10": (10, 9, 2, 2),
+            "3_5_km": (8, 1, 0, 0),
+        },
         pairs=20,
         wrong_pairs=1,
         wrong_fixes=0,
@@ -89,10 +92,30 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
     assert figures["coast_end_p95_m"] == 100.0
     assert figures["fixed_share"] == 18 / 20
     assert (figures["catalogued_share"], figures["recall_5_30_km"]) == (0.25, 0.75)
-    assert figures["track_recall_5_30_km"] == 0.8
+    assert (figures["track_recall_5_30_km"], figures["recall_5_30_km_depth_06_10"]) == (0.8, 0.4)
+    assert (figures["recall_3_5_km"], figures["track_recall_3_5_km"]) == (0.125, None)
     assert figures["wrong_pairs_share"] == 0.05
     assert "position_m" not in figures["windows"][0]
-    assert "registered in 50 % of the frames" in format_survey(figures)
+    text = format_survey(figures)
+    assert "registered in 50 % of the frames" in text
+    assert ": 5 to 30 km 75 % (80 %), of these with depth/diameter .06 to .10 40 % (25 %)," in text
+    assert text.splitlines()[-2].endswith("above .10 90 % (100 %), 3 to 5 km 12 % (unknown)")
+
+
+def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups() -> None:
+    diameter_m = np.array([2.9e3, 3e3, 4.999e3, 5e3, 30e3, 30.1e3, 10e3, 10e3, 10e3, 10e3])
+    depth_ratio = np.array([0.08, 0.08, 0.2, 0.0599, 0.06, 0.08, 0.0999, 0.10, 0.2, np.nan])
+    catalogue = make_catalogue(
+        np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m
+    )
+    in_image = np.array([7, 6, 4, 5, 5, 9, 4, 8, 5, 10])
+    detected = np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])
+    assert recall_counts(catalogue, np.stack([in_image, detected], axis=1)) == {
+        "5_30_km": (37, 15, 5, 3),
+        "5_30_km_depth_06_10": (9, 5, 1, 0),
+        "5_30_km_depth_above_10": (13, 8, 2, 2),
+        "3_5_km": (10, 5, 1, 0),
+    }
 
 
 def test_a_list_that_is_not_registered_is_stated_and_what_is_unknown_has_no_figure() -> None:

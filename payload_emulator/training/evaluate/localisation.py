@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.scoring import Tally
+from payload_emulator.training.evaluate.scoring import Tally, resampled_sums
 
 FEWEST_PAIRS = 20
 """A mean error of fewer craters says nothing to a quarter of a pixel: one of them may be two pixels off."""
-_ROUNDS = 400
 
 
 def right(tallied: Tally, threshold: float) -> BoolArray:
@@ -67,23 +66,16 @@ def _bias(tallied: Tally, chosen: BoolArray, sun_azimuth_rad: FloatArray) -> dic
     """Mean errors of chosen detections along the axes of the image and of the Sun, each with a 95 % interval."""
     names = ("du_px", "dv_px", "toward_sun_px", "across_sun_px")
     count = int(chosen.sum())
-    nan = float("nan")
     if not count:
-        empty: dict[str, Any] = dict.fromkeys(names, nan)
-        return {
-            "pairs": 0,
-            **empty,
-            "length_px": nan,
-            "noise_px": nan,
-            "standard_error_px": nan,
-            "median_length_px": nan,
-            "interval_95": {name: [nan, nan] for name in names},
-        }
+        lengths, nan = ("length_px", "noise_px", "standard_error_px", "median_length_px"), float("nan")
+        empty: dict[str, Any] = dict.fromkeys((*names, *lengths), nan)
+        return {"pairs": 0, **empty, "interval_95": {name: [nan, nan] for name in names}}
     frame = tallied.detection_frame[chosen].astype(int)
     sine, cosine = np.sin(sun_azimuth_rad[frame]), np.cos(sun_azimuth_rad[frame])
     u, v = tallied.error_u[chosen], tallied.error_v[chosen]
     errors = np.stack([u, v, u * sine - v * cosine, u * cosine + v * sine], axis=1)
-    drawn = _resampled_means(errors, frame)
+    sums = resampled_sums(np.column_stack([errors, np.ones(count)]), frame)
+    drawn = sums[:, :-1] / sums[:, -1:]
     low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
     mean = errors.mean(axis=0)
     return {
@@ -95,13 +87,3 @@ def _bias(tallied: Tally, chosen: BoolArray, sun_azimuth_rad: FloatArray) -> dic
         "median_length_px": float(np.hypot(np.median(u), np.median(v))),
         "interval_95": {name: [float(a), float(b)] for name, a, b in zip(names, low, high, strict=True)},
     }
-
-
-def _resampled_means(errors: FloatArray, frame: IntArray) -> FloatArray:
-    """Means (rounds, k) of errors (n, k) over resampled frames."""
-    _, place = np.unique(frame, return_inverse=True)
-    count = np.bincount(place).astype(float)
-    sums = np.stack([np.bincount(place, weights=column) for column in errors.T], axis=1)
-    drawn = np.random.default_rng(0).integers(0, count.size, (_ROUNDS, count.size))
-    means: FloatArray = sums[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None]
-    return means

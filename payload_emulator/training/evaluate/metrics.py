@@ -223,13 +223,12 @@ def _calibration(tallied: Tally, threshold: float, chosen: BoolArray | None = No
     sigma = tallied.sigma_px[hit]
     scaled = np.concatenate([tallied.error_u[hit] / sigma, tallied.error_v[hit] / sigma])
     if scaled.size == 0:
-        names = ("mean_sigma_px", "rms", "median_ratio", "inside_one_sigma", "inside_three_sigma")
+        names = ("mean_sigma_px", "rms", "inside_one_sigma", "inside_three_sigma")
         return {"pairs": 0} | dict.fromkeys(names, float("nan"))
     return {
         "pairs": int(hit.sum()),
         "mean_sigma_px": float(sigma.mean()),
         "rms": float(np.sqrt(np.mean(scaled**2))),
-        "median_ratio": float(np.median(np.abs(scaled)) / 0.6745),
         "inside_one_sigma": float(np.mean(np.abs(scaled) < 1.0)),
         "inside_three_sigma": float(np.mean(np.abs(scaled) < 3.0)),
     }

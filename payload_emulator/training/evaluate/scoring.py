@@ -380,48 +380,34 @@ def average_precision(tallied: Tally) -> float:
     return float(np.sum(np.diff(recall) * precision))
 
 
-def bootstrap_f1(tallied: Tally, threshold: float) -> tuple[float, float]:
-    """95 % interval of F1 over resampled blocks of ground."""
-    blocks = np.unique(np.concatenate([tallied.crater_block, tallied.detection_block]))
-    f1 = _resampled_f1(tallied, threshold, blocks)
-    return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
-
-
 def with_interval(tallied: Tally, threshold: float) -> dict[str, Any]:
-    """Return the figures at a threshold with the interval of F1."""
-    return {**tallied.figures(threshold).to_dict(), "f1_interval_95": list(bootstrap_f1(tallied, threshold))}
-
-
-def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray) -> FloatArray:
-    """F1 (_ROUNDS,) of blocks drawn with replacement; NaN without any."""
-    if blocks.size == 0:
-        return np.full(_ROUNDS, np.nan)
+    """Return the figures at a threshold with the 95 % interval of F1 over resampled blocks of ground."""
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
-        wrong = (tallied.score >= threshold) & (tallied.outcome == 0)
-    counts = np.array(
-        [
-            (
-                np.count_nonzero(found & (tallied.crater_block == block)),
-                np.count_nonzero(tallied.crater_block == block),
-                np.count_nonzero(wrong & (tallied.detection_block == block)),
-            )
-            for block in blocks
-        ],
-        dtype=np.float64,
-    )
-    rng = np.random.default_rng(0)
-    drawn = counts[rng.integers(0, len(blocks), (_ROUNDS, len(blocks)))].sum(axis=1)
-    return np.asarray(2.0 * drawn[:, 0] / np.maximum(drawn[:, 0] + drawn[:, 2] + drawn[:, 1], 1.0))
+    wrong = (tallied.score >= threshold) & (tallied.outcome == 0)
+    # F1 is twice the craters found over all craters and claims.
+    parts = np.concatenate([np.stack([found, 1.0 + found], axis=1), np.stack([0.0 * wrong, wrong], axis=1)])
+    blocks = np.concatenate([tallied.crater_block, tallied.detection_block])
+    return {**tallied.figures(threshold).to_dict(), "f1_interval_95": list(_interval(2.0, parts, blocks))}
 
 
 def bootstrap_recall(found: BoolArray, block: IntArray) -> tuple[float, float]:
     """95 % interval of the share of craters found (n,), over resampled blocks of ground (n,)."""
-    if found.size == 0:
+    return _interval(1.0, np.stack([found, np.ones(found.size)], axis=1), block)
+
+
+def _interval(factor: float, parts: FloatArray, block: IntArray) -> tuple[float, float]:
+    """95 % interval of `factor` times the sum of the first of the columns (n, 2) over that of the second."""
+    if block.size == 0:
         return float("nan"), float("nan")
-    _, place = np.unique(block, return_inverse=True)
-    total = np.bincount(place).astype(float)
-    hits = np.bincount(place, weights=found)
-    drawn = np.random.default_rng(0).integers(0, total.size, (_ROUNDS, total.size))
-    recall = hits[drawn].sum(axis=1) / total[drawn].sum(axis=1)
-    return float(np.percentile(recall, 2.5)), float(np.percentile(recall, 97.5))
+    above, below = resampled_sums(parts, block).T
+    low, high = np.percentile(factor * above / np.maximum(below, 1.0), (2.5, 97.5))
+    return float(low), float(high)
+
+
+def resampled_sums(values: FloatArray, group: IntArray) -> FloatArray:
+    """Sums (rounds, k) of values (n, k) over groups that are drawn with replacement from those of the rows (n,)."""
+    _, place = np.unique(group, return_inverse=True)
+    sums = np.stack([np.bincount(place, weights=column) for column in values.T], axis=1)
+    drawn = np.random.default_rng(0).integers(0, len(sums), (_ROUNDS, len(sums)))
+    return np.asarray(sums[drawn].sum(axis=1), dtype=np.float64)

@@ -16,10 +16,8 @@ def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
     pairs = []
     for _ in range(count):
         n = 30
-        u, v = (
-            part.ravel()[:n]
-            for part in np.meshgrid(np.arange(40.0, 480.0, 80.0), np.arange(40.0, 480.0, 80.0))
-        )
+        place = np.arange(40.0, 480.0, 80.0)
+        u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
         diameter, ratio = rng.uniform(12, 60, n), rng.uniform(0.06, 0.2, n)
         truth = FrameTruth(u, v, diameter, np.full(n, 7e3), ratio, np.arange(n), 512, 512, 0.0, 0)
         inward = 1.0 / (1.0 + share * ratio * diameter)
@@ -67,8 +65,7 @@ def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
 
 def test_too_few_craters_give_no_correction():
     share, error = fit_parallax(frames(1)[:1])
-    assert share == 0.0
-    assert np.isnan(error)
+    assert share == 0.0 and np.isnan(error)
 
 
 def test_the_papers_threshold_is_chosen_over_its_classes_together():

@@ -1,5 +1,7 @@
 """Figures by altitude, light, place and state, against scenes whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,18 +73,9 @@ def test_sigma_is_called_calibrated_where_errors_follow_it():
     u, v = rng.uniform(30, 480, 4000), rng.uniform(30, 480, 4000)
     parts = []
     for k in range(40):
-        chosen = slice(100 * k, 100 * k + 1)
-        truth, found = scene(u[chosen], v[chosen], sigma=0.7)
-        parts.append(
-            (
-                truth,
-                FrameDetections(
-                    found.u_px + rng.normal(0, 0.7, 1),
-                    found.v_px + rng.normal(0, 0.7, 1),
-                    *(getattr(found, n) for n in ("diameter_px", "diameter_m", "score", "sigma_px")),
-                ),
-            )
-        )
+        truth, found = scene(u[[100 * k]], v[[100 * k]], sigma=0.7)
+        error_u, error_v = rng.normal(0, 0.7, (2, 1))
+        parts.append((truth, replace(found, u_px=found.u_px + error_u, v_px=found.v_px + error_v)))
     calibration = figures_of(parts, [LOW] * 40)["sigma_calibration"]
     # 80 draws: the rms of a unit Gaussian is known to 1 / sqrt(160) = 0.08.
     assert calibration["rms"] == pytest.approx(1.0, abs=0.25)

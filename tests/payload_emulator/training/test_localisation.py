@@ -1,16 +1,13 @@
 """Signed bias by the Sun's azimuth, in the axes of the image and of the Sun; distances from measured rims."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.localisation import (
-    bias_by_octant,
-    bias_overall,
-)
+from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
 from payload_emulator.training.evaluate.scoring import FrameDetections, tally
-
-METRES_PER_DEGREE = 1_737_400.0 * np.pi / 180.0
 
 
 def shifted_scene(azimuth_deg, shift, number=0):
@@ -62,11 +59,7 @@ def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
 
 def test_octants_of_a_few_craters_name_no_worst_one():
     truth, found = shifted_scene(10.0, (2.0, 0.0))
-    few = FrameTruth(
-        *(
-            value[:5] if isinstance(value, np.ndarray) else value
-            for value in (getattr(truth, name) for name in truth.__slots__)
-        )
-    )
+    columns = ("u_px", "v_px", "diameter_px", "diameter_m", "depth_ratio", "ids")
+    few = replace(truth, **{name: getattr(truth, name)[:5] for name in columns})
     _, overall = bias_of((few, found))
     assert overall["pairs"] == 5 and overall["worst_octant"] is None

@@ -5,16 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lunar.catalogue import size_class
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.scoring import (
     FrameDetections,
     MatchRule,
     best_threshold,
-    bootstrap_f1,
     match,
     tally,
     threshold_for_precision,
+    with_interval,
 )
 
 
@@ -103,13 +102,6 @@ def test_a_detection_of_the_wrong_class_is_false_and_its_crater_missed():
     assert tally([frame], [detections]).figures(0.5).f1 == 1.0
 
 
-def test_size_classes_hold_their_lower_limits_and_thirty_kilometres():
-    diameters = np.array(
-        [2_999.0, 3_000.0, 4_999.0, 5_000.0, 9_999.0, 10_000.0, 15_000.0, 30_000.0, 30_001.0]
-    )
-    assert size_class(diameters).tolist() == [-1, 3, 3, 0, 0, 1, 2, 2, -1]
-
-
 def test_nothing_expected_and_nothing_found_gives_no_figure_instead_of_a_perfect_one():
     figures = tally([truth([], [])], [found([], [], [])]).figures(0.5)
     assert np.isnan([figures.precision, figures.recall, figures.f1, figures.loc_px]).all()
@@ -126,8 +118,7 @@ def test_the_best_threshold_separates_right_from_wrong():
 def test_the_bootstrap_interval_holds_the_figure_and_narrows_to_it_when_blocks_agree():
     frames = [truth([100, 200], [100, 200], block=k) for k in range(8)]
     detections = [found([100], [100], [0.9])] * 8
-    low, high = bootstrap_f1(tally(frames, detections), 0.5)
-    assert low == pytest.approx(2 / 3) and high == pytest.approx(2 / 3)
+    assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == pytest.approx([2 / 3, 2 / 3])
 
 
 points = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=12)
