@@ -36,7 +36,7 @@ from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_sc
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.renderer import Rendering
-from payload_emulator.sim.render.sensor import SensorModel, expose
+from payload_emulator.sim.render.sensor import SensorModel, take_picture
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.tiles import Terrain
 
@@ -108,7 +108,7 @@ def _speed_at(
     render_ms = _least_ms(lambda: renderer.render(*view))
     raymarch.render(*view, every=64)
     march_ms = 64.0 * _cpu_ms(lambda: raymarch.render(*view, every=8))
-    sensor_ms = _least_ms(lambda: expose(picture.radiance, SensorModel(), np.random.default_rng(0)))
+    sensor_ms = _least_ms(lambda: take_picture(picture.radiance, SensorModel(), np.random.default_rng(0)))
     row: dict[str, object] = {
         "render_ms": round(render_ms, 1),
         "sensor_ms": round(sensor_ms, 1),

@@ -30,14 +30,20 @@ def kept(name: str) -> bytes | None:
     return octets if hashlib.sha256(octets).digest() == content[:_DIGEST_OCTETS] else None
 
 
-def keep(name: str, octets: bytes) -> None:
-    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files."""
-    folder = cache_folder()
+def keep(name: str, octets: bytes, most: int = 0) -> None:
+    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files.
+
+    Of a kind, the name up to its hyphen, the newest files stay: at most ``most``, or all for 0.
+    """
+    folder, kind = cache_folder(), name.partition("-")[0]
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         part = folder / uuid.uuid4().hex
         part.write_bytes(hashlib.sha256(octets).digest() + octets)
         part.replace(folder / name)
-        for other in folder.iterdir():
-            if other.stat().st_mtime < time.time() - KEPT_S:
-                other.unlink()
+        with os.scandir(folder) as files:
+            written = sorted((file.stat().st_mtime, file.name) for file in files)
+        same = [other for _, other in written if other.partition("-")[0] == kind]
+        old = [other for second, other in written if second < time.time() - KEPT_S]
+        for other in {*old, *same[:-most]}:
+            (folder / other).unlink()

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import inspect
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from kernels import cache_folder, keep, kept
-from lunar import constants
+from kernels import keep, kept
 from lunar.arrays import IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.sim.terrain import tiles
+from payload_emulator.sim.terrain.tiles import Terrain, ground_hash
 
 KEPT = 32
 """Sets of craters that are kept, up to 2 MB each."""
@@ -32,7 +27,7 @@ def sources_of(scenario: Scenario, data: DataFolder) -> str:
     return repr((scenario.terrain, scenario.seed, stated))
 
 
-def rims_of(scenario: Scenario, terrain: tiles.Terrain, craters: IntArray) -> CraterCatalogue:
+def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray) -> CraterCatalogue:
     """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground."""
     listed, navigation = terrain.catalogue, scenario.navigation
     diameter_m = listed.diameter_m[craters]
@@ -41,34 +36,11 @@ def rims_of(scenario: Scenario, terrain: tiles.Terrain, craters: IntArray) -> Cr
     if scenario.has_flat_ground:
         return replace(listed.select(useful), rim_height_m=np.zeros(len(useful)))
     places = (listed.latitude_rad, listed.longitude_rad, listed.diameter_m, listed.depth_m, useful)
-    key = hashlib.sha256(f"{_code()} {terrain.sources}".encode())
-    for part in places:
-        key.update(part.tobytes())
-    name = f"rims-{key.hexdigest()}"
+    name = f"rims-{ground_hash(terrain.sources, *places)}"
     octets = kept(name) if terrain.sources else None
     if octets is not None:
         terrain.take_measurements(useful, np.frombuffer(octets).reshape(-1, 4))
     found = terrain.measured(useful)
-    if octets is not None or not terrain.sources:
-        return found
-    keep(name, terrain.measurements_m(useful).tobytes())
-    with suppress(OSError):  # another process has deleted one
-        newest = sorted(cache_folder().glob("rims-*"), key=lambda file: file.stat().st_mtime)
-        for file in newest[:-KEPT]:
-            file.unlink()
+    if octets is None and terrain.sources:
+        keep(name, terrain.measurements_m(useful).tobytes(), KEPT)
     return found
-
-
-@functools.cache
-def _code() -> str:
-    """Return the hash of the code that measures, and of the compiler and the processor, which decide the last bit."""
-    import llvmlite.binding
-    import numba
-
-    key = hashlib.sha256(
-        f"{numba.__version__} {np.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
-    )
-    for module in (tiles, constants):
-        for file in sorted(Path(inspect.getfile(module)).parent.glob("*.py")):
-            key.update(file.read_bytes())
-    return key.hexdigest()

@@ -1,4 +1,4 @@
-"""Measured rims are kept on disk and are never those of another ground."""
+"""Tiles and measured rims are kept on disk and are never those of another ground."""
 
 import os
 from dataclasses import replace
@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lunar.arrays import IntArray
+from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session import rims
 from payload_emulator.session.rims import rims_of, sources_of
 from payload_emulator.session.scenario import Scenario
+from payload_emulator.sim.terrain import tiles
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
+from payload_emulator.sim.terrain.tiles import Heights
 
 SCENARIO = Scenario(name="rims", seed=5)
 ALL = np.arange(6)
@@ -22,7 +24,6 @@ ALL = np.arange(6)
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     opened().measured(ALL[:1])  # compiled code comes from its own folder
-    monkeypatch.setattr(rims, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr("kernels.cache_folder", lambda: tmp_path)
     return tmp_path
 
@@ -64,15 +65,42 @@ def test_rims_are_measured_once_and_again_for_other_ground(folder: Path) -> None
     assert makes_ground(opened())
 
 
-def test_the_oldest_sets_of_rims_are_deleted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rims, "KEPT", 2)
-    files: list[Path] = []
-    for age_s in (300.0, 200.0, 100.0):
-        rims_of(SCENARIO, opened(), ALL[len(files) :])
-        (new,) = set(folder.iterdir()) - set(files)
-        os.utime(new, (0.0, new.stat().st_mtime - age_s))
-        files.append(new)
-    assert set(folder.iterdir()) == set(files[1:])
+def test_tiles_are_made_once_and_again_for_other_ground(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, make = list[ProceduralTerrain](), ProceduralTerrain.make_heights
+
+    def counted(terrain: ProceduralTerrain, *places: FloatArray) -> Heights:
+        made.append(terrain)
+        return make(terrain, *places)
+
+    def tile(terrain: ProceduralTerrain, latitude_rad: float = 0.1) -> Heights:
+        patch = terrain.patch(latitude_rad, 0.1)
+        return patch.heights[patch.table[0, 0]]
+
+    monkeypatch.setattr(ProceduralTerrain, "make_heights", counted)
+    first = opened()
+    assert np.array_equal(tile(first), tile(opened()))
+    assert made == [first]
+    for terrain in (opened("other"), opened("one", 1e-9), opened(""), opened("")):  # two are not known
+        tile(terrain)
+        assert made.pop() is terrain
+    for file in folder.glob("tile-*"):
+        file.write_bytes(file.read_bytes()[:-1])
+    damaged = opened()
+    assert np.array_equal(tile(first), tile(damaged))
+    assert made.pop() is damaged
+
+    monkeypatch.setattr(tiles, "FILED_TILES", 1)
+    monkeypatch.setattr(rims, "KEPT", 1)
+    tile(damaged, 0.2)
+    tile(opened(), 0.2)
+    assert made == [first, damaged]
+    rims_of(SCENARIO, first, ALL)
+    rims_of(SCENARIO, first, ALL[1:])
+    rims_of(SCENARIO, newest := opened(), ALL[1:])
+    assert not newest._slots
+    assert sorted(file.name[:5] for file in folder.iterdir()) == ["rims-", "tile-"]
 
 
 def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_path: Path) -> None:

@@ -21,9 +21,7 @@ COLOUR = (1.06, 1.0, 0.90)
 FULL_RADIANCE_FLOOR = 1.0e-4
 """Auto exposure gives up below this: the night side stays dark."""
 
-
 TRANSFER_STEPS = 16_384
-
 
 _BOUNDS = (
     ("exposure", 0.0, math.inf),
@@ -104,23 +102,6 @@ class SensorModel:
                 raise PayloadError(f"sensor: expected {name} from {low:g} to {high:g}, found {value:g}")
 
 
-def expose(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> OctetArray:
-    """RGB picture (H, W, 3) of a radiance (H, W), 8 bit; see `expose_deep` for more."""
-    if sensor.bits != 8:
-        raise PayloadError(f"sensor: expected 8 bits for an 8-bit picture, found {sensor.bits}")
-    return np.asarray(_read_out(radiance, sensor, rng), dtype=np.uint8)
-
-
-def expose_deep(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
-    """RGB picture (H, W, 3) in 16 bits with the sensor's own steps: full scale is 65535 at any depth."""
-    return _read_out(radiance, sensor, rng)
-
-
-def take_picture(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> Picture:
-    """RGB picture (H, W, 3) of a radiance (H, W): 8-bit numbers of an 8-bit sensor, 16-bit numbers of a deeper one."""
-    return expose(radiance, sensor, rng) if sensor.bits == 8 else expose_deep(radiance, sensor, rng)
-
-
 def random_sensor(rng: np.random.Generator) -> SensorModel:
     """A sensor and exposure drawn over the span that a detector should be indifferent to."""
     return SensorModel(
@@ -148,7 +129,8 @@ def auto_exposure(radiance: Image, sensor: SensorModel) -> float:
     return sensor.exposure_target / float(np.percentile(sunlit, sensor.exposure_percentile))
 
 
-def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
+def take_picture(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> Picture:
+    """RGB picture (H, W, 3) of a radiance (H, W) in the sensor's steps: 8 bits of 8, else 16 with full scale 65535."""
     from payload_emulator.sim.render._sensor_kernel import read_out
 
     signal = _blurred(np.asarray(radiance, dtype=np.float32), sensor.psf_sigma_px)
@@ -164,7 +146,8 @@ def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) ->
         signal += np.float32(sensor.stray) * signal.mean()
     if sensor.gain_mismatch:
         signal *= _fixed_pattern(height, width, sensor.gain_mismatch)
-    out = np.empty((height, width, 3), np.uint16)
+    transfer = _transfer(sensor.gamma, sensor.bits)
+    out = np.empty((height, width, 3), transfer.dtype)
     noise = rng.standard_normal((height, width, 3), dtype=np.float32)
     read_out(
         signal,
@@ -174,15 +157,12 @@ def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) ->
         sensor.dark_e,
         sensor.read_noise_e,
         sensor.offset,
-        _transfer(sensor.gamma, sensor.bits),
+        transfer,
         out,
     )
     hot = round(sensor.hot_pixels * height * width)
-    if hot:
-        fixed = np.random.Generator(np.random.PCG64([width, height, hot]))
-        out[fixed.integers(0, height, hot), fixed.integers(0, width, hot)] = (
-            255 if sensor.bits == 8 else 65535
-        )
+    fixed = np.random.Generator(np.random.PCG64([width, height, hot]))
+    out[fixed.integers(0, height, hot), fixed.integers(0, width, hot)] = transfer[-1]
     return out
 
 
@@ -193,11 +173,12 @@ def _fixed_pattern(height: int, width: int, rms: float) -> Image:
     return np.float32(1.0) + np.float32(rms) * fixed.standard_normal((height, width), dtype=np.float32)
 
 
-def _transfer(gamma: float, bits: int) -> npt.NDArray[np.uint16]:
+@lru_cache(maxsize=4)
+def _transfer(gamma: float, bits: int) -> Picture:
     """Output for each of 16384 steps of input from 0 to full scale."""
     share = np.linspace(0.0, 1.0, TRANSFER_STEPS) ** gamma
     if bits == 8:
-        return np.rint(255.0 * share).astype(np.uint16)
+        return np.rint(255.0 * share).astype(np.uint8)
     levels = (1 << bits) - 1
     return np.rint(np.rint(levels * share) * (65535.0 / levels)).astype(np.uint16)
 

@@ -174,10 +174,12 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
                     line[j] += weight * source[j]
         inner = out[i, reach : columns - reach]
         for j in range(inner.size):
-            total = weights[0] * line[j]
-            for k in range(1, weights.size):
-                total += weights[k] * line[j + k]
-            inner[j] = total
+            inner[j] = weights[0] * line[j]
+        for k in range(1, weights.size):
+            source = line[k:]
+            weight = weights[k]
+            for j in range(inner.size):
+                inner[j] += weight * source[j]
         out[i, :reach] = line[:reach]
         out[i, columns - reach :] = line[columns - reach :]
     return out

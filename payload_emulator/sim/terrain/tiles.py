@@ -7,16 +7,23 @@ every window is the same bits whatever was asked before, and no seam can appear 
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import math
 import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from kernels import keep, kept
+from lunar import constants
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -47,6 +54,9 @@ MEAN_ALBEDO = 0.12
 
 KEPT_TILES = 64
 """Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only."""
+
+FILED_TILES = 1024
+"""Tiles of 1 MB that are kept on disk for later runs: six windows of a pole-to-pole orbit side by side need 650."""
 
 RIM_AZIMUTHS = 48
 FLOOR_AZIMUTHS = 16
@@ -180,7 +190,14 @@ class Terrain(ABC):
             Beyond 84 degrees of latitude, where an equirectangular grid is no use, or wider than the cache, or from
             another thread than the one this terrain belongs to.
         """
-        self._keep_to_one_thread()
+        thread = threading.get_ident()
+        if self._owner is None:
+            self._owner = thread
+        elif self._owner != thread:
+            raise TerrainError(
+                f"terrain {self.name}: expected the thread that first asked it for ground, found another "
+                f"({threading.current_thread().name}): open a terrain for each thread"
+            )
         latitude = np.asarray(latitude_rad, dtype=np.float64).ravel()
         longitude = np.asarray(longitude_rad, dtype=np.float64).ravel()
         worst = int(np.abs(latitude).argmax())
@@ -197,18 +214,13 @@ class Terrain(ABC):
         tile_columns = 2 * self._level_rows[level]
         rows = (0.5 * math.pi - latitude) * scale - 0.5
         columns = longitude * scale - 0.5
-        above = np.floor((rows - spare) / TILE_PIXELS).astype(np.int64)
-        below = np.floor((rows + spare) / TILE_PIXELS).astype(np.int64)
-        before = np.floor((columns - wide) / TILE_PIXELS).astype(np.int64)
-        behind = np.floor((columns + wide) / TILE_PIXELS).astype(np.int64)
+        edges = np.stack([rows - spare, rows + spare, columns - wide, columns + wide])
+        above, below, before, behind = np.floor(edges / TILE_PIXELS).astype(np.int64)
         top, left = int(above.min()), int(before.min())
         wanted = np.zeros((int(below.max()) - top + 1, int(behind.max()) - left + 1), dtype=bool)
-        # A tile is wider than twice the spacing in any sane call; ranges cover the rest.
-        for row in range(int((below - above).max()) + 1):
-            for column in range(int((behind - before).max()) + 1):
-                wanted[np.minimum(above + row, below) - top, np.minimum(before + column, behind) - left] = (
-                    True
-                )
+        spans = np.stack([above - top, below - top, before - left, behind - left], axis=1)
+        for row, last_row, column, last_column in set(map(tuple, spans.tolist())):
+            wanted[row : last_row + 1, column : last_column + 1] = True
         count = int(np.count_nonzero(wanted))
         if count > self.cache_tiles or wanted.shape[1] > tile_columns:
             raise TerrainError(
@@ -216,14 +228,14 @@ class Terrain(ABC):
                 "the view is too wide or too near a pole"
             )
         self._room = max(self._room, count)
-        table = np.full(wanted.shape, -1, np.int32)
-        places = [(int(row), int(column)) for row, column in np.argwhere(wanted)]
-        keys = [(level, top + row, (left + column) % tile_columns) for row, column in places]
+        keys = [
+            (level, top + row, (left + column) % tile_columns) for row, column in np.argwhere(wanted).tolist()
+        ]
         for key in keys:
             if key in self._slots:
                 self._slots.move_to_end(key)
-        for place, key in zip(places, keys, strict=True):
-            table[place] = self._slot(key)
+        table = np.full(wanted.shape, -1, np.int32)
+        table[wanted] = [self._slots[key] if key in self._slots else self._made(key) for key in keys]
         bounds = self._bounds[table[wanted]]
         assert self._pool is not None and self._albedo is not None
         return TerrainPatch(
@@ -246,9 +258,6 @@ class Terrain(ABC):
         self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0
     ) -> FloatArray:
         """Height above the map sphere (...) in metres, bilinear on the grid of a level; places may lie far apart."""
-        return self._sample(latitude_rad, longitude_rad, level)
-
-    def _sample(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int) -> FloatArray:
         from payload_emulator.sim.terrain import kernels
 
         latitude, longitude = np.broadcast_arrays(
@@ -263,11 +272,11 @@ class Terrain(ABC):
         block_column = np.floor(flat_longitude * self.pixels_per_radian / (4 * TILE_PIXELS << level))
         blocks, block = np.unique(block_row * 1.0e6 + block_column, return_inverse=True)
         for number in range(blocks.size):
-            chosen = np.flatnonzero(block == number)
-            patch = self.patch(flat_latitude[chosen], flat_longitude[chosen], level=level)
-            rows, columns = patch.coordinates(flat_latitude[chosen], flat_longitude[chosen])
-            values = np.empty(chosen.size)
-            kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, rows, columns, values)
+            chosen = block == number
+            places = flat_latitude[chosen], flat_longitude[chosen]
+            patch = self.patch(*places, level=level)
+            values = np.empty(places[0].size)
+            kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, *patch.coordinates(*places), values)
             out[chosen] = values
         return out.reshape(latitude.shape)
 
@@ -311,12 +320,12 @@ class Terrain(ABC):
             latitude = self.catalogue.latitude_rad[part][:, None]
             longitude = self.catalogue.longitude_rad[part][:, None]
             radius = 0.5 * self.catalogue.diameter_m[part][:, None] / MOON_RADIUS_M
-            around = self._sample(*_circle(latitude, longitude, radius, RIM_AZIMUTHS), MEASURE_LEVEL)
+            around = self.height_m(*_circle(latitude, longitude, radius, RIM_AZIMUTHS), MEASURE_LEVEL)
             rim = around.mean(axis=1)
             azimuth = _azimuths(RIM_AZIMUTHS)
             tilt = 2.0 / RIM_AZIMUTHS * around @ np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
             rings = [
-                self._sample(
+                self.height_m(
                     *_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS), MEASURE_LEVEL
                 ).mean(axis=1)
                 for fraction in (0.1, 0.22, 0.34)
@@ -339,27 +348,14 @@ class Terrain(ABC):
         """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
         self._owner = None
 
-    def _keep_to_one_thread(self) -> None:
-        thread = threading.get_ident()
-        if self._owner is None:
-            self._owner = thread
-        elif self._owner != thread:
-            raise TerrainError(
-                f"terrain {self.name}: expected the thread that first asked it for ground, found another "
-                f"({threading.current_thread().name}): open a terrain for each thread"
-            )
-
-    def _slot(self, key: tuple[int, int, int]) -> int:
-        slot = self._slots.get(key)
-        if slot is not None:
-            self._slots.move_to_end(key)
-            return slot
+    def _made(self, key: tuple[int, int, int]) -> int:
+        """Put a tile into a slot of the pool, and return the slot."""
         if self._pool is None or self._albedo is None:
             size, small = TILE_PIXELS + 3, (1 << ALBEDO_SHIFT) + 1
             self._pool = np.empty((self.cache_tiles, size, size), np.float32)
             self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
         latitude, longitude = tile_angles(key[1], key[2], self._level_rows[key[0]] * TILE_PIXELS / 180.0)
-        heights = self.make_heights(latitude, longitude)
+        heights = self._heights(key, latitude, longitude)
         step = TILE_PIXELS >> ALBEDO_SHIFT
         albedo = self.make_albedo(latitude[APRON::step], longitude[APRON::step])
         slot = self._slots.popitem(last=False)[1] if len(self._slots) >= self._room else len(self._slots)
@@ -368,6 +364,47 @@ class Terrain(ABC):
         self._bounds[slot] = heights.min(), heights.max()
         self._slots[key] = slot
         return slot
+
+    def _heights(self, key: tuple[int, int, int], latitude: FloatArray, longitude: FloatArray) -> Heights:
+        """Return the heights of a tile, made once and read from disk later if it is known what they are made of."""
+        if not self.sources:
+            return self.make_heights(latitude, longitude)
+        name = f"tile-{ground_hash(self._ground_hash, np.array(key))}"
+        octets = kept(name)
+        if octets is None:
+            octets = self.make_heights(latitude, longitude).tobytes()
+            keep(name, octets, FILED_TILES)
+        return np.frombuffer(octets, np.float32).reshape(latitude.size, -1)
+
+    @functools.cached_property
+    def _ground_hash(self) -> str:
+        """Hash of what the heights of tiles are made of."""
+        listed = self.listed
+        columns = (listed.latitude_rad, listed.longitude_rad, listed.diameter_m, listed.depth_m)
+        return ground_hash(f"{self.sources} {self.pixels_per_degree}", *columns)
+
+
+def ground_hash(sources: str, *arrays: npt.NDArray[np.generic]) -> str:
+    """Return the hash of what ground or measurements of it are made of, the code included."""
+    key = hashlib.sha256(f"{_code_hash()} {sources}".encode())
+    for array in arrays:
+        key.update(array.tobytes())
+    return key.hexdigest()
+
+
+@functools.cache
+def _code_hash() -> str:
+    """Return the hash of the code that makes ground, and of libraries and processor, which decide the last bit."""
+    import llvmlite.binding
+
+    key = hashlib.sha256(llvmlite.binding.get_host_cpu_name().encode())
+    for package in ("numba", "numpy", "opencv-python-headless", "rasterio"):
+        with suppress(PackageNotFoundError):
+            key.update(version(package).encode())
+    for module in (__file__, constants.__file__):
+        for file in sorted(Path(module).parent.glob("*.py")):
+            key.update(file.read_bytes())
+    return key.hexdigest()
 
 
 def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: float) -> tuple[FloatArray, FloatArray]:

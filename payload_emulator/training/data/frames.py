@@ -139,18 +139,17 @@ def _exposed(
 ) -> tuple[NDArray[Any], OctetArray]:
     """The frame as the recipe wants it, mean of the channels (H, W) or RGB (H, W, 3), and its mean in 8 bits."""
     from payload_emulator.flight.vision.preprocess import gray_levels
-    from payload_emulator.sim.render.sensor import expose, expose_deep
+    from payload_emulator.sim.render.sensor import take_picture
 
     in_colour = recipe.colour == "rgb"
+    picture = take_picture(radiance, replace(sensor, bits=recipe.bits), rng)
     if recipe.bits == 8:
-        picture = expose(radiance, sensor, rng)
-        gray = gray_levels(picture)
+        gray = gray_levels(picture.astype(np.uint8, copy=False))
         return (picture if in_colour else gray), gray
-    deep_picture = expose_deep(radiance, replace(sensor, bits=recipe.bits), rng)
-    red, green, blue = np.moveaxis(deep_picture, -1, 0)
+    red, green, blue = np.moveaxis(picture, -1, 0)
     total = red.astype(np.uint32) + green + blue  # a sum along an axis of three is ten times slower
     deep = ((total + 1) // 3).astype(np.uint16)
-    return (deep_picture if in_colour else deep), (deep >> 8).astype(np.uint8)
+    return (picture if in_colour else deep), (deep >> 8).astype(np.uint8)
 
 
 def _label(

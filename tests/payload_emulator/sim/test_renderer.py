@@ -27,6 +27,12 @@ def sun(elevation_deg, azimuth_deg, latitude_deg, longitude_deg):
     return sun_direction_mcmf(*(math.radians(angle) for angle in angles))
 
 
+def rays(rotation):
+    """Directions of all pixels in MCMF."""
+    v, u = np.mgrid[0:512, 0:512]
+    return CAMERA.rays(np.stack([u, v], axis=-1)) @ rotation
+
+
 @pytest.mark.parametrize("longitude_deg", [20.0, 0.0, 359.9])
 @pytest.mark.parametrize("height_m", [0.0, -3000.0, 4000.0])
 def test_ranges_over_a_smooth_sphere_are_those_of_the_sphere(formula_terrain, height_m, longitude_deg):
@@ -34,9 +40,7 @@ def test_ranges_over_a_smooth_sphere_are_those_of_the_sphere(formula_terrain, he
     position, rotation = pose(10.0, longitude_deg, 20e3)
     tilted = axis_rotation(1, math.radians(3.0)) @ axis_rotation(3, 0.7) @ rotation
     picture = renderer.render(terrain, CAMERA, position, tilted, sun(30.0, 20.0, 10.0, longitude_deg))
-    v, u = np.mgrid[0:512, 0:512]
-    rays = CAMERA.rays(np.stack([u, v], axis=-1)) @ tilted
-    expected = intersect_sphere(position, rays, MOON_RADIUS_M + height_m)
+    expected = intersect_sphere(position, rays(tilted), MOON_RADIUS_M + height_m)
     # A hundredth of a pixel (100 m on the ground) along the ray: grid points are joined by straight lines.
     np.testing.assert_allclose(picture.range_m, expected, atol=2.0)
 
@@ -47,9 +51,8 @@ def test_a_lambert_sphere_shines_with_the_sine_of_the_local_sun(formula_terrain)
     toward = sun(20.0, 60.0, -30.0, 100.0)
     picture = renderer.render(terrain, CAMERA, position, rotation, toward, LAMBERT)
     assert picture.lit.min() == 1.0
-    v, u = np.mgrid[0:512, 0:512]
-    rays = CAMERA.rays(np.stack([u, v], axis=-1)) @ rotation
-    points = position + rays * intersect_sphere(position, rays)[..., None]
+    directions = rays(rotation)
+    points = position + directions * intersect_sphere(position, directions)[..., None]
     expected = 0.12 * (points @ toward) / MOON_RADIUS_M
     # Heights near 1.7e6 m lose nothing to single precision that shows above one part in 300.
     np.testing.assert_allclose(picture.radiance, expected, rtol=3e-3)
@@ -65,9 +68,7 @@ def test_the_shadow_of_a_step_ends_where_trigonometry_says(formula_terrain):
     picture = renderer.render(formula_terrain(wall), CAMERA, position, rotation, sun(10.0, 0.0, 0.0, 50.0))
     # Along the central meridian the ground south of the wall is dark for height / tan(elevation).
     column = picture.lit[:, 255]
-    points = position + picture.range_m[:, 255, None] * (
-        CAMERA.rays(np.stack([np.full(512, 255), np.arange(512)], axis=-1)) @ rotation
-    )
+    points = position + picture.range_m[:, 255, None] * rays(rotation)[:, 255]
     latitude = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
     dark = (column < 0.5) & (latitude < edge_rad - 100.0 / MOON_RADIUS_M)
     length = (edge_rad - latitude[dark].min()) * MOON_RADIUS_M

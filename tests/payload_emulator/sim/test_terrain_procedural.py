@@ -67,21 +67,16 @@ def test_craters_are_as_deep_as_they_were_drawn(procedural):
 
 def test_levels_of_detail_show_the_same_ground(procedural):
     latitude, longitude = np.radians(np.linspace(9.2, 10.8, 60)), np.radians(np.linspace(19.2, 20.8, 60))
-    fine = procedural._sample(latitude, longitude, 0)
+    fine = procedural.height_m(latitude, longitude, 0)
     for level in range(1, LEVELS):
-        coarse = procedural._sample(latitude, longitude, level)
+        coarse = procedural.height_m(latitude, longitude, level)
         # What is left out is small craters and waves: tens of metres where they lie.
         assert np.median(np.abs(coarse - fine)) < 25.0
 
 
 def test_craters_of_a_given_catalogue_stand_where_it_says():
-    given = make_catalogue(
-        np.radians([10.0, 10.4]),
-        np.radians([20.0, 20.6]),
-        [8000.0, 12000.0],
-        source="two",
-        depth_m=[1500.0, np.nan],
-    )
+    places = np.radians([[10.0, 10.4], [20.0, 20.6]])
+    given = make_catalogue(*places, [8000.0, 12000.0], source="two", depth_m=[1500.0, np.nan])
     terrain = ProceduralTerrain(3, catalogue=given)
     assert terrain.catalogue is given
     assert "two" in terrain.name
