@@ -8,6 +8,14 @@ duration_s = {duration_s}
 [terrain]
 source = "procedural"
 """
+SELENITA = """name = "selenita"
+[spacecraft]
+id = 76
+[camera]
+fov_deg = 120.0
+width_px = 512
+height_px = 512
+"""
 _FILTER = """filter_gravity = "builtin"
 filter_degree = 8
 """
@@ -22,12 +30,17 @@ def live_scenario(name: str, seed: int, duration_s: float) -> str:
     )
 
 
+def still_scenario(name: str, duration_s: float, seed: int = 7) -> str:
+    """Return a window of rendered images in the built-in gravity field; further sections may follow."""
+    return (
+        f'name = "{name}"\nseed = {seed}\n[dynamics]\ngravity = "builtin"\norientation = "iau"'
+        f"{_WINDOW.format(duration_s=duration_s)}"
+    )
+
+
 def short_scenario(duration_s: float, estimators: str = 'estimators = ["anchored"]\n') -> str:
     """Return a window of a few rendered images; it ends in the section `navigation`."""
-    return (
-        'name = "short"\nseed = 7\n[dynamics]\ngravity = "builtin"\norientation = "iau"'
-        f"{_WINDOW.format(duration_s=duration_s)}[navigation]\n{estimators}{_FILTER}"
-    )
+    return f"{still_scenario('short', duration_s)}[navigation]\n{estimators}{_FILTER}"
 
 
 def commanded_scenario(name: str, further: str = "") -> str:

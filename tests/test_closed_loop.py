@@ -10,25 +10,17 @@ from pathlib import Path
 import pytest
 
 from linna import cli
+from tests.scenarios import still_scenario
 
-SCENARIO = """
-name = "closed-loop"
-seed = 7
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 180.0
-[terrain]
-source = "procedural"
-[navigation]
+SCENARIO = (
+    still_scenario("closed-loop", 180.0)
+    + """[navigation]
 filter_gravity = "builtin"
 filter_degree = 8
 initial_position_error_m = 1000.0
 initial_velocity_error_m_s = 1.0
 """
+)
 FRAMES = 12
 
 

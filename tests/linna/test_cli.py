@@ -14,6 +14,7 @@ from linna.parser import ABOVE_ZERO, REQUIRED, all_commands, command_parser, num
 from payload_emulator.errors import install_hint
 from payload_emulator.session.recipe import load_recipe, procedural_recipe
 from payload_emulator.session.scenario import load_scenario
+from tests.scenarios import still_scenario
 
 
 def linna(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -98,17 +99,7 @@ def test_errors_are_a_json_object_with_json(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().out == ""
 
 
-SCENARIO = """name = "small"
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 60.0
-[terrain]
-source = "procedural"
-"""
+SCENARIO = still_scenario("small", 60.0)
 
 
 def test_a_scenario_is_checked_without_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from lunar.catalogue import CraterCatalogue
 from payload_emulator.session.loading import SEEN_BELOW_RIM_M, onboard_catalogue
 from payload_emulator.session.scenario import load_scenario
+from tmtc.tables import CatalogueTable
 
 
 def measured(source: str) -> CraterCatalogue:
@@ -23,21 +25,27 @@ def measured(source: str) -> CraterCatalogue:
     )
 
 
-def heights(source: str) -> np.ndarray:
-    """Heights (m) of the on-board table, without the errors that a scenario adds."""
+def on_board(source: str, fraction: float = 0.0) -> CatalogueTable:
+    """On-board table with errors of its centres of a fraction of the diameter, and none of its heights."""
     scenario = load_scenario("selenita")
     navigation = replace(
-        scenario.navigation, catalogue_error_fraction_of_diameter=0.0, catalogue_height_error_m=0.0
+        scenario.navigation, catalogue_error_fraction_of_diameter=fraction, catalogue_height_error_m=0.0
     )
-    return onboard_catalogue(replace(scenario, navigation=navigation), measured(source)).rim_height_m
+    return onboard_catalogue(replace(scenario, navigation=navigation), measured(source))
 
 
 def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them() -> None:
     rims = measured("LU1319381").rim_height_m
-    np.testing.assert_allclose(heights("LU1319381") - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
+    np.testing.assert_allclose(on_board("LU1319381").rim_height_m - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
     # Of the order of the measured 16 to 23 m: another sign would double the error of the altitude.
     assert 14.0 <= SEEN_BELOW_RIM_M <= 24.0
 
 
 def test_procedural_craters_are_placed_on_their_rims() -> None:
-    np.testing.assert_array_equal(heights("synthetic, seed 1"), measured("").rim_height_m)
+    np.testing.assert_array_equal(on_board("synthetic, seed 1").rim_height_m, measured("").rim_height_m)
+
+
+@pytest.mark.parametrize("source", ["LU1319381", "synthetic, seed 1"])
+def test_centres_have_the_errors_that_are_added_the_error_of_the_list_is_the_detectors(source: str) -> None:
+    np.testing.assert_array_equal(on_board(source, 0.03).sigma_m[:, :2], 150.0)
+    np.testing.assert_array_equal(on_board(source).sigma_m[:, :2], 10.0)

@@ -25,26 +25,18 @@ from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
 from payload_emulator.sim.terrain.tiles import Terrain
+from tests.scenarios import still_scenario
 
-SCENARIO = """
-name = "small"
-seed = 7
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 60.0
-[terrain]
-source = "procedural"
-[camera]
+SCENARIO = (
+    still_scenario("small", 60.0)
+    + """[camera]
 tilt_deg = 20.0
 k1 = -0.05
 [requirements]
 recall = -1.0
 median_error_m = 42.0
 """
+)
 
 
 @pytest.fixture(scope="module")

@@ -10,22 +10,15 @@ from payload_emulator.session.camera import Exposure
 from payload_emulator.session.reduced import craters_in_view
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world import build_world
+from tests.scenarios import still_scenario
 
-SCENARIO = """
-name = "overlay"
-[dynamics]
-gravity = "builtin"
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-07T01:40:00Z"
-duration_s = 30.0
-[terrain]
-source = "procedural"
-[camera]
+SCENARIO = (
+    still_scenario("overlay", 30.0, 1)
+    + """[camera]
 tilt_deg = 12.0
 k1 = -0.02
 """
+)
 RIM_M = 5_000.0
 
 

@@ -80,6 +80,8 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
     figures = summary([session(window(), window(nees=8.0)), session(longer)])
     assert figures["frames"] == 20
     assert figures["median_m"] == np.median([10, 20, 30, 40] * 2 + np.linspace(50, 60, 12).tolist())
+    # Of three windows drawn again, all are the short ones in 8 of 27 cases, the long one three times in 1 of 27.
+    assert figures["median_95_m"] == pytest.approx([25.0, 55.0])
     assert figures["max_m"] == 60.0
     assert figures["nees_mean"] == pytest.approx((6.0 + 8.0 + 12.8) / 3.0)
     # Chi-square with 18 degrees of freedom (Abramowitz and Stegun, table 26.8): 8.23075 and 31.5264.

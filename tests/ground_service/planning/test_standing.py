@@ -24,20 +24,16 @@ from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
 from ground_service.worker.follow_up import follow_in_process
 from tests.ground_service.conftest import START, Clock, add_reference, save_circle
+from tests.scenarios import SELENITA
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 NS = 10**9
 HOUR = 3600 * NS
 DAYS = 3
 
-MISSION = """name = "selenita"
-[spacecraft]
-id = 76
-[camera]
-fov_deg = 120.0
-width_px = 512
-height_px = 512
-[link.stations.here]
+MISSION = (
+    SELENITA
+    + """[link.stations.here]
 latitude_deg = 10.0
 longitude_deg = 60.0
 minimum_elevation_deg = 0.0
@@ -47,6 +43,7 @@ longitude_deg = -120.0
 minimum_elevation_deg = 0.0
 {extra}
 """
+)
 LINKS = """[[links]]
 name = "a"
 kind = "tcp"

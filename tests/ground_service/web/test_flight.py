@@ -32,6 +32,7 @@ from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import build_world
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page, wait_until
+from tests.scenarios import SELENITA
 from tmtc.dictionary import DICTIONARY
 
 NS = 1_000_000_000
@@ -57,14 +58,9 @@ filter_degree = 8
 [faults]
 events = ["overheating at 60 for 45 size 60", "camera_lost at 150 for 30"]
 """
-MISSION = """name = "selenita"
-[spacecraft]
-id = 76
-[camera]
-fov_deg = 120.0
-width_px = 512
-height_px = 512
-[link.stations.madrid]
+MISSION = (
+    SELENITA
+    + """[link.stations.madrid]
 latitude_deg = 40.43
 longitude_deg = -4.25
 minimum_elevation_deg = 0.0
@@ -78,6 +74,7 @@ station = "madrid"
 downlink = "127.0.0.1:{port}"
 silence_s = 1.0
 """
+)
 ORDERS = (
     ("set_housekeeping_interval", {"structure_id": 1, "interval_s": 15}),
     ("set_parameter", {"parameter_id": 21, "value": 2.0}),  # frames between thumbnails

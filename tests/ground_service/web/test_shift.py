@@ -29,6 +29,7 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page, wait_until
+from tests.scenarios import SELENITA
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
@@ -46,14 +47,9 @@ COVERED_LABELS = """() => {
     return labels.filter((one) => covered(box(one))).map((one) => one.textContent);
 }"""
 
-MISSION = """name = "selenita"
-[spacecraft]
-id = 76
-[camera]
-fov_deg = 120.0
-width_px = 512
-height_px = 512
-[approval]
+MISSION = (
+    SELENITA
+    + """[approval]
 windows = "manual"
 [link.stations.madrid]
 latitude_deg = 40.43
@@ -78,6 +74,7 @@ station = "canberra"
 send = "manual"
 uplink = "127.0.0.1:{up}"
 """
+)
 
 PASS_MISSION = """name = "archive"
 [spacecraft]
