@@ -176,7 +176,6 @@ class NavigationRun:
     wrong: IntArray
     own: IntArray
     findable: IntArray
-    altitude_m: FloatArray
     attitude_noise_rad: FloatArray
 
     @property
@@ -569,7 +568,6 @@ def _row(
         wrong,
         own,
         int(np.count_nonzero(np.isin(truth, state.landmarks.ids))),
-        float(np.linalg.norm(true_state[:3])) - MOON_RADIUS_M,
         report.attitude_noise_rad,
     )
 
