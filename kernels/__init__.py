@@ -20,10 +20,15 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "linna" / "kernels"
 
 
+def _folder_of(kind: str) -> Path:
+    """Return the folder of a kind; builds under test read that of compiled code, and no ground may lie in it."""
+    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims") else cache_folder()
+
+
 def kept(name: str) -> bytes | None:
     """Return what was kept under a name; None if there is none or it is damaged."""
     try:
-        content = (cache_folder() / name).read_bytes()
+        content = (_folder_of(name.partition("-")[0]) / name).read_bytes()
     except OSError:
         return None
     octets = content[_DIGEST_OCTETS:]
@@ -35,7 +40,8 @@ def keep(name: str, octets: bytes, most: int = 0) -> None:
 
     Of a kind, the name up to its hyphen, the newest files stay: at most ``most``, or all for 0.
     """
-    folder, kind = cache_folder(), name.partition("-")[0]
+    kind = name.partition("-")[0]
+    folder = _folder_of(kind)
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         part = folder / uuid.uuid4().hex

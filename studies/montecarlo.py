@@ -352,8 +352,8 @@ def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> Naviga
     """The case with the errors of the detector that last for a run drawn into its given ones."""
     detector, drawn = case.detector, rng.standard_normal(3)
     right, down = np.array(detector.bias_px) + detector.bias_sigma_px * drawn[:2]
-    scale = detector.scale + detector.scale_sigma * float(drawn[2])
-    return replace(case, detector=replace(detector, bias_px=(float(right), float(down)), scale=scale))
+    scale = detector.scale + detector.scale_sigma * drawn[2]
+    return replace(case, detector=replace(detector, bias_px=(right, down), scale=scale))
 
 
 def _wandering(

@@ -18,7 +18,7 @@ from lunar.frames import IauOrientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.dynamics import ProcessNoise, process_noise
+from payload_emulator.flight.navigation.dynamics import process_noise
 from payload_emulator.sim.detector import SimulatedDetector
 from studies.montecarlo import CatalogueErrors, NavigationCase
 
@@ -89,9 +89,7 @@ def crater_world() -> CraterCatalogue:
     return make_catalogue(np.arcsin(z), longitude, diameter, source="simulated", rim_height_m=height)
 
 
-def standard_case(
-    data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0, catalogued: float = 1.0
-) -> NavigationCase:
+def standard_case(data: DataFolder, track: Track, hours: float, catalogued: float = 1.0) -> NavigationCase:
     """Return the case of a track: start errors of 5 km and 5 m/s, a frame every 15 s.
 
     Each revolution has two imaging arcs of 37 minutes.
@@ -105,8 +103,6 @@ def standard_case(
 
     Parameters
     ----------
-    noise_factor
-        Factor on all process noise of the filter; 1 is the shipped value.
     catalogued
         Share of the craters that the uploaded catalogue holds. The payload maps the others, and uses them one
         revolution (1.85 hours) later, when most of the ground in view is the same.
@@ -160,19 +156,5 @@ def standard_case(
         attitude_correlation_s=errors.attitude_correlation_s,
         lasting_m_s2=shipped.markov_sigma_m_s2,
         lasting_correlation_s=shipped.correlation_s,
-        parameters=replace(parameters, noise=_scaled(shipped, noise_factor)),
-    )
-
-
-def _scaled(noise: ProcessNoise, factor: float) -> ProcessNoise:
-    def times(values: tuple[float, float, float], by: float) -> tuple[float, float, float]:
-        return by * values[0], by * values[1], by * values[2]
-
-    far = noise.far_side_psd_m2_s3
-    return replace(
-        noise,
-        white_psd_m2_s3=times(noise.white_psd_m2_s3, factor),
-        markov_sigma_m_s2=times(noise.markov_sigma_m_s2, float(np.sqrt(factor))),
-        far_side_psd_m2_s3=None if far is None else times(far, factor),
-        far_side_oblique_psd_m2_s3=times(noise.far_side_oblique_psd_m2_s3, factor),
+        parameters=replace(parameters, noise=shipped),
     )

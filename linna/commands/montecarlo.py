@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from linna.output import emit, finish
-from linna.parser import ABOVE_ZERO, number, option
+from linna.parser import number, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,7 +21,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits",
         "test",
     )
-    option(parser, "--noise-factor F", ABOVE_ZERO, "factor on the filter's process noise", 1.0)
     catalogued = "share of the craters in the catalogue; the payload maps the others"
     option(parser, "--catalogued S", number(above=0, most=1), catalogued, 1.0)
     option(
@@ -43,9 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     from studies.montecarlo import consistency, fly_many, verdict
     from studies.montecarlo_world import standard_case
 
-    stated = ("track", "hours", "noise_factor", "catalogued", "attitude_noise_deg", "runs")
+    stated = ("track", "hours", "catalogued", "attitude_noise_deg", "runs")
     given = {name: getattr(arguments, name) for name in stated}
-    case = standard_case(data_folder(), *(given[name] for name in stated[:4]))
+    case = standard_case(data_folder(), *(given[name] for name in stated[:3]))
     if given["attitude_noise_deg"] is not None:
         case = replace(case, attitude_noise_rad=radians(given["attitude_noise_deg"]))
     seeds = list(range(arguments.seed, arguments.seed + arguments.runs))

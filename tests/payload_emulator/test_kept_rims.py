@@ -24,8 +24,9 @@ ALL = np.arange(6)
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     opened().measured(ALL[:1])  # compiled code comes from its own folder
-    monkeypatch.setattr("kernels.cache_folder", lambda: tmp_path)
-    return tmp_path
+    # Ground lies beside the folder of compiled code, which builds under test read.
+    monkeypatch.setattr("kernels.cache_folder", lambda: tmp_path / "code")
+    return tmp_path / "code-ground"
 
 
 def opened(sources: str = "one", shift_rad: float = 0.0) -> ProceduralTerrain:
