@@ -302,8 +302,8 @@ def format_survey(figures: dict[str, Any]) -> str:
             f"NIS {nis}",
             f"fixed {100 * figures['fixed_share']:.1f} %; wrong pairs {100 * figures['wrong_pairs_share']:.2f} %, "
             f"wrong fixes {figures['wrong_fixes']}; crater list {stated}",
-            f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters; of these craters in "
-            "view are detected (on their tracks): "
+            f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters; detected of the "
+            "catalogued craters in view (on their tracks): "
             + ", ".join(f"{text} {share} ({lasting})" for text, share, lasting in recall),
             f"level {figures['level']}",
         ]
