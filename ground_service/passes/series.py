@@ -105,19 +105,20 @@ class SeriesReading:
                 )
                 for name, unit in units.items()
             ]
-        return [self._long_series(name, unit, level) for name, unit in units.items()]
+        long = []
+        for name, unit in units.items():
+            found, correlation = self._aggregates(name, level)
+            buckets = downsample_aggregates(found, self.max_points)
+            long.append(Series(name, unit, int(found.rows.sum()), correlation, buckets))
+        return long
 
-    def _long_series(self, name: str, unit: str, level: int) -> Series:
-        found, correlation = self._aggregates(name, level)
-        return Series(
-            name, unit, int(found.rows.sum()), correlation, downsample_aggregates(found, self.max_points)
-        )
+    def _key(self) -> tuple[int, int, int, int]:
+        return self.source.code, self.span.vehicle, self.source.version, self.source.part
 
     def _level(self) -> int | None:
         """The coarsest level of roll-ups that is fine enough; None where samples are few or all are coarse."""
-        key = (self.source.code, self.span.vehicle, self.source.version, self.source.part)
         count, first, last = rollups.rolled_extent(
-            self.connection, *key, self.span.start_ticks, self.span.stop_ticks
+            self.connection, *self._key(), self.span.start_ticks, self.span.stop_ticks
         )
         if count <= FEW_ROWS:
             return None
@@ -133,15 +134,7 @@ class SeriesReading:
         start, stop = self.span.start_ticks, self.span.stop_ticks
         first, last = -(-start // width), (stop + 1) // width - 1
         rows = rollups.rollup_rows(
-            self.connection,
-            self.source.code,
-            self.span.vehicle,
-            self.source.version,
-            self.source.part,
-            level,
-            first,
-            last,
-            self.source.places[name],
+            self.connection, *self._key(), level, first, last, self.source.places[name]
         )
         begin, used = utc_ns_of_ticks(rows[0], self.span.correlations)
         end, _ = utc_ns_of_ticks(rows[1], self.span.correlations)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -99,9 +100,8 @@ def sample_arrays(
     """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for what is not known."""
     with connection.execute(_samples(kind, where, columns, equal)) as result:
         # Plain tuples of the driver: they need no translation, and rows as objects would take most of the time.
-        rows = result.cursor.fetchall()
-    # Whole numbers are below 2^53, so that float64 holds them.
-    values = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+        cells = chain.from_iterable(result.cursor.fetchall())
+        values = np.fromiter(cells, np.float64).reshape(-1, len(columns))  # whole numbers are below 2^53
     table = SAMPLES[kind]
     return {
         name: values[:, i].astype(np.int64 if table.c[name].type.python_type is int else np.float64)

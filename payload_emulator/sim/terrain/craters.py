@@ -8,7 +8,7 @@ profile of less depth, from fresh (0) to ghost (1).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,9 @@ import numpy.typing as npt
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.terrain.kernels import PROFILE_REACH
+
+KEPT_CELLS = 1024
+"""Cells of small craters that are kept, 20 KB each: the widest tile needs 169."""
 
 AGE_STEPS = 10
 SHAPES = 4
@@ -60,14 +63,7 @@ class CraterShapes:
 
     def select(self, indices: IntArray) -> CraterShapes:
         """The craters of these indices, in that order."""
-        return CraterShapes(
-            self.latitude_rad[indices],
-            self.longitude_rad[indices],
-            self.radius_rad[indices],
-            self.depth_m[indices],
-            self.profile_row[indices],
-            self.wobble[indices],
-        )
+        return CraterShapes(*(getattr(self, one.name)[indices] for one in fields(self)))
 
     def above(self, radius_rad: float) -> CraterShapes:
         """The craters larger than this."""
@@ -175,20 +171,9 @@ class SmallCraters:
         rows = range(max(0, math.floor(90.0 - north)), min(179, math.floor(90.0 - south)) + 1)
         # The order of stamping must not depend on the tile: sums of floats do not commute in the last bit.
         cells = sorted({(row, column % 360) for row in rows for column in range(west, east + 1)})
-        parts = [self._cell(row, column) for row, column in cells]
-        return CraterShapes(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in (
-                    "latitude_rad",
-                    "longitude_rad",
-                    "radius_rad",
-                    "depth_m",
-                    "profile_row",
-                    "wobble",
-                )
-            )
-        )
+        parts = [self._cell(*cell) for cell in cells]
+        names = (one.name for one in fields(CraterShapes))
+        return CraterShapes(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def _cell(self, row: int, column: int) -> CraterShapes:
         found = self._cells.get((row, column))
@@ -204,9 +189,9 @@ class SmallCraters:
         diameter = draw_power_law(rng, count, self.low_m, self.high_m, self.exponent)
         ratio = draw_depth_ratio(rng, count, SMALL_DEPTH_QUANTILES)
         made = shape_craters(latitude, longitude, diameter, ratio, rng)
-        if len(self._cells) > 4096:
-            self._cells.clear()
-        self._cells[(row, column)] = made
+        self._cells[row, column] = made
+        if len(self._cells) > KEPT_CELLS:
+            del self._cells[next(iter(self._cells))]
         return made
 
 

@@ -33,10 +33,12 @@ def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_a
     monkeypatch.setattr("payload_emulator.sim.terrain.tiles.KEPT_TILES", 1)
     second = ProceduralTerrain(5, cache_tiles=8)
     forward = [first.height_m(a, b) for a, b in zip(latitude, longitude, strict=True)]
+    monkeypatch.setattr("payload_emulator.sim.terrain.craters.KEPT_CELLS", 3)
     backward = [second.height_m(a, b) for a, b in zip(latitude[::-1], longitude[::-1], strict=True)]
     np.testing.assert_array_equal(forward, backward[::-1])
     np.testing.assert_array_equal(first.height_m(latitude, longitude), second.height_m(latitude, longitude))
     assert len(second._slots) <= 4 < len(first._slots)
+    assert len(second._small._cells) == 3
 
 
 def test_there_is_no_step_at_the_prime_meridian(procedural):
