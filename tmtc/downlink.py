@@ -839,7 +839,7 @@ def _boots(buffer: OctetArray, cut: PacketCut, ticks: IntArray, dictionary: Dict
 
     Boots are taken to begin at their boot event, or else at their first housekeeping packet.
     """
-    tables = dictionary.unpack_many(buffer, cut, only=("housekeeping", "event_info"))
+    tables = dictionary.unpack_many(buffer, cut)
     housekeeping = tables.get("housekeeping")
     if housekeeping is None:
         return None

@@ -14,7 +14,7 @@ import json
 import math
 import operator
 import struct
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -163,10 +163,10 @@ class Table:
     ticks: IntArray
     sequence_count: IntArray
     message_counter: IntArray
-    columns: dict[str, RecordArray]
-    raw: dict[str, RecordArray]
-    items: dict[str, RecordArray]
-    items_raw: dict[str, RecordArray]
+    columns: Mapping[str, RecordArray]
+    raw: Mapping[str, RecordArray]
+    items: Mapping[str, RecordArray]
+    items_raw: Mapping[str, RecordArray]
     item_owner: IntArray
 
     def __len__(self) -> int:
@@ -315,19 +315,12 @@ class Dictionary:
                 result[mine] = np.where(right, index, WRONG_LENGTH)
         return result
 
-    def unpack_many(
-        self, buffer: Octets, cut: PacketCut, only: Collection[str] | None = None
-    ) -> dict[str, Table]:
-        """A table for every kind of telemetry packet in `cut`; damaged and unknown ones are left out.
-
-        `only` names the kinds that are wanted, all by default.
-        """
+    def unpack_many(self, buffer: Octets, cut: PacketCut) -> dict[str, Table]:
+        """A table for every kind of telemetry packet in `cut`; damaged and unknown ones are left out."""
         octets = as_octets(buffer)
         which = self.identify(octets, cut)
         tables = {}
         for index, definition in enumerate(self.telemetry):
-            if only is not None and definition.name not in only:
-                continue
             rows = np.flatnonzero(which == index)
             if rows.size:
                 tables[definition.name] = self._compiled[definition.name].table(octets, cut.offsets, rows)
@@ -370,15 +363,6 @@ def gather(octets: OctetArray, starts: IntArray, dtype: np.dtype[Any]) -> Record
     opaque = np.dtype((np.void, length))
     windows: RecordArray = np.ndarray((octets.size - length + 1,), dtype=opaque, buffer=octets, strides=(1,))
     return windows[starts].view(dtype)
-
-
-def _gather_items(
-    octets: OctetArray, starts: IntArray, counts: IntArray, dtype: np.dtype[Any]
-) -> tuple[RecordArray, IntArray]:
-    """Return the `counts` (n,) items of `dtype` from each of `starts` (n,), and the index of the start of each."""
-    owner = np.repeat(np.arange(counts.size, dtype=np.int64), counts)
-    place = np.arange(owner.size, dtype=np.int64) - (np.cumsum(counts) - counts)[owner]
-    return gather(octets, starts[owner] + dtype.itemsize * place, dtype), owner
 
 
 def _checked_header(octets: bytes, packet_type: int) -> Any:
@@ -494,7 +478,7 @@ class _Compiled:
             assert self.item_dtype is not None
             start = definition.base_length - CRC_LENGTH
             records = np.frombuffer(octets, dtype=self.item_dtype, count=count, offset=start)
-            raw[group.name], values[group.name] = _columns(group.fields, records)
+            raw[group.name], values[group.name] = map(dict, _columns(group.fields, records))
         return values, raw
 
     def lengths_hold(self, octets: OctetArray, offsets: IntArray, lengths: IntArray) -> BoolArray:
@@ -514,15 +498,18 @@ class _Compiled:
         records = gather(octets, starts, self.tm_dtype)
         header = records["header"]
         raw, columns = _columns(definition.fields, records)
-        items: dict[str, RecordArray] = {}
-        items_raw: dict[str, RecordArray] = {}
+        items = items_raw = _columns((), records)[0]
         owner = np.empty(0, dtype=np.int64)
         if group:
+            from tmtc import _cutting
+
             assert self.item_dtype is not None
             counts = raw[group.count].astype(np.int64)
-            data = starts + (definition.base_length - CRC_LENGTH)
-            found, owner = _gather_items(octets, data, counts, self.item_dtype)
-            items_raw, items = _columns(group.fields, found)
+            sizes = definition.item_length * counts
+            found = np.empty(int(sizes.sum()), dtype=np.uint8)
+            _cutting.copy_spans(octets, starts + (definition.base_length - CRC_LENGTH), sizes, found)
+            items_raw, items = _columns(group.fields, found.view(self.item_dtype))
+            owner = np.repeat(np.arange(counts.size), counts)
         return Table(
             name=definition.name,
             packet_index=rows,
@@ -568,23 +555,38 @@ def _dtype_fields(fields: tuple[Field, ...]) -> list[Any]:
     return [(f.name, f.dtype) if f.size == 1 else (f.name, f.dtype, (f.size,)) for f in fields]
 
 
-def _columns(
-    fields: tuple[Field, ...], records: RecordArray
-) -> tuple[dict[str, RecordArray], dict[str, RecordArray]]:
+class _Columns(Mapping[str, RecordArray]):
+    """Columns by the names of their fields, each made when it is first asked for."""
+
+    def __init__(self, fields: tuple[Field, ...], make: Callable[[Field], RecordArray]) -> None:
+        self._fields, self._make = {f.name: f for f in fields}, make
+        self._made: dict[str, RecordArray] = {}
+
+    def __getitem__(self, name: str) -> RecordArray:
+        if name not in self._made:
+            self._made[name] = self._make(self._fields[name])
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+
+def _columns(fields: tuple[Field, ...], records: RecordArray) -> tuple[_Columns, _Columns]:
     """(raw, engineering) columns of big-endian `records`."""
-    raw, engineering = {}, {}
-    for f in fields:
-        column = np.ascontiguousarray(records[f.name], dtype=np.dtype(f.dtype).newbyteorder("="))
-        raw[f.name] = column
-        engineering[f.name] = _decode_column(f, column)
-    return raw, engineering
+    raw = _Columns(
+        fields, lambda f: np.ascontiguousarray(records[f.name], np.dtype(f.dtype).newbyteorder("="))
+    )
+    return raw, _Columns(fields, lambda f: _decode_column(f, raw[f.name]))
 
 
 def _decode_column(f: Field, raw: RecordArray) -> RecordArray:
     if f.is_float:
         return raw.astype(np.float64) if not f.is_calibrated else raw.astype(np.float64) * f.scale + f.offset
     if not f.is_calibrated:
-        return raw.astype(np.uint64 if f.type == "u64" else np.int64)
+        return raw.astype(np.uint64 if f.type == "u64" else np.int64, copy=False)
     values = raw * f.scale + f.offset
     if f.missing is not None:
         values[raw == f.missing] = np.nan

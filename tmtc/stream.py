@@ -186,7 +186,8 @@ def cut_packets(
         consumed = cutter.cut(start, stop, final)
     rows = cutter.rows[: cutter.count]
     kind = rows[:, 0]
-    chosen = rows[kind <= _BAD]
+    whole = kind <= _BAD
+    chosen = rows if whole.all() else rows[whole]
     return PacketCut(
         offsets=chosen[:, 1].copy(),
         lengths=chosen[:, 2] - chosen[:, 1],
@@ -228,18 +229,38 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
     )
 
 
-class _Cutter:
-    """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
+class _Rows:
+    """Rows kind, start, stop of a pass over a buffer."""
 
-    def __init__(self, octets: OctetArray, packet_type: int, form: PacketForm) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int) -> None:
         from tmtc import _cutting  # numba is imported only where it is used
 
         self.kernels: Any = _cutting
-        self.tables, self.powers = _cutting.crc_tables(), _cutting.powers_of_octets()
         self.octets = octets
         self.packet_type = packet_type
         self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
         self.count = 0
+
+    def grow(self) -> bool:
+        """Make room for more rows where none is left; return whether that was so."""
+        full = self.count == self.rows.shape[0]
+        if full:
+            self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
+        return full
+
+    def add(self, kind: int, p: int, q: int) -> None:
+        """Write a row."""
+        self.grow()
+        self.rows[self.count] = kind, p, q
+        self.count += 1
+
+
+class _Cutter(_Rows):
+    """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
+
+    def __init__(self, octets: OctetArray, packet_type: int, form: PacketForm) -> None:
+        super().__init__(octets, packet_type)
+        self.tables, self.powers = self.kernels.crc_tables(), self.kernels.powers_of_octets()
         self.prefix: npt.NDArray[np.uint16] | None = None
         self.known = np.full(2, -1, dtype=np.int64)
         self.unchecked = form.apids()
@@ -250,8 +271,7 @@ class _Cutter:
         self.known[:] = -1
         while p < stop:
             p = self.walk(p, stop, final)
-            if self.count == self.rows.shape[0]:
-                self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
+            if self.grow():
                 continue
             if p == stop:
                 break
@@ -268,17 +288,8 @@ class _Cutter:
 
     def walk(self, p: int, stop: int, final: bool) -> int:
         """Write rows of undamaged packets from `p` on; return the position behind them."""
-        end, self.count = self.kernels.walk(
-            self.octets,
-            p,
-            stop,
-            self.packet_type,
-            self.tables,
-            self.rows,
-            self.count,
-            self.unchecked,
-            not final,
-        )
+        key = (self.octets, p, stop, self.packet_type, self.tables, self.rows, self.count)
+        end, self.count = self.kernels.walk(*key, self.unchecked, not final)
         return int(end)
 
     def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
@@ -291,11 +302,8 @@ class _Cutter:
         last = self.rows[self.count - 1]
         if kind == _SKIPPED and self.count > begin and last[0] == _SKIPPED:
             last[2] = q
-            return
-        if self.count == self.rows.shape[0]:
-            self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
-        self.rows[self.count] = kind, p, q
-        self.count += 1
+        else:
+            self.add(kind, p, q)
 
     def decide(self, p: int, stop: int) -> list[tuple[int, int]]:
         """(kind, end) of what stands at `p` and right after it, where no packet with a right checksum stands."""
@@ -335,7 +343,7 @@ class _Cutter:
         return _IDLE if self.is_idle(p) else _BAD
 
     def is_idle(self, p: int) -> bool:
-        return bool(self.octets[p] & 0x0F == 0x07 and self.octets[p + 1] == 0xFF)
+        return bool(self.kernels.is_idle(self.octets, p))
 
     def length_at(self, p: int, stop: int) -> int:
         key = (self.octets, p, stop, self.packet_type)
@@ -349,20 +357,14 @@ class _Cutter:
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
 
 
-class _HeaderCutter:
+class _HeaderCutter(_Rows):
     """One pass over packets that are found by their headers: walk over headers, search where they end."""
 
     def __init__(self, octets: OctetArray, packet_type: int, form: PacketForm, begins: bool) -> None:
-        from tmtc import _cutting
-
-        self.kernels: Any = _cutting
+        super().__init__(octets, packet_type)
         self.begins = begins
-        self.octets = octets
-        self.packet_type = packet_type
         self.prefix_octets = form.prefix_octets
-        self.checks = form.apids(), _cutting.crc_tables()
-        self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
-        self.count = 0
+        self.checks = form.apids(), self.kernels.crc_tables()
         self.last = np.full(1 << 11, -1, dtype=np.int64)
 
     def cut(self, start: int, stop: int, final: bool) -> int:
@@ -377,9 +379,9 @@ class _HeaderCutter:
             p, self.count = kernels.walk_unchecked(
                 self.octets, p, *place, *self.checks, self.rows, self.count
             )
-            if self.count == self.rows.shape[0]:
-                self.grow()
-            elif p < stop and (self.count == before or self.is_begun(p, *key)):
+            if self.grow():
+                continue
+            if p < stop and (self.count == before or self.is_begun(p, *key)):
                 p = self.skip(p, *key)  # a packet whose end is missing; those before it fit
             elif p < stop:
                 # the length of the last packet leads to no header: it is wrong, or what follows is no packet
@@ -390,7 +392,7 @@ class _HeaderCutter:
                     p = begin
                 elif self.is_unchecked(begin):  # nothing confirms the packet: octets of it may be missing
                     self.rows[self.count - 1, 0] = _BAD
-                self.note(p, q)
+                self.add(_SKIPPED, p, q)
                 p = q
         return p
 
@@ -408,16 +410,5 @@ class _HeaderCutter:
         """Skip from `p` to the next position at which packets begin; return it."""
         key = (stop, packet_type, self.prefix_octets, self.last)
         q = int(self.kernels.search_unchecked(self.octets, p + 1, *key, *self.checks))
-        self.note(p, q)
+        self.add(_SKIPPED, p, q)
         return q
-
-    def note(self, p: int, q: int) -> None:
-        """Write a row of skipped octets."""
-        if self.count == self.rows.shape[0]:
-            self.grow()
-        self.rows[self.count] = _SKIPPED, p, q
-        self.count += 1
-
-    def grow(self) -> None:
-        """Make room for more rows."""
-        self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))

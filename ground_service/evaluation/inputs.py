@@ -57,7 +57,7 @@ from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import format_utc, parse_utc
 from reports.values import HousekeepingParameter, InstrumentReport, SettingsComparison
 from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
-from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
+from tmtc.instruments import APID_INSTRUMENTS
 from tmtc.stream import cut_packets
 
 _UNITS = {"degC": "°C", "1/1000": "‰", "": "packets"}
@@ -252,15 +252,14 @@ def identification_samples(connection: Connection, span: PassSpan) -> Identifica
 def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
     """Every report of a crater that the payload mapped itself, in time order, out of the packets."""
     octets = sample_store.packet_octets(connection, span, APID_DETECTIONS)
-    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
     return mapped_craters(tables.get("landmarks"))
 
 
 def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
     """Return the statistics of the optional instruments of the payload, out of the packets."""
     octets = sample_store.packet_octets(connection, span, APID_INSTRUMENTS)
-    names = tuple(one.name for one in instrument_telemetry())
-    return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets), only=names))
+    return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets)))
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:
@@ -441,7 +440,7 @@ def _onboard_build(connection: Connection, span: PassSpan) -> str:
 def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
     """Return the largest processor time of a step over the cadence, in percent of one core; None if unknown."""
     octets = sample_store.packet_octets(connection, span, APID_PERFORMANCE)
-    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("performance",)).get("performance")
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets)).get("performance")
     if table is None or not len(table) or not cadence_s:
         return None
     stages = [name for name in table.columns if name.startswith("cpu_") and name.endswith("_ms")]

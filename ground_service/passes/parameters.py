@@ -321,8 +321,8 @@ def packets_by_name(connection: Connection, span: PassSpan) -> Iterator[tuple[st
 
 def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
     octets = sample_store.packet_octets(connection, span, DICTIONARY.packet(packet).apid)
-    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet,))
-    records = packet_records(tables)
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
+    records = packet_records({packet: tables[packet]} if packet in tables else {})
     if len(records) > RECORDS_LIMIT:
         raise InvalidInput("packets", packet, f"at most {RECORDS_LIMIT} in a pass", str(len(records)))
     times = span.utc_ns([int(one["ticks"]) for one in records]).tolist()

@@ -51,7 +51,7 @@ def packet_values(
 ) -> tuple[IntArray, NDArray[Any]]:
     """Return ticks and values (n,) of a field of stored packets, or of their items, in order of time."""
     octets = packet_octets(connection, span, packet.apid)
-    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet.name,)).get(packet.name)
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets)).get(packet.name)
     if table is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
     ticks = table.ticks if packet.group is None else onboard_ticks(table.items["sample_ticks"])

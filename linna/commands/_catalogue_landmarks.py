@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tmtc.downlink import decode
 
     decoded = decode(arguments.downlink.read_bytes())
-    table = DICTIONARY.unpack_many(decoded.buffer, decoded.cut, only=("landmarks",)).get("landmarks")
+    table = DICTIONARY.unpack_many(decoded.buffer, decoded.cut).get("landmarks")
     catalogue = open_catalogue(arguments.catalogue, arguments.seed)
     reports = mapped_craters(table)
     mapped = latest(reports)

@@ -22,7 +22,7 @@ from payload_emulator.flight.navigation.outcomes import Mode, Outcome
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.world import World, clock_ticks
 from tmtc.dictionary import DICTIONARY
-from tmtc.estimates import ESTIMATE_PACKETS, FilterEstimates, filter_estimates
+from tmtc.estimates import FilterEstimates, filter_estimates
 from tmtc.schema import Table
 from tmtc.stream import cut_packets
 from tmtc.tables import (
@@ -36,7 +36,6 @@ from tmtc.tables import (
 )
 
 _NS = 1_000_000_000
-_PACKETS = (*ESTIMATE_PACKETS, "identifications", "navigation_state", "frame_outcome", "detections")
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
 _ARC_GAP_NS = 600 * _NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
@@ -146,7 +145,7 @@ def judge_session(
     octets
         All packets of the payload, end to end.
     """
-    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=_PACKETS)
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
     estimates = filter_estimates(tables)
     if not len(estimates):
         return None

@@ -330,10 +330,15 @@ def test_a_dictionary_that_defines_a_packet_twice_is_refused():
         Dictionary(1, (definition, definition))
 
 
-def test_only_the_wanted_tables_are_made():
+def test_a_column_is_made_once_when_it_is_asked_for():
     buffer = pack("housekeeping", HOUSEKEEPING) + pack("detections", detections(2, np.random.default_rng(0)))
-    assert set(DICTIONARY.unpack_many(buffer, cut_packets(buffer))) == {"housekeeping", "detections"}
-    assert set(DICTIONARY.unpack_many(buffer, cut_packets(buffer), only=("detections",))) == {"detections"}
+    tables = DICTIONARY.unpack_many(buffer, cut_packets(buffer))
+    assert set(tables) == {"housekeeping", "detections"}
+    columns = tables["housekeeping"].columns
+    assert list(columns) == [f.name for f in DICTIONARY.packet("housekeeping").fields]
+    assert not columns._made
+    assert columns["mode"] is columns["mode"]
+    assert set(columns._made) == {"mode"}
 
 
 def test_integer_columns_do_not_wrap_in_arithmetic():

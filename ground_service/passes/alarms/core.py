@@ -27,8 +27,8 @@ EVENT_SEVERITIES = {"event_medium": WARNING, "event_high": ALARM}
 OUTCOMES = ("fix_refused",)
 """Events that are a normal outcome of a frame: requirements judge their share, single ones raise no alarm."""
 
-WATCHED_PACKETS = (*EVENT_SEVERITIES, *(one.name for one in STRUCTURES.values()))
-WATCHED_APIDS = tuple(sorted({DICTIONARY.packet(name).apid for name in WATCHED_PACKETS}))
+_WATCHED = (*map(DICTIONARY.packet, EVENT_SEVERITIES), *STRUCTURES.values())
+WATCHED_APIDS = tuple(sorted({one.apid for one in _WATCHED}))
 
 Source = Literal["event", "parameter", "operations"]
 OPERATIONS: Source = "operations"
@@ -69,7 +69,7 @@ def limited_parameters() -> tuple[Field, ...]:
 
 def conditions_in(octets: bytes) -> tuple[Condition, ...]:
     """Return the conditions in telemetry packets that stand end to end, one for each cause, by source and name."""
-    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=WATCHED_PACKETS)
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
     found: dict[tuple[Source, str], Condition] = {}
     for one in _conditions(tables):
         key = (one.source, one.name)

@@ -105,7 +105,7 @@ def _detections(packets: list[bytes], tick: int) -> np.ndarray:
     from tmtc.stream import cut_packets
 
     octets = b"".join(packets)
-    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("detections",))["detections"]
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets))["detections"]
     row = int(np.flatnonzero(table.columns["image_ticks"] == tick)[0])
     mine = table.item_owner == row
     return np.column_stack([table.items["u_px"][mine], table.items["v_px"][mine]]).astype(float)
