@@ -135,7 +135,7 @@ def rows() -> Iterator[Row]:
 
 
 def _ours(octets: bytes) -> Any:
-    """Tables with the transmitted value of every field, which is what the rivals give."""
+    """Return tables with the transmitted values of all fields, as the other libraries give."""
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
     for table in tables.values():
         list(table.raw.values()), list(table.items_raw.values())

@@ -75,7 +75,7 @@ def _after(crc: int, buffer: RecordArray, i: int, last: int, tables: RecordArray
 
 @njit(nogil=True)
 def _crc(buffer: RecordArray, start: int, stop: int, tables: RecordArray) -> int:
-    """Return the register after two octets or more; sixteen change it at once. Unsigned places need no test."""
+    """Return the CRC register after at least two octets, 16 per step; unsigned indices avoid wraparound checks."""
     crc, i, end = _U(0xFFFF), _U(start), _U(stop)
     while i + _U(17) < end:
         crc = _after(crc, buffer, i, _U(15), tables)
@@ -92,7 +92,7 @@ def checksums_hold(rows: RecordArray, tables: RecordArray, holds: RecordArray) -
 
 @njit(nogil=True)
 def copy_spans(buffer: RecordArray, starts: RecordArray, sizes: RecordArray, out: RecordArray) -> None:
-    """Write the `sizes` (n,) octets from each of `starts` (n,), one span after another."""
+    """Copy the `sizes` (n,) octets from each of `starts` (n,) into `out`, one span after another."""
     end = _U(0)
     for n in range(starts.size):
         start = _U(starts[n])

@@ -556,7 +556,7 @@ def _dtype_fields(fields: tuple[Field, ...]) -> list[Any]:
 
 
 class _Columns(Mapping[str, RecordArray]):
-    """Columns by the names of their fields, each made when it is first asked for."""
+    """Columns by field name, computed on first access."""
 
     def __init__(self, fields: tuple[Field, ...], make: Callable[[Field], RecordArray]) -> None:
         self._fields, self._make = {f.name: f for f in fields}, make
