@@ -110,12 +110,6 @@ def bench(packets: int = PACKETS) -> dict[str, Any]:
     figures["values_equal"] = _compare(fixed, variable, *ours, packets)
     figures["reed_solomon_mb_per_s"] = _reed_solomon()
     figures["downlink_mb_per_s"] = _downlink(variable)
-    fixed_rates, variable_rates = figures["fixed_62_octets"], figures["variable_mean_267_octets"]
-    figures["ratios"] = {
-        "fixed, to spacepackets": _ratio(fixed_rates, "spacepackets cut + header + struct + fastcrc"),
-        "fixed, to the XTCE interpreter": _ratio(fixed_rates, "space_packet_parser XTCE, no checksum"),
-        "variable, to ccsdspy": _ratio(variable_rates, "ccsdspy VariableLength, no checksum"),
-    }
     return figures
 
 
@@ -284,10 +278,6 @@ def _rates(
             "mb_per_s": round(len(octets) / packets * count / 1e6 / seconds, 1),
         }
     return rates
-
-
-def _ratio(rates: dict[str, dict[str, float]], rival: str) -> float:
-    return round(rates["linna, checksum"]["packets_per_s"] / rates[rival]["packets_per_s"], 1)
 
 
 def _best(run: Callable[[], Any], rounds: int = 5) -> float:

@@ -336,7 +336,6 @@ def test_a_column_is_made_once_when_it_is_asked_for():
     assert set(tables) == {"housekeeping", "detections"}
     columns = tables["housekeeping"].columns
     assert list(columns) == [f.name for f in DICTIONARY.packet("housekeeping").fields]
-    assert not columns._made
     assert columns["mode"] is columns["mode"]
     assert set(columns._made) == {"mode"}
 

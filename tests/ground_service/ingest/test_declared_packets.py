@@ -37,6 +37,7 @@ from lunar.timescales import parse_utc
 from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.crc import crc16
+from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
 from tmtc.packets import pack_packet
 
@@ -465,15 +466,18 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(
     ground: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
     enter(ground, tmp_path / "m")
-    ingest_file(ground, downlink(tmp_path, [*payload_packets(synthetic_pass), *bus_packets(20)]))
+    packets = payload_packets(synthetic_pass)
+    (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
+    packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
+    ingest_file(ground, downlink(tmp_path, [*packets, *bus_packets(20)]))
     pass_id = define(ground, 86_400.0)
     records = json.loads(export_packets(ground, pass_id, "Housekeeping", "json"))
     assert [one["utc"][:23] for one in records] == [f"2029-08-07T00:00:{k:02d}.000" for k in range(20)]
     assert {one["MODE"] for one in records} <= {"SAFE", "NOMINAL", "DETUMBLE"}
     lines = export_packets(ground, pass_id, "Event", "csv").decode().splitlines()
     assert lines[0].startswith("utc,packet,VERSION")
-    own = json.loads(export_packets(ground, pass_id, "navigation_state", "json"))
-    assert own and own[0]["packet"] == "navigation_state"
+    own = json.loads(export_packets(ground, pass_id, "event_low", "json"))
+    assert {one["packet"] for one in own} == {"event_low"}
     with pytest.raises(NotFound, match="packet"):
         export_packets(ground, pass_id, "nothing", "csv")
     assert export_packets(ground, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
