@@ -25,8 +25,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import binomtest
-
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = (
     "tmtc",
@@ -242,6 +240,8 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
             for mutant, state in sorted(states.items())
             if state not in KILLED
         ]
+    from scipy.stats import binomtest
+
     killed = len(chosen) - len(survivors)
     low, high = binomtest(killed, len(chosen)).proportion_ci(method="wilson")
     return {

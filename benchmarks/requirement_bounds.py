@@ -15,11 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
 
 def tolerance_bound(values: Sequence[float], at_most: bool, share: float, confidence: float) -> float:
     """Return the bound that a share of the population keeps, with this confidence; NaN for fewer than two values."""
+    from scipy import stats
+
     count = len(values)
     if count < 2:
         return float("nan")

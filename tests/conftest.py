@@ -1,11 +1,15 @@
 """Shared by all tests: where the real data are, and what is skipped without them."""
 
 import os
+import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
+from _pytest.assertion import rewrite
 from hypothesis import settings
+
+from tests.cost import Cost
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
@@ -17,6 +21,43 @@ os.environ.setdefault("LINNA_ALLOW_DATABASE_OWNER", "true")
 # Properties are tried on the same examples everywhere, and a busy machine is no failure.
 settings.register_profile("linna", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("linna")
+
+
+# Libraries that no test needs before it runs: they cost each process seconds and hundreds of megabytes.
+HEAVY = ("torch", "astropy", "scipy.stats", "matplotlib", "onnxscript", "playwright")
+IMPORTED = pytest.StashKey[list[str]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Sum the cost of the tests, and rewrite assertions once, before several processes would each do it."""
+    config.pluginmanager.register(Cost(), "cost")
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        _rewrite_assertions(config)
+
+
+def _rewrite_assertions(config: pytest.Config) -> None:
+    """Write the compiled form of each test module that lacks one, where `pytest` looks for it."""
+    if sys.dont_write_bytecode:
+        return
+    state = config.stash[rewrite.assertstate_key]
+    tests = Path(__file__).parent
+    for path in (*tests.rglob("test_*.py"), *tests.rglob("conftest.py")):
+        folder = rewrite.get_cache_dir(path)
+        compiled = folder / (path.stem + rewrite.PYC_TAIL)
+        if rewrite.try_makedirs(folder) and rewrite._read_pyc(path, compiled) is None:
+            source_hash, code = rewrite._rewrite_test(path, config)
+            rewrite._write_pyc(state, code, source_hash, compiled)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Note which heavy libraries the collection has imported."""
+    session.config.stash[IMPORTED] = [name for name in HEAVY if name in sys.modules]
+
+
+@pytest.fixture(scope="session")
+def imported_while_collecting(pytestconfig: pytest.Config) -> list[str]:
+    """The heavy libraries that were imported before the first test."""
+    return pytestconfig.stash[IMPORTED]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from reports.figures import consistency, navigation
 from reports.figures.canvas import Canvas, TimeScale
 from reports.figures.theme import REFERENCE, color, series_styles
 from reports.render import render_html
 from reports.values import BinScore, NavigationSeries, TrackSeries
+from tests.lazy import Lazy
 from tests.reports import example
 from tests.reports.page import Page
 
@@ -41,9 +42,9 @@ def series(name: str = "anchored", **more: object) -> NavigationSeries:
 TRACK = TrackSeries(TIMES, np.linspace(-10.0, 10.0, N), np.full(N, 300.0), np.linspace(20_000.0, 30_000.0, N))
 
 
-def drawn(draw: Callable[[Canvas], None], height_in: float = 3.6) -> Figure:
+def drawn(draw: Callable[[Canvas], None], height_in: float = 3.6) -> Any:
     """Return the figure that a function draws."""
-    figure = Figure(figsize=(9.0, height_in))
+    figure = Lazy("matplotlib.figure").Figure(figsize=(9.0, height_in))
     draw(Canvas(figure, 9.0, height_in))
     return figure
 

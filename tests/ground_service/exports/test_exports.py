@@ -14,7 +14,6 @@ import pyarrow.parquet
 import pyogrio
 import pytest
 import spiceypy
-from oem import OrbitEphemerisMessage
 from PIL import Image
 
 from ground_service.errors import EvaluationError, FileDamaged, NotFound
@@ -36,6 +35,7 @@ from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import FILTER_ERROR_RTN_M, SPACECRAFT, SPHERICAL_ERROR_RTN_M
 from tests.ground_service.evaluation.still import TurnedOrientation
 from tests.ground_service.exports.conftest import COVARIANCE, FRAMES, RichPass
+from tests.lazy import Lazy
 from tmtc.errors import MissingLibrary
 
 CRAFT = spacecraft_id(SPACECRAFT)
@@ -84,7 +84,7 @@ def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(
     for kind in ("oem", "oem-xml", "spk", "czml"):
         (tmp_path / kind).write_bytes(export(rich_ground, kind, "anchored"))
     for kind in ("oem", "oem-xml"):
-        states = list(OrbitEphemerisMessage.open(tmp_path / kind).states)
+        states = list(Lazy("oem").OrbitEphemerisMessage.open(tmp_path / kind).states)
         found[kind] = 1e3 * np.array([one.position for one in states])
     with spiceypy.KernelPool(str(tmp_path / "spk")):
         ets = [float(et_from_utc_ns(int(one))) for one in utc_ns]

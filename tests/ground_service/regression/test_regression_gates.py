@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
@@ -34,6 +33,9 @@ from ground_service.regression.gates.samples import (
     _estimator,
 )
 from ground_service.regression.gates.sequence import informative_order, is_clear, planned_looks
+from tests.lazy import Lazy
+
+stats = Lazy("scipy.stats")
 
 POLICY = load_policy().policy
 NARROW = read_policy(

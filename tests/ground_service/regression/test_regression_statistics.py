@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from ground_service.regression.gates.statistics import (
     UnitSums,
@@ -16,6 +15,9 @@ from ground_service.regression.gates.statistics import (
     student_upper_tail,
     unit_sums,
 )
+from tests.lazy import Lazy
+
+stats = Lazy("scipy.stats")
 
 
 def test_holm_steps_down_as_in_the_textbook_example() -> None:

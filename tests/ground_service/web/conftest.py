@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -28,6 +28,10 @@ from ground_service.web import displays
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import format_oem
 from lunar.timescales import parse_utc
+from tests.lazy import Lazy, expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, BrowserContext, Page
 
 CHROMIUM = "/usr/bin/chromium"
 OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
@@ -270,16 +274,12 @@ class Pictures:
         picture.quantize(256).save(self.folder / f"{name}.png", optimize=True)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def patience() -> None:
-    """Wait long for what pages show: a state that is reached ends the wait, and the machine may be busy."""
-    expect.set_options(timeout=PATIENCE_S * 1e3)
-
-
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """The system's Chromium, without a screen."""
-    with sync_playwright() as playwright:
+    """The system's Chromium, without a screen; a state that is reached ends the wait for it."""
+    sync_api = Lazy("playwright.sync_api")
+    sync_api.expect.set_options(timeout=PATIENCE_S * 1e3)
+    with sync_api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield chromium
         chromium.close()

@@ -1,11 +1,11 @@
 """Pages of administrators: users with their tokens, and the status of the service."""
 
 import pytest
-from playwright.sync_api import expect
 
 from ground_service.access.service import add_user, list_tokens, list_users
 from ground_service.ground import open_ground
 from tests.ground_service.web.conftest import patient
+from tests.lazy import expect
 from tests.serving import token_valid
 
 

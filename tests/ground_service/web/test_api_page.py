@@ -1,10 +1,9 @@
 """The API page in Chromium: operations are shown and called under the content security policy."""
 
-from playwright.sync_api import expect
-
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from tests.ground_service.web.conftest import strict_page
+from tests.lazy import expect
 
 
 def test_the_api_page_shows_and_calls_operations_without_console_errors(page):

@@ -4,7 +4,6 @@ import re
 from urllib.parse import quote_plus
 
 import pytest
-from playwright.sync_api import expect
 
 from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
@@ -12,6 +11,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from tests.ground_service.web.conftest import strict_page
 from tests.ground_service.web.test_in_browser import answered, colour_of, settled
+from tests.lazy import expect
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,6 @@ import urllib.request
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import TimeoutError as TimedOut
-from playwright.sync_api import expect
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
@@ -21,6 +19,7 @@ from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.web.conftest import Pictures, patient, press, strict_page, wait_until
+from tests.lazy import Lazy, expect
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -289,7 +288,7 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser, 
             try:
                 tag.wait_for(timeout=10_000)
                 break
-            except TimedOut:
+            except Lazy("playwright.sync_api").TimeoutError:
                 continue
         tag.hover()
         other.get_by_label("Remove tag Anomaly").click()

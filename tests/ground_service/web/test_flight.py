@@ -11,11 +11,10 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect
 
 from ground_service.ground import open_ground
 from ground_service.missions.ephemerides.service import add_ephemeris
@@ -32,8 +31,12 @@ from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import build_world
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page, wait_until
+from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tmtc.dictionary import DICTIONARY
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator, Page
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T01:40:00Z")

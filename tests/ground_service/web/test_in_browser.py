@@ -4,11 +4,10 @@ import re
 import time
 import zipfile
 
-from playwright.sync_api import expect
-
 from ground_service.regression.archives import pack_archive
 from tests.ground_service.regression.test_regressions import with_detections
 from tests.ground_service.web.conftest import press, shows, wait_until
+from tests.lazy import expect
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from playwright.sync_api import Page, expect
+from typing import TYPE_CHECKING
 
 from tests.ground_service.web.conftest import wait_until
 from tests.ground_service.web.test_in_browser import answered, camera_fault, housekeeping, receive, settled
+from tests.lazy import expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 SPACECRAFT = 78
 """Not that of other tests of this service."""

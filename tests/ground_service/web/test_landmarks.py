@@ -4,8 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.evaluation.landmarks.model import LandmarkFilter
@@ -18,6 +16,7 @@ from tests.ground_service.conftest import write_manifest
 from tests.ground_service.web.conftest import COUNT_REQUESTS, patient, press, shows
 from tests.ground_service.web.test_in_browser import answered
 from tests.ground_service.web.test_sign_in import sign_in
+from tests.lazy import Lazy, expect
 
 FRAMES = 12
 
@@ -66,7 +65,7 @@ def review(browser, searched):
 
 def serious(page):
     """Serious barriers of a page."""
-    found = Axe().run(page).response["violations"]
+    found = Lazy("axe_playwright_python.sync_playwright").Axe().run(page).response["violations"]
     return [
         (one["id"], [node["html"][:120] for node in one["nodes"]][:3])
         for one in found

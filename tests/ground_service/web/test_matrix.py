@@ -10,12 +10,10 @@ import os
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 from ground_service.access.service import add_user
 from ground_service.client import Client
@@ -35,6 +33,10 @@ from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rew
 from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient, wait_until
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
+from tests.lazy import Lazy, expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, BrowserContext, Page
 
 Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
@@ -245,7 +247,7 @@ def barriers(page: Page) -> list[str]:
     """Return the serious and critical findings of axe."""
     return [
         f"{one['id']} {[node['html'][:100] for node in one['nodes'][:2]]}"
-        for one in Axe().run(page).response["violations"]
+        for one in Lazy("axe_playwright_python.sync_playwright").Axe().run(page).response["violations"]
         if one["impact"] in ("serious", "critical")
     ]
 

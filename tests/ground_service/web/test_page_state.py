@@ -4,7 +4,6 @@ import csv
 import re
 
 import pytest
-from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
@@ -27,6 +26,7 @@ from tests.ground_service.web.conftest import (
     wait_until,
 )
 from tests.ground_service.web.test_in_browser import answered, camera_fault, receive, settled
+from tests.lazy import expect
 from tmtc.downlink import encode_cadus
 
 PATHS_OF_VIEWERS = [

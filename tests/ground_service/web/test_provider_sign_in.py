@@ -3,10 +3,10 @@
 import re
 
 import pytest
-from playwright.sync_api import expect
 
 from tests.ground_service.access.openid import CLIENT, SECRET, running_provider
 from tests.ground_service.web.conftest import patient
+from tests.lazy import expect
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
@@ -29,10 +28,14 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page, wait_until
+from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 NS = 1_000_000_000
 SPACECRAFT = 76

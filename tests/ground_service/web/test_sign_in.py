@@ -1,11 +1,11 @@
 """Pages of a service that has users."""
 
 import pytest
-from playwright.sync_api import expect
 
 from ground_service.access.service import add_user
 from ground_service.ground import open_ground
 from tests.ground_service.web.conftest import patient
+from tests.lazy import expect
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import pymap3d
 import pytest
 
 from lunar.ephemeris import Ephemeris, EphemerisSegment
@@ -14,6 +13,7 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.sim.board.contact_plan import parse_outage, plan_contacts
 from payload_emulator.sim.board.link import STATIONS, LinkSection
+from tests.lazy import Lazy
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T00:00:00Z")
@@ -46,7 +46,7 @@ def elevation_deg(ephemeris: Ephemeris, utc_ns: int, station: str) -> float:
     cosine, sine = np.cos(sidereal), np.sin(sidereal)
     x, y, z = from_earth
     latitude, longitude, height = STATIONS[station]
-    _, elevation, _ = pymap3d.ecef2aer(
+    _, elevation, _ = Lazy("pymap3d").ecef2aer(
         cosine * x + sine * y, cosine * y - sine * x, z, latitude, longitude, height
     )
     return float(elevation)

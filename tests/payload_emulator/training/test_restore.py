@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
-import torch
 
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detector import OnnxDetector, decode
 from payload_emulator.training.model.export import keep_blocked, onnx_model
-from payload_emulator.training.model.model import CraterNet, ExportedCraterNet, ModelConfig, parse_config
-from payload_emulator.training.model.restore import count_statistics, enlarging, network_from_onnx
+from tests.lazy import Lazy
+
+torch = Lazy("torch")
+networks = Lazy("payload_emulator.training.model.model")
+restoring = Lazy("payload_emulator.training.model.restore")
 
 
 class Crops:
@@ -34,7 +36,7 @@ def outputs(network, image):
 
 
 def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None:
-    network, document = network_from_onnx(shipped)
+    network, document = restoring.network_from_onnx(shipped)
     image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = outputs(network, image)
     expected = OnnxDetector(shipped.read_bytes()).run_network(image)
@@ -45,11 +47,11 @@ def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None
 
 
 def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) -> None:
-    network, _ = network_from_onnx(shipped)
-    average, _ = network_from_onnx(shipped)
+    network, _ = restoring.network_from_onnx(shipped)
+    average, _ = restoring.network_from_onnx(shipped)
     image = Crops().batch(1, 16)["image"]
     before = outputs(network, image)
-    count_statistics(network, Crops(), average, crops=32)
+    restoring.count_statistics(network, Crops(), average, crops=32)
     after = outputs(network, image)
     np.testing.assert_allclose(after[0], before[0], atol=2e-4)
     np.testing.assert_allclose(after[1], before[1], atol=2e-3)
@@ -67,18 +69,18 @@ def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) 
 
 def test_what_is_no_exported_network_is_refused(tmp_path) -> None:
     with pytest.raises(ModelError, match="expected an exported network, found no file"):
-        network_from_onnx(tmp_path / "none.onnx")
+        restoring.network_from_onnx(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(ModelError, match="expected an exported network"):
-        network_from_onnx(tmp_path / "text.onnx")
+        restoring.network_from_onnx(tmp_path / "text.onnx")
 
 
 def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
-    network = CraterNet(ModelConfig(16, depth=True, enlarge=2)).eval()
+    network = networks.CraterNet(networks.ModelConfig(16, depth=True, enlarge=2)).eval()
     assert network.config.cell_px == 2
     import onnx
 
-    model = keep_blocked(onnx_model(ExportedCraterNet(network).eval()))
+    model = keep_blocked(onnx_model(networks.ExportedCraterNet(network).eval()))
     detector = OnnxDetector(model.SerializeToString())
     assert onnx.checker.check_model(model) is None
     assert detector.stride_px == 2
@@ -87,15 +89,17 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
     assert heat.shape == (1, 1, 256, 256) and geometry.shape == (1, 5, 256, 256)
     np.testing.assert_allclose(heat, outputs(network, image)[0], atol=2e-4)
     with pytest.raises(ModelError, match="expected a divisor of the stride 4, found 3"):
-        ModelConfig(enlarge=3)
+        networks.ModelConfig(enlarge=3)
 
 
 def test_older_networks_name_the_only_backbone_and_stride() -> None:
-    assert parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == ModelConfig(enlarge=2)
+    assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(
+        enlarge=2
+    )
     with pytest.raises(ModelError, match="expected backbone small, found 'large'"):
-        parse_config({"backbone": "large"})
+        networks.parse_config({"backbone": "large"})
     with pytest.raises(ModelError, match="expected stride_px 4, found 2"):
-        parse_config({"stride_px": 2})
+        networks.parse_config({"stride_px": 2})
 
 
 def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
@@ -107,12 +111,12 @@ def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
 
 
 def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped) -> None:
-    network, _ = network_from_onnx(shipped)
+    network, _ = restoring.network_from_onnx(shipped)
     image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
     large = torch.nn.functional.interpolate(
         torch.from_numpy(image), scale_factor=2.0, mode="bilinear", align_corners=False
     ).numpy()
-    heat, geometry = outputs(enlarging(network, 2), image)
+    heat, geometry = outputs(restoring.enlarging(network, 2), image)
     expected_heat, expected = outputs(network, large)
     np.testing.assert_allclose(heat, expected_heat, atol=1e-5)
     np.testing.assert_allclose(geometry[:, 2], expected[:, 2] - np.log(2.0), atol=1e-4)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,8 +26,10 @@ from payload_emulator.training.evaluate.evaluate import detect_with_network
 from payload_emulator.training.evaluate.scoring import tally
 from payload_emulator.training.model import train as training
 from payload_emulator.training.model.export import load_network
-from payload_emulator.training.model.restore import read_checkpoint
 from payload_emulator.training.model.train import train
+from tests.lazy import Lazy
+
+torch = Lazy("torch")
 
 SHORT = TrainParameters(
     minutes=0.0,
@@ -186,7 +187,7 @@ def test_changed_octets_of_a_checkpoint_are_read_or_a_model_error(tmp_path_facto
                 octets[at % len(octets)] = value
             written.writestr(name, bytes(octets))
     with contextlib.suppress(ModelError):
-        read_checkpoint(changed)
+        Lazy("payload_emulator.training.model.restore").read_checkpoint(changed)
 
 
 def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dataset, tmp_path):

@@ -1,0 +1,93 @@
+"""Processor time of the tests by folder, in turns of a calibration loop, compared with the table `cost.csv`.
+
+A turn is the same work on any machine. The processor time includes that of child processes which have ended.
+`python -m tests.cost` compares the last complete run with the table; `--write` makes the table.
+"""
+
+import csv
+import os
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+TABLE = Path(__file__).with_name("cost.csv")
+MEASURED = Path(__file__).parents[1] / "build" / "test-cost.csv"
+MARGIN = 1.2
+SMALLEST_TURNS = 20  # folders below this are noise
+
+
+def processor_s() -> float:
+    """Return the processor time of this process and its ended children, s."""
+    return sum(os.times()[:4])
+
+
+def turn_s() -> float:
+    """Return the processor time of one turn of the calibration loop, s: the fastest of five."""
+    spent = []
+    for _ in range(5):
+        start = time.process_time()
+        sum(number * number % 7 for number in range(500_000))
+        spent.append(time.process_time() - start)
+    return min(spent)
+
+
+class Cost:
+    """Sums of the processor time of the tests, by file."""
+
+    def __init__(self) -> None:
+        self.last_s, self.files = processor_s(), Counter[str]()
+
+    def pytest_collection_finish(self) -> None:
+        self.last_s = processor_s()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self, item: pytest.Item):
+        report, now = (yield), processor_s()
+        report.processor_s, self.last_s = now - self.last_s, now
+        return report
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.files[report.nodeid.partition("::")[0]] += getattr(report, "processor_s", 0.0)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        turn = turn_s()
+        folders = Counter[str]()
+        for name, spent in self.files.items():
+            folders[str(Path(name).parent)] += spent
+        terminalreporter.section("processor time of the tests")
+        for title, costs in (("folder", folders.most_common()), ("file", self.files.most_common(20))):
+            for name, spent in costs:
+                terminalreporter.write_line(f"{spent:8.1f} s {spent / turn:8.0f} turns  {title} {name}")
+        MEASURED.parent.mkdir(exist_ok=True)
+        write(MEASURED, {name: spent / turn for name, spent in folders.items()})
+
+
+def write(path: Path, turns: dict[str, float]) -> None:
+    """Write a table of turns by folder."""
+    with path.open("w", newline="") as out:
+        csv.writer(out, lineterminator="\n").writerows(sorted((name, round(n)) for name, n in turns.items()))
+
+
+def read(path: Path) -> dict[str, float]:
+    """Read a table of turns by folder."""
+    with path.open(newline="") as lines:
+        return {name: float(turns) for name, turns in csv.reader(lines)}
+
+
+def grown(table: dict[str, float], measured: dict[str, float]) -> list[str]:
+    """Return a line for each folder that costs more than the table allows."""
+    limits = {name: max(MARGIN * table.get(name, 0.0), SMALLEST_TURNS) for name in measured}
+    return [
+        f"{name}: {turns:.0f} turns, limit {limits[name]:.0f}"
+        for name, turns in sorted(measured.items())
+        if turns > limits[name]
+    ]
+
+
+if __name__ == "__main__":
+    if "--write" in sys.argv:
+        write(TABLE, read(MEASURED))
+    sys.exit("\n".join(grown(read(TABLE), read(MEASURED))) or 0)
