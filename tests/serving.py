@@ -25,11 +25,12 @@ with warnings.catch_warnings():
     from starlette.testclient import WebSocketDenialResponse as WebSocketDenialResponse
 
 
-def wait_for(reached: Callable[[], Any], what: str, seconds: float = 60.0) -> None:
-    """Wait until a condition holds; fail if it never does."""
-    until = time.monotonic() + seconds
+def wait_for(reached: Callable[[], Any], what: str) -> None:
+    """Wait until a condition holds, on a loaded machine as well: only the limit of the suite ends the wait.
+
+    `what` is among the values that the failure shows.
+    """
     while not reached():
-        assert time.monotonic() < until, f"{what}: not reached within {seconds} s"
         time.sleep(0.01)
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -110,8 +111,30 @@ def environment(home: Path) -> dict[str, str]:
     }
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
+def command_lines(text: str) -> list[list[str]]:
+    """Return the words of each `linna` command of a shell script, without redirections and pipes."""
+    lines = []
+    for line in text.replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:1] == ["linna"]:
+            ends = [k for k, word in enumerate(words) if re.match(r"\d?>|[|&;]", word)]
+            lines.append(words[1 : min(ends, default=len(words))])
+    return lines
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name: str) -> None:
+    marks = [
+        m for m in MARK.finditer((DOCS / "tutorials" / name).read_text()) if m["kind"] in ("run", "tour")
+    ]
+    commands = [words for mark in marks for words in command_lines(mark["text"])]
+    assert commands
+    for words in commands:
+        command_parser(GROUPS, words[0]).parse_args(words)
+
+
+# `test_packaging` runs the first tutorial, the tour of the README.
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", [name for name in TUTORIALS if name != "first-pass.md"])
 def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) -> None:
     script, expected = ["set -e", "trap 'kill $(jobs -p) || true' EXIT"], list[str]()
@@ -142,8 +165,7 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
         assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", told[0])
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.campaign
 def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> None:
     (workflow,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "ci.md").read_text(), re.DOTALL)
     steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["gates"]["steps"]]

@@ -67,7 +67,6 @@ def images_of(octets: bytes) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
     whole: tuple[Path, Figures],
 ) -> None:
@@ -103,7 +102,6 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_a_window_of_the_run_has_the_images_and_detections_of_an_archive(
     whole: tuple[Path, Figures], tmp_path: Path
 ) -> None:
@@ -149,7 +147,6 @@ def assert_same_figures(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(1800)
 def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(tmp_path: Path) -> None:
     other = commanded_scenario("other", "[clock]\noffset_s = -2.0\n").replace(
         "[orbit]", "[orbit]\nraan_deg = 40.0"
@@ -168,7 +165,6 @@ def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(t
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(900)
 def test_time_that_does_not_wait_gives_reports_too(tmp_path: Path) -> None:
     terms = replace(TERMS, days=0.25, factor=300.0)
     scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
@@ -397,8 +393,7 @@ def test_a_restored_checkpoint_has_archive_spacecraft_and_progress_of_one_moment
     assert Checkpoints(tmp_path / "other", home, snapshot).restore() is None and not home.exists()
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.campaign
 def test_a_stopped_run_continues_and_ends_with_the_same_figures(
     whole: tuple[Path, Figures], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

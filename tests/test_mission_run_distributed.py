@@ -6,7 +6,6 @@ import json
 import socket
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,7 +51,6 @@ def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(900)
 def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LINNA_DATA", raising=False)
     scenario, data = parse_scenario(SCENARIO), DataFolder(None)
@@ -80,7 +78,6 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
     assert not Path((folder / "postgres-folder").read_text()).exists()
 
 
-@pytest.mark.timeout(60)
 def test_a_kill_waits_for_the_process_that_it_kills_and_for_no_later_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,10 +190,8 @@ def test_a_part_that_ends_while_the_spacecraft_is_down_is_started_again(tmp_path
         assert not keeper.wait()  # the spacecraft is down
         first = part.pid
         part.kill()
-        until = time.monotonic() + 60.0
         while part.pid == first:
             keeper.check()
-            assert time.monotonic() < until
         assert runs(part.pid)
         keeper.recovered()
         keeper.stop()

@@ -183,7 +183,6 @@ filter_degree = 8
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
     """The tour of the README on a short pass; the service answers on a free port."""
     tour = re.findall(
@@ -202,7 +201,7 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, 
         command(tour[1], "--port", str(port)), cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL
     )
     try:
-        wait_for(lambda: server.poll() is not None or answers(port), "an answer of the service", 120.0)
+        wait_for(lambda: server.poll() is not None or answers(port), "an answer of the service")
         assert server.poll() is None
     finally:
         server.terminate()

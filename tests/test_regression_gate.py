@@ -20,7 +20,6 @@ from tests.payload_emulator.test_replay import SCENARIO
 
 FRAMES = 8
 
-pytestmark = pytest.mark.timeout(1200)
 """A confined build compiles its kernels in every run, since nothing that it writes is kept."""
 
 

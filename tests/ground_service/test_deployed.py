@@ -170,9 +170,9 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
                 overlay.stop()
                 assert answer(k).status_code == overlay.meanwhile
                 overlay.start()
-            wait_for(lambda k=k: accepted(k), f"piece {k}", 120.0)
+            wait_for(lambda k=k: accepted(k), f"piece {k}")
         for job in jobs:
-            wait_for(lambda job=job: proxy.get(f"/api/v1/jobs/{job}").json()["state"] == "done", job, 120.0)
+            wait_for(lambda job=job: proxy.get(f"/api/v1/jobs/{job}").json()["state"] == "done", job)
     assert not [name for name, part in service.parts.items() if part.has_ended]
     # Both API processes answer the same, also for what a provider needs.
     found, signed = [], set()
@@ -186,7 +186,6 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     "kind", ["base", *(pytest.param(one, marks=pytest.mark.campaign) for one in ("objects", "provider"))]
 )

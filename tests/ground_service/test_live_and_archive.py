@@ -40,7 +40,7 @@ NS = 1_000_000_000
 START = parse_utc("2029-08-07T01:40:00Z")
 FIRST, LAST = START + 180 * NS, START + 600 * NS
 UNTIL = START + 1400 * NS
-PATIENCE_S = 120.0
+PATIENCE_S = 900.0
 
 OF_THE_IMPORT = {
     "pass_id": "number of the row",

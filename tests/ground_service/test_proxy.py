@@ -112,7 +112,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
 
     try:
         with made.running(configuration):
-            wait_for(answers, "the service behind the proxy", 120.0)
+            wait_for(answers, "the service behind the proxy")
             yield made
     finally:
         service.terminate()

@@ -83,8 +83,8 @@ def flown(session: LiveSession, orders: Callable[[LiveSession], bytes] = lambda 
             socket.create_connection(
                 ("127.0.0.1", session.ports["telemetry earth"]), timeout=60.0
             ) as telemetry,
-            socket.create_connection(("127.0.0.1", session.ports["telecommand earth"]), timeout=60.0) as up,
-            socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=60.0) as console,
+            socket.create_connection(("127.0.0.1", session.ports["telecommand earth"]), timeout=900.0) as up,
+            socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=900.0) as console,
         ):
             octets = orders(session)
             up.sendall(octets)

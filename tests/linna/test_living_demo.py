@@ -49,7 +49,6 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)
 def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path: Path) -> None:
     port, log = free_port(), tmp_path / "log"
     words = ["demo", "--live", "--out", tmp_path / "demo", "--port", port, "--rate", 240]

@@ -74,7 +74,7 @@ class Ground:
             thread.start()
 
     def _connect(self, name: str) -> socket.socket:
-        connection = socket.create_connection(("127.0.0.1", self.session.ports[name]), timeout=60)
+        connection = socket.create_connection(("127.0.0.1", self.session.ports[name]), timeout=900.0)
         return connection
 
     def _receive(self) -> None:
@@ -337,7 +337,7 @@ def test_a_console_that_connects_after_the_end_is_told_of_it(tmp_path: Path) -> 
     session = opened(scenario(), holds=True, stop_utc_ns=EPOCH, state_file=state)
     with running(session) as thread:
         wait_for(lambda: session._held, "the end of the session")
-        with socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=60.0) as console:
+        with socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=900.0) as console:
             assert json.loads(console.makefile("r").readline())["kind"] == "finished"
             console.sendall(b"run\n")
             thread.join(60)

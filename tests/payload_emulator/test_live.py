@@ -59,9 +59,9 @@ class Watcher:
     """A client of the live payload."""
 
     def __init__(self, live: LiveSession) -> None:
-        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=20.0)
-        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=20.0)
-        self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=20.0)
+        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=900.0)
+        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0)
+        self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=900.0)
         self.lines = self.console.makefile("r")
         self.say("watch")
 
@@ -265,7 +265,7 @@ def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_paylo
     held = []
     for k in range(300):
         for name in ("telemetry earth", "telecommand earth", "console"):
-            connection = socket.create_connection(("127.0.0.1", live.ports[name]), timeout=20.0)
+            connection = socket.create_connection(("127.0.0.1", live.ports[name]), timeout=900.0)
             if name == "console":
                 # The answer to an unknown word meets a connection that is gone already.
                 connection.sendall(b"unknown\n" * 3 + b"half a wo")
@@ -313,7 +313,7 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody() -> None
     received: list[tuple[int, bytes]] = []
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: received.append((number, octets)))
     selector = served(server)
-    slow, quick = (socket.create_connection(("127.0.0.1", server.port), timeout=20.0) for _ in range(2))
+    slow, quick = (socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(2))
     while len(server.clients) < 2:
         turn(selector)
     chunk, octets = bytes(range(256)) * 1024, b""
@@ -348,7 +348,7 @@ def test_words_of_a_client_that_left_without_reading_are_received(
     received: list[bytes] = []
     server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))
     selector = served(server)
-    client = socket.create_connection(("127.0.0.1", server.port), timeout=20.0)
+    client = socket.create_connection(("127.0.0.1", server.port), timeout=900.0)
     while not server.clients:
         turn(selector)
     server.send(b"snapshot that nobody reads\n")
@@ -369,7 +369,7 @@ def test_no_more_connections_are_held_than_the_limit() -> None:
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: None)
     selector = served(server)
     clients = [
-        socket.create_connection(("127.0.0.1", server.port), timeout=20.0) for _ in range(CLIENT_LIMIT + 3)
+        socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(CLIENT_LIMIT + 3)
     ]
     while server._accepted < CLIENT_LIMIT:
         turn(selector)

@@ -270,7 +270,7 @@ def test_a_value_that_is_no_report_is_refused_by_name() -> None:
         render_html({"title": "not a report"})
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_day_of_passes_stays_under_eight_megabytes() -> None:
     report = example.pass_report(hours=24.0)
     assert sum(len(s.utc_ns) for s in report.navigation if s.kind == "estimate") == 3 * 5_760

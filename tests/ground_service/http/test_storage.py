@@ -80,7 +80,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
         client.get(f"{V1}/ingests/1").json()["state"] == "queued"
     )  # nothing of a small piece is stored before all of it
     client.app.state.dispatcher.resume()  # the thread of the recurring work may have resumed it already
-    wait_for(lambda: client.get(f"{V1}/jobs/{job}").json()["state"] == "done", "the ingest", 60.0)
+    wait_for(lambda: client.get(f"{V1}/jobs/{job}").json()["state"] == "done", "the ingest")
     with ground.database.reading() as connection:
         found = archive_hash(connection, 1)
         packets = repository.newest(connection, repository.PACKETS, Paging(limit=1))[1]

@@ -53,6 +53,7 @@ def downlink(make_pass: Callable[..., Any]) -> Path:
     return Path(make_pass(frames=30, seed=4).folder) / "downlink.cadu"
 
 
+@pytest.mark.campaign
 def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path, tmp_path: Path) -> None:
     """The stream is stored in about ten transactions; the process is killed outright at random moments among them."""
     with open_ground(tmp_path / "whole") as ground:

@@ -383,7 +383,7 @@ def test_archives_of_one_regression_are_rendered_at_the_same_time(
     ground: Ground, make_flyable: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     digests = [keep_archive(ground, make_flyable(frames=4, seed=seed).folder).digest for seed in (1, 2)]
-    both, settle = threading.Barrier(2, timeout=20.0), service.settle_archive
+    both, settle = threading.Barrier(2, timeout=900.0), service.settle_archive
 
     def rendered(ground: Ground, digest: str) -> KeptArchive:
         both.wait()  # broken if the second archive waits for the first one

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,14 +29,14 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import format_oem
 from lunar.timescales import parse_utc
 from tests.lazy import Lazy, expect
+from tests.serving import wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
 
 CHROMIUM = "/usr/bin/chromium"
 OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
-START_S = 180.0
-PATIENCE_S = 180.0
+PATIENCE_S = 900.0
 NS = 1_000_000_000
 # Counts the requests of a page's scripts until their answers are read, and notes what was refused.
 COUNT_REQUESTS = """
@@ -68,14 +68,6 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-
-
-def wait_until(reached: Callable[[], bool], otherwise: str) -> None:
-    """Wait for a state, with patience."""
-    until = time.monotonic() + PATIENCE_S
-    while not reached():
-        assert time.monotonic() < until, otherwise
-        time.sleep(0.02)
 
 
 def press(page: Page, name: str) -> None:
@@ -121,7 +113,7 @@ class Console:
 
     def say(self, message: dict[str, object]) -> None:
         """One message to everyone connected, of whom there is at least one in time."""
-        wait_until(lambda: bool(self._clients), "nobody has connected to the console")
+        wait_for(lambda: bool(self._clients), "nobody has connected to the console")
         for client in list(self._clients):
             with suppress(OSError):  # one that has just hung up
                 client.sendall(json.dumps(message).encode() + b"\n")
@@ -199,8 +191,7 @@ class Service:
             raise
 
     def _wait_for_address(self, log: Path) -> str:
-        until = time.monotonic() + START_S
-        while time.monotonic() < until:
+        while True:
             text = log.read_text(errors="replace")
             if "startup complete" in text:
                 return text.split("ground service on ", 1)[1].split()[0].rstrip("/")

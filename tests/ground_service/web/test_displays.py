@@ -18,8 +18,9 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.web import displays
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.web.conftest import Pictures, patient, press, strict_page, wait_until
+from tests.ground_service.web.conftest import Pictures, patient, press, strict_page
 from tests.lazy import Lazy, expect
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -161,7 +162,7 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     mct.get_by_label("Select fault: camera fault").check()
     mct.get_by_role("button", name="Shelve").click()
     mct.get_by_label("Save", exact=True).click()
-    wait_until(lambda: alarm_states(shown.url)["camera_fault"] == "shelved", "the alarm is not shelved")
+    wait_for(lambda: alarm_states(shown.url)["camera_fault"] == "shelved", "the alarm is not shelved")
     assert alarm_states(shown.url) == {"temperature_c": "acknowledged", "camera_fault": "shelved"}
     listed = mct.locator(".c-fault-mgmt__list").filter(has=mct.get_by_label("Select fault: temperature"))
     current = listed.get_by_label("Live Value")
@@ -194,7 +195,7 @@ def test_a_notebook_keeps_entries_with_their_author_for_other_browsers(mct, show
     mct.locator(".c-notebook__drag-area").click()
     mct.get_by_label("Notebook Entry Input").last.fill("The camera fault began after the slew.")
     mct.locator(".c-ne__save-button > button").click()
-    wait_until(lambda: "after the slew" in str(stored_notebook(shown.url)), "the entry is not stored")
+    wait_for(lambda: "after the slew" in str(stored_notebook(shown.url)), "the entry is not stored")
     notebook = stored_notebook(shown.url)
     name = json.loads(ask(f"{shown.url}/api/v1/session")[1])["name"]
     assert notebook["created_by"] == name and notebook["document"]["createdBy"] == name
@@ -260,7 +261,7 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser, 
     mct.locator(".js-add-tag-button").click()
     mct.get_by_placeholder("Type to select tag").click()
     mct.locator(".js-tag-option", has_text="Anomaly").click()
-    wait_until(lambda: stored_annotations(shown.url), "the annotation is not stored")
+    wait_for(lambda: stored_annotations(shown.url), "the annotation is not stored")
     (kept,) = stored_annotations(shown.url)
     name = json.loads(ask(f"{shown.url}/api/v1/session")[1])["name"]
     assert (kept["created_by"], kept["document"]["createdBy"]) == (name, name)
@@ -275,9 +276,7 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser, 
         for scheme in ("dark", "light"):
             other.emulate_media(color_scheme=scheme)
             again = open_plot(other, shown.url)
-            wait_until(
-                lambda plot=again: marked(plot) > 1200, f"the marks are not drawn in the {scheme} theme"
-            )
+            wait_for(lambda plot=again: marked(plot) > 1200, f"the marks are not drawn in the {scheme} theme")
         Pictures(tmp_path, documented=False).take(other, "displays-annotation")
         box = again.bounding_box()
         other.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"], steps=5)
@@ -292,7 +291,7 @@ def test_a_range_of_a_plot_is_annotated_for_other_browsers(mct, shown, browser, 
                 continue
         tag.hover()
         other.get_by_label("Remove tag Anomaly").click()
-        wait_until(lambda: stored_annotations(shown.url)[0]["document"]["_deleted"], "it is not removed")
+        wait_for(lambda: stored_annotations(shown.url)[0]["document"]["_deleted"], "it is not removed")
     finally:
         other.context.close()
 

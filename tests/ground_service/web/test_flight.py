@@ -30,9 +30,10 @@ from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import build_world
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 
 if TYPE_CHECKING:
@@ -142,12 +143,12 @@ def flown(
             ]
             station.sendall(b"".join(sent))
             octets = sum(len(one) for one in sent)
-            wait_until(
+            wait_for(
                 lambda: sum(len(one) for _, one in payload._uplinked) == octets,
                 "no telecommands have arrived",
             )
             clients = payload.stations["earth"].telemetry.clients
-            wait_until(lambda: bool(clients), "the link is not connected")
+            wait_for(lambda: bool(clients), "the link is not connected")
             found = Flown(service.url, layout, live)
             follow(found)
             yield found
@@ -181,7 +182,7 @@ def follow(flown: Flown) -> None:
     expect(flown.layout.get_by_text("Live feed connected")).to_be_visible()
     flown.live.get_by_role("button", name="Run").click()
     expect(lad_row(flown.layout, "mode")).to_be_visible()
-    wait_until(lambda: flown.newest().get("frames_processed") == FRAMES, "not all frames were received")
+    wait_for(lambda: flown.newest().get("frames_processed") == FRAMES, "not all frames were received")
 
 
 def lad_row(page: Page, name: str) -> Locator:
@@ -216,14 +217,14 @@ def opened(flown: Flown, browser: Browser) -> Iterator[Page]:
 
 def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Path) -> None:
     page = flown.layout
-    wait_until(
+    wait_for(
         lambda: f"{flown.newest()['packets_sent']:.0f}" in lad_row(page, "packets sent").inner_text(),
         "the newest number of packets is not shown",
     )
     expect(page.locator(PLOT)).to_have_count(2 * 3)  # of each plot, one for the lines and one for highlights
     all_events_are_shown(page, flown)
     # The value is within its limits again; the alarm is kept until somebody acknowledges it.
-    wait_until(lambda: not flown.alarm("temperature_c")["active"], "the condition of the alarm has not ended")
+    wait_for(lambda: not flown.alarm("temperature_c")["active"], "the condition of the alarm has not ended")
     fault = fault_named(page, "temperature")
     value = fault.get_by_label("Live Value")
     expect(value).to_contain_text("°C")
@@ -245,7 +246,7 @@ def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Pat
     expect(activity(page, "morning, approved")).to_be_visible()
     expect(page.get_by_text("Contacts, madrid").first).to_be_visible()
     # The plot has the peak, which may have come together with later packets.
-    wait_until(lambda: highest_tick(page) >= 60.0, "the peak of the temperature is not shown")
+    wait_for(lambda: highest_tick(page) >= 60.0, "the peak of the temperature is not shown")
     Pictures(tmp_path).take(page, "displays-shift")
 
 
@@ -273,7 +274,7 @@ def fault_named(page: Page, name: str) -> Locator:
 def all_events_are_shown(page: Page, flown: Flown) -> None:
     """Wait until the table has as many events as the service, which may still be receiving the last ones."""
     rows = event_rows(page)
-    wait_until(lambda: rows.count() == flown.events(), "the table does not show each event once")
+    wait_for(lambda: rows.count() == flown.events(), "the table does not show each event once")
 
 
 def event_rows(page: Page) -> Locator:
@@ -343,7 +344,7 @@ def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_pa
 def test_windows_and_contacts_are_a_plan(flown: Flown, opened: Page, tmp_path: Path) -> None:
     span = {"since": "2029-08-07T01:00:00Z", "until": "2029-08-07T03:00:00Z"}
     # The open contact of the link ends without telemetry; until then none is predicted after it.
-    wait_until(lambda: bool(flown.ask("contacts", **span)["contacts"]), "no contact is predicted")
+    wait_for(lambda: bool(flown.ask("contacts", **span)["contacts"]), "no contact is predicted")
     start, stop = (int(parse_utc(one)) // 1_000_000 for one in span.values())
     hours = f"tc.mode=fixed&tc.startBound={start}&tc.endBound={stop}&tc.timeSystem=utc"
     opened.goto(address("plan").replace(SHOWN, f"{hours}&hideInspector=true&hideTree=true"))

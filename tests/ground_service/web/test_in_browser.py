@@ -6,8 +6,9 @@ import zipfile
 
 from ground_service.regression.archives import pack_archive
 from tests.ground_service.regression.test_regressions import with_detections
-from tests.ground_service.web.conftest import press, shows, wait_until
+from tests.ground_service.web.conftest import press, shows
 from tests.lazy import expect
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -40,9 +41,7 @@ def receive(page, packets, spacecraft_id=77):
         headers={"Content-Type": "application/octet-stream"},
     )
     job = answer.json()["job_id"]
-    deadline = time.monotonic() + 60
     while page.request.get(f"/api/v1/jobs/{job}").json()["state"] != "done":
-        assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
@@ -70,7 +69,7 @@ def settled(page, path):
 
 def answered(page):
     """Wait until no script of the page waits for an answer."""
-    wait_until(lambda: page.evaluate("window.underWay === 0"), "requests are not answered")
+    wait_for(lambda: page.evaluate("window.underWay === 0"), "requests are not answered")
 
 
 def test_a_pass_is_exported_with_a_button(page):
@@ -128,10 +127,10 @@ def test_the_grid_of_a_chart_follows_a_change_of_the_colours(page):
     settled(page, "/passes/1")
     answered(page)
     expect(page.locator(".chart canvas").first).to_be_visible()
-    wait_until(lambda: pixels_of(page, light) > 500, "the grid is not drawn")
+    wait_for(lambda: pixels_of(page, light) > 500, "the grid is not drawn")
     assert pixels_of(page, dark) == 0
     page.emulate_media(color_scheme="dark")
-    wait_until(lambda: pixels_of(page, dark) > 500, "the grid has the colour of the light scheme")
+    wait_for(lambda: pixels_of(page, dark) > 500, "the grid has the colour of the light scheme")
     assert pixels_of(page, light) == 0
     page.emulate_media(color_scheme="light")
 
@@ -150,9 +149,7 @@ def test_small_figures_have_a_power_of_ten_and_zero_has_none_and_long_times_have
 
 def test_passes_are_searched_and_show_their_verdict(page):
     job = page.request.post("/api/v1/passes/1/reports").json()["id"]
-    deadline = time.monotonic() + 60
     while page.request.get(f"/api/v1/jobs/{job}").json()["state"] != "done":
-        assert time.monotonic() < deadline
         time.sleep(0.1)
     settled(page, "/passes?search=SYNTHETIC")
     row = page.locator("#passes tbody tr").first
@@ -340,7 +337,7 @@ def test_a_chart_is_zoomed_with_the_keyboard(page):
     chart.focus()
     page.keyboard.press("+")
     expect(page).to_have_url(re.compile("zoom="))
-    wait_until(lambda: chart.screenshot() != before, "the chart has not changed")
+    wait_for(lambda: chart.screenshot() != before, "the chart has not changed")
     page.keyboard.press("0")
 
 
@@ -479,7 +476,7 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
     press(page, "Pause")
     press(page, "Step")
     page.get_by_label("Rate").select_option("60")
-    wait_until(lambda: len(console.heard) >= 3, f"heard no more than {console.heard}")
+    wait_for(lambda: len(console.heard) >= 3, f"heard no more than {console.heard}")
     assert console.heard == ["pause", "step", "rate 60"]
 
 

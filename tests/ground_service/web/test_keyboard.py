@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.ground_service.web.conftest import wait_until
+from tests.ground_service.web.conftest import wait_for
 from tests.ground_service.web.test_in_browser import answered, camera_fault, housekeeping, receive, settled
 from tests.lazy import expect
+from tests.serving import wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -47,7 +48,7 @@ def test_the_focus_stays_on_a_button_when_rows_are_added_above_it(page: Page) ->
     expect(row).to_contain_text("released")
     answered(page)
     # The button is gone, and no other one is under the finger.
-    wait_until(lambda: focused(page) == (first, "row"), "the focus is not in the row")
+    wait_for(lambda: focused(page) == (first, "row"), "the focus is not in the row")
     page.keyboard.press("Shift+Tab")
     assert focused(page) == (second, "Reject")
     page.keyboard.press("Tab")

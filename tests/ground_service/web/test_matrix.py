@@ -30,10 +30,11 @@ from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import SPACECRAFT, START
 from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
-from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient, wait_until
+from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
 from tests.lazy import Lazy, expect
+from tests.serving import wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
@@ -177,7 +178,7 @@ def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
     """Receive a pass over TCP, and leave traces on every page; return the number of the pass."""
     spacecraft.replay(packets)
     spacecraft.report("event_high", event_id=20, frame_number=7)
-    wait_until(lambda: api.list_alarms().total > 0, "no alarm was raised")
+    wait_for(lambda: api.list_alarms().total > 0, "no alarm was raised")
     live = api.define_pass(
         "live pass", format_utc(START - 600 * NS), format_utc(START + 1200 * NS), SPACECRAFT
     ).id

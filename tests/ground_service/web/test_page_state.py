@@ -23,10 +23,10 @@ from tests.ground_service.web.conftest import (
     press,
     shows,
     strict_page,
-    wait_until,
 )
 from tests.ground_service.web.test_in_browser import answered, camera_fault, receive, settled
 from tests.lazy import expect
+from tests.serving import wait_for
 from tmtc.downlink import encode_cadus
 
 PATHS_OF_VIEWERS = [
@@ -145,7 +145,7 @@ def test_the_automation_page_lists_the_rules(page):
 def test_an_archive_without_frames_is_listed_with_its_reason_and_not_chosen(page):
     kept = "/api/v1/regression-archives"
     # The rules keep the archive of the imported pass, which has no images, some time after the start.
-    wait_until(
+    wait_for(
         lambda: 1 in [one["pass_id"] for one in page.request.get(kept).json()], "the archive is not kept"
     )
     settled(page, "/regression")
@@ -360,7 +360,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     page = planner
     bar = page.locator('#timeline [data-window="1"]')
     bar.press("ArrowRight")
-    wait_until(lambda: times(page, 1) == (61.0, 81.0), "not moved")
+    wait_for(lambda: times(page, 1) == (61.0, 81.0), "not moved")
     for key, expected in (
         ("ArrowDown", (61.0, 80.0)),
         ("]", (62.0, 80.0)),
@@ -368,16 +368,16 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     ):
         answered(page)
         bar.press(key)
-        wait_until(lambda expected=expected: times(page, 1) == pytest.approx(expected), key)
+        wait_for(lambda expected=expected: times(page, 1) == pytest.approx(expected), key)
     answered(page)
     page.locator("#selected").get_by_label("Stop, UTC").fill("2030-01-01T01:15:00Z")
     page.locator("#selected").get_by_role("button", name="Change").click()
-    wait_until(lambda: times(page, 1) == (62.0, 75.0), "not changed by the form")
+    wait_for(lambda: times(page, 1) == (62.0, 75.0), "not changed by the form")
     answered(page)
     # In one step, and again while there is none: an update of the page replaces the bar.
     page.evaluate("document.querySelector('#timeline [data-window=\"1\"]').scrollIntoView()")
     boxes = [None]
-    wait_until(lambda: boxes.append(bar.locator("rect").bounding_box()) or boxes[-1] is not None, "no bar")
+    wait_for(lambda: boxes.append(bar.locator("rect").bounding_box()) or boxes[-1] is not None, "no bar")
     box = boxes[-1]
     page.mouse.move(box["x"] + 3, box["y"] + 5)  # the start
     page.mouse.down()
@@ -385,7 +385,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     shown = bar.locator("rect").bounding_box()
     assert shown["width"] == pytest.approx(1.5 * box["width"], rel=0.02)
     page.mouse.up()
-    wait_until(lambda: times(page, 1)[0] < 60.0, "not resized with the pointer")
+    wait_for(lambda: times(page, 1)[0] < 60.0, "not resized with the pointer")
     start, stop = times(page, 1)
     assert stop == 75.0 and start == pytest.approx(62.0 - 13.0 / 2, abs=0.3)
 
@@ -403,7 +403,7 @@ def test_times_being_typed_survive_an_update_of_the_planner(planner):
     expect(field).to_have_value("2030-01-01T01:05:00Z")
     expect(field).to_be_focused()
     field.press("Enter")
-    wait_until(lambda: times(page, 1) == (65.0, 80.0), "not changed by the form")
+    wait_for(lambda: times(page, 1) == (65.0, 80.0), "not changed by the form")
     answered(page)
     expect(field).to_be_focused()
     # A change that another operator made replaces what is shown.

@@ -27,9 +27,10 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page, wait_until
+from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
+from tests.serving import wait_for
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.uplink import UplinkDecoder
@@ -131,7 +132,7 @@ class Spacecraft:
     def report(self, name: str, **values: Any) -> None:
         """Send a packet to the service, which has connected."""
         zeros = {one.name: 0 for one in DICTIONARY.packet(name).fields if one.size == 1}
-        wait_until(lambda: bool(self._listeners), "the service has not connected")
+        wait_for(lambda: bool(self._listeners), "the service has not connected")
         with self._sending:
             self._count += 1
             ticks = int(ticks_from_utc_ns(time.time_ns())) + self._count
@@ -140,7 +141,7 @@ class Spacecraft:
 
     def replay(self, packets: list[bytes]) -> None:
         """Send packets of a recorded pass."""
-        wait_until(lambda: bool(self._listeners), "the service has not connected")
+        wait_for(lambda: bool(self._listeners), "the service has not connected")
         with self._sending:
             self._listeners[-1].sendall(self._encoder.encode(packets))
 

@@ -251,10 +251,8 @@ def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping
         place = f"127.0.0.1:{server.server_address[1]}"
         mail = Channel(email=("a@b.example",), smtp=place)
         channel = Channel(webhook=f"http://{place}/") if handler is Dripping else mail
-        began = time.monotonic()
         with pytest.raises(NotDelivered, match="not delivered in 3 attempts"):
             send(tmp_path, channel, "id", "s", {}, deadline_s=0.3, wait=no_wait)
-        assert time.monotonic() - began < 5.0
         server.shutdown()
 
 
@@ -419,12 +417,12 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
         def kinds(state: str) -> list[str]:
             return [one.kind for one in local.read(list_jobs, JobFilter()).items if one.state == state]
 
-        wait_for(lambda: "notification" in kinds("running"), "the notification", 30.0)
+        wait_for(lambda: "notification" in kinds("running"), "the notification")
         job = dispatcher.submit("plan", {})
-        wait_for(lambda: local.read(get_job, job).state == "done", "another job", 30.0)
+        wait_for(lambda: local.read(get_job, job).state == "done", "another job")
         assert kinds("running") == ["notification"]
         held.set()
-        wait_for(lambda: kinds("running") == [], "the end of the notification", 30.0)
+        wait_for(lambda: kinds("running") == [], "the end of the notification")
         [action] = local.read(list_automation_actions, ActionFilter()).items
         assert (action.state, action.result) == ("done", {"hook": "delivered"})
     finally:

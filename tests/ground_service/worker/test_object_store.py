@@ -81,7 +81,7 @@ def job_of(ground: Ground, key: str) -> dict[str, Any]:
 
 
 def result_of(ground: Ground, key: str) -> dict[str, Any]:
-    wait_for(lambda: job_of(ground, key)["state"] in ("done", "failed"), f"the end of job {key}", 180.0)
+    wait_for(lambda: job_of(ground, key)["state"] in ("done", "failed"), f"the end of job {key}")
     row = job_of(ground, key)
     assert row["state"] == "done", row
     return dict(row["result"])

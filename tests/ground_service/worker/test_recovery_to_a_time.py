@@ -150,7 +150,7 @@ def archive_all(ground: Ground) -> None:
             last = connection.execute(text("SELECT last_archived_wal FROM pg_stat_archiver")).scalar()
         return last is not None and not last.endswith(".backup") and last >= segment
 
-    wait_for(is_archived, f"{segment} in the archive", 120.0)
+    wait_for(is_archived, f"{segment} in the archive")
 
 
 def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
@@ -209,7 +209,7 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
             with ground.database.snapshot() as connection:
                 return not connection.execute(text("SELECT pg_is_in_recovery()")).scalar()
 
-        wait_for(is_recovered, "the end of the recovery", 120.0)
+        wait_for(is_recovered, "the end of the recovery")
         assert [one.name for one in users.list_users(ground)] == ["before", "in-the-backup"]
         with ground.database.snapshot() as connection:
             assert list(audit.broken_entries(connection)) == []

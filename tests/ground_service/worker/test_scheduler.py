@@ -195,7 +195,7 @@ def test_the_command_has_the_lease_until_it_is_stopped(
         assert capsys.readouterr().err == expected
         process = subprocess.Popen([sys.executable, "-m", "linna", "scheduler"])
         try:
-            wait_for(lambda: has_scheduler(ground), "the scheduler", 120.0)
+            wait_for(lambda: has_scheduler(ground), "the scheduler")
             assert cli.run(["scheduler", "--check"]) == 0
             process.terminate()
             assert process.wait(60) == 0
@@ -245,7 +245,7 @@ def test_processes_on_postgresql_have_the_lease_one_after_the_other(
     killed: list[str] = []
     try:
         for _ in range(3):
-            wait_for(lambda: any(owner not in killed for owner, _ in seen()), "the next scheduler", 120.0)
+            wait_for(lambda: any(owner not in killed for owner, _ in seen()), "the next scheduler")
             owner = next(owner for owner, _ in reversed(seen()) if owner not in killed)
             killed.append(owner)
             os.kill(int(owner.split(":")[1]), signal.SIGKILL)

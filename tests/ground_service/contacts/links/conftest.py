@@ -15,7 +15,7 @@ from ground_service.contacts.links.runner import LinkRunner
 from ground_service.ground import Ground
 from ground_service.missions.service import add_mission
 
-PATIENCE_S = 20.0
+PATIENCE_S = 900.0
 
 
 @dataclass

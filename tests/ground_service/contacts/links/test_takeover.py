@@ -21,6 +21,7 @@ from tests.serving import wait_for
 CADU = 1279
 
 
+@pytest.mark.campaign
 def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
     migrated_postgres: Callable[[], str], tmp_path: Path, station: Station, synthetic_pass: Any
 ) -> None:
@@ -37,7 +38,7 @@ def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
         processes = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) for _ in range(2)]
         try:
             first = station.accept(60.0)
-            wait_for(lambda: service.get_link(ground, "lab").owner is not None, "an owner", 60.0)
+            wait_for(lambda: service.get_link(ground, "lab").owner is not None, "an owner")
             owner = service.get_link(ground, "lab").owner or ""
             (killed,) = [one for one in processes if f":{one.pid}:" in owner]
             before = released(ground, 2)
@@ -77,6 +78,3 @@ def expected_hash(tmp_path: Path, synthetic_pass: Any) -> str:
         if not hash_of(ground):
             ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
         return hash_of(ground)
-
-
-pytestmark = pytest.mark.timeout(240)

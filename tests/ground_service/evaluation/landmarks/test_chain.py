@@ -91,6 +91,7 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     return Learned(folder, written.folder, thin, len(proposed), before["unmatched"], linna)
 
 
+@pytest.mark.campaign
 def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) -> None:
     """The table goes up by PUS 13, released by a second person; the flight software flies with it."""
     folder, linna = learned.folder, learned.linna
