@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.ground_service.web.conftest import wait_for
 from tests.ground_service.web.test_in_browser import answered, camera_fault, housekeeping, receive, settled
 from tests.lazy import expect
 from tests.serving import wait_for
