@@ -25,19 +25,33 @@ SEED   ?= 1
 SHIPPED := $(foreach name,runtime postgres parquet traces oidc objects terrain exports,requirements/$(name).txt)
 HASHED  := $(SHIPPED:requirements/%=requirements/hashed/%)
 
-.PHONY: demo test check openmct docs pictures page-table sbom licences package release bench campaigns mutation up install install-dev clean
+.PHONY: demo test test-cost campaigns-left clean-campaigns check openmct docs pictures page-table sbom licences package release bench campaigns mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
 
 # Compiled modules are kept, whatever the environment says: many tests start processes.
-# Three processes on two cores: browsers and servers are waited for.
-test: $(VENV)/.dev
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+SUITE = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# Long campaigns; each has a short twin in `make test` (docs/mutation.md).
+test: $(VENV)/.dev
+	$(SUITE)
+
+# Long campaigns; each has a short twin in `make test` (tests/campaigns.csv). A run that was stopped goes on with the files
+# that have not passed; `make campaigns-left` lists them, and `make clean-campaigns` forgets what has passed.
 campaigns: $(VENV)/.dev
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -m campaign -n 2 --dist loadfile --no-loadscope-reorder
+	$(SUITE) -m campaign --resume
+	$(MAKE) test-cost
+
+campaigns-left: $(VENV)/.dev
+	$(BIN)/python -m pytest -m campaign --resume --collect-only -q
+
+clean-campaigns:
+	rm -f build/campaigns.txt
+
+# Processor time of the newest complete `make test` by folder, compared with tests/cost.csv.
+test-cost: $(VENV)/.dev
+	test -f build/test-cost.csv || $(SUITE)
+	$(BIN)/python -m tests.cost
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

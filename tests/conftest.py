@@ -1,5 +1,6 @@
 """Shared by all tests: where the real data are, and what is skipped without them."""
 
+import csv
 import os
 import sys
 from collections import Counter
@@ -26,6 +27,24 @@ settings.load_profile("linna")
 # Libraries that no test needs before it runs: they cost each process seconds and hundreds of megabytes.
 HEAVY = ("torch", "astropy", "scipy.stats", "matplotlib", "onnxscript", "playwright")
 IMPORTED = pytest.StashKey[list[str]]()
+
+
+PASSED = Path(__file__).parents[1] / "build" / "campaigns.txt"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that resumes the campaigns."""
+    parser.addoption(
+        "--resume", action="store_true", help="leave out campaigns that have passed, and note new ones"
+    )
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note a campaign that has passed."""
+    if "campaign" in report.keywords and report.when == "call" and report.passed:
+        PASSED.parent.mkdir(exist_ok=True)
+        with PASSED.open("a") as passed:
+            passed.write(f"{report.nodeid}\n")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -60,12 +79,27 @@ def imported_while_collecting(pytestconfig: pytest.Config) -> list[str]:
     return pytestconfig.stash[IMPORTED]
 
 
+def _campaigns() -> set[str]:
+    """Return the tests that `campaigns.csv` moves out of the suite: files, tests, or single cases of tests."""
+    with Path(__file__).with_name("campaigns.csv").open(newline="") as lines:
+        return {f"tests/{row['test']}" for row in csv.DictReader(lines)}
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Slow files run first, browser tests last, the largest file first; real data only if LINNA_DATA is set.
+    """Mark campaigns; run slow files first, browser tests last, the largest file first; real data only with LINNA_DATA.
 
     A driven browser keeps an event loop in the thread of the tests, in which `asyncio.run` is then refused.
     With several processes this needs `--no-loadscope-reorder`.
     """
+    moved = _campaigns()
+    for item in items:
+        names = {item.nodeid, item.nodeid.partition("[")[0], item.nodeid.partition("::")[0]}
+        if names & moved:
+            item.add_marker("campaign")
+    if config.getoption("resume") and PASSED.exists():
+        passed = set(PASSED.read_text().splitlines())
+        items[:] = [item for item in items if item.nodeid not in passed]
     driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     sizes = Counter(item.path for item in items if item.path in driven)
     slow = Counter(item.path for item in items if "slow" in item.keywords)

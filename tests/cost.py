@@ -52,7 +52,9 @@ class Cost:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.files[report.nodeid.partition("::")[0]] += getattr(report, "processor_s", 0.0)
 
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+    def pytest_terminal_summary(
+        self, terminalreporter: pytest.TerminalReporter, config: pytest.Config
+    ) -> None:
         turn = turn_s()
         folders = Counter[str]()
         for name, spent in self.files.items():
@@ -61,8 +63,10 @@ class Cost:
         for title, costs in (("folder", folders.most_common()), ("file", self.files.most_common(20))):
             for name, spent in costs:
                 terminalreporter.write_line(f"{spent:8.1f} s {spent / turn:8.0f} turns  {title} {name}")
-        MEASURED.parent.mkdir(exist_ok=True)
-        write(MEASURED, {name: spent / turn for name, spent in folders.items()})
+        whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("keyword")
+        if whole and config.getoption("markexpr") == "not campaign":
+            MEASURED.parent.mkdir(exist_ok=True)
+            write(MEASURED, {name: spent / turn for name, spent in folders.items()})
 
 
 def write(path: Path, turns: dict[str, float]) -> None:

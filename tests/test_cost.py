@@ -1,5 +1,6 @@
 """The cost of the suite: collection without heavy libraries, and folders compared with the table."""
 
+import csv
 from pathlib import Path
 
 import pytest
@@ -26,3 +27,14 @@ def test_a_new_folder_may_cost_little() -> None:
 def test_the_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     cost.write(tmp_path / "cost.csv", {"tests/b": 2.4, "tests/a": 10.0})
     assert cost.read(tmp_path / "cost.csv") == {"tests/a": 10.0, "tests/b": 2.0}
+
+
+def test_every_entry_of_the_campaigns_is_a_test_with_a_twin() -> None:
+    tests = Path(__file__).parent
+    with (tests / "campaigns.csv").open(newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    assert len({row["test"] for row in rows}) == len(rows) > 50
+    for row in rows:
+        file, _, name = row["test"].partition("[")[0].partition("::")
+        assert f"def {name}(" in (tests / file).read_text() or not name, row
+        assert row["twin"], row

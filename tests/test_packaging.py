@@ -233,7 +233,7 @@ def test_the_project_has_its_legal_and_citation_files() -> None:
     assert citation["version"] == __version__ and citation["cff-version"] == "1.2.0"
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(
     tmp_path: Path,
 ) -> None:

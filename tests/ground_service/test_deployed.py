@@ -185,10 +185,8 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
     return signed.pop()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["base", *(pytest.param(one, marks=pytest.mark.campaign) for one in ("objects", "provider"))]
-)
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["base", "objects", "provider"])
 def test_no_acknowledged_piece_is_lost_with_any_server_lost(
     kind: str, synthetic_pass: Any, tmp_path: Path
 ) -> None:
