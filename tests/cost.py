@@ -37,8 +37,7 @@ def turn_s() -> float:
 class Cost:
     """Sums of the processor time of the tests, by file."""
 
-    def __init__(self) -> None:
-        self.last_s, self.files = processor_s(), Counter[str]()
+    last_s, files = 0.0, Counter[str]()
 
     def pytest_collection_finish(self) -> None:
         self.last_s = processor_s()
@@ -55,8 +54,7 @@ class Cost:
     def pytest_terminal_summary(
         self, terminalreporter: pytest.TerminalReporter, config: pytest.Config
     ) -> None:
-        turn = turn_s()
-        folders = Counter[str]()
+        turn, folders = turn_s(), Counter[str]()
         for name, spent in self.files.items():
             folders[str(Path(name).parent)] += spent
         terminalreporter.section("processor time of the tests")
