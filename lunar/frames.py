@@ -84,7 +84,7 @@ _DAF_RECORD = 1024
 
 
 ICRF = "ICRF"
-ICRF_NAMES = (ICRF, "ICRF1", "ICRF2", "ICRF3", "GCRF")
+ICRF_NAMES = (ICRF, "ICRF1", "ICRF2", "ICRF3", "GCRF", "ICRS")
 J2000_NAMES = ("EME2000", "J2000")
 """Names of inertial axes in ephemeris files."""
 
@@ -343,6 +343,14 @@ def quaternion_from_matrix(matrix: ArrayLike) -> FloatArray:
     q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+
+
+def continuous_quaternions(q: ArrayLike) -> FloatArray:
+    """Return quaternions (n, 4) of the same rotations with signs such that each lies closest to the one before."""
+    given = np.asarray(q, dtype=np.float64)
+    flips = np.sum(given[1:] * given[:-1], axis=1) < 0.0
+    signs = np.cumprod(np.where(np.concatenate([[False], flips]), -1.0, 1.0))
+    return np.asarray(given * signs[: len(given), None])
 
 
 def rotation_vector_from_matrix(matrix: ArrayLike) -> FloatArray:

@@ -105,8 +105,8 @@ def orbit_octets(inputs: PassInputs, craft: Craft, kind: str, states: str) -> by
     return (format_oem_xml(ephemeris) if kind == "oem-xml" else format_oem(ephemeris)).encode()
 
 
-def attitude_octets(inputs: PassInputs, craft: Craft, kind: str) -> bytes:
-    """Return the attitude of the camera in the frames of a pass as `aem` or `ck`.
+def attitude_octets(inputs: PassInputs, craft: Craft, kind: str, version: str) -> bytes:
+    """Return the attitude of the camera in the frames of a pass as `ck`, or `aem` of a version.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def attitude_octets(inputs: PassInputs, craft: Craft, kind: str) -> bytes:
         step = float(np.median(np.diff(ticks))) if len(ticks) > 1 else float(TICKS_PER_SECOND)
         return ck_octets(ticks, q_wxyz, spacecraft_id(craft.number), gap_ticks=int(GAP_STEPS * step))
     segment = AttitudeSegment(utc_ns, q_wxyz, object_name=craft.name, object_id=craft.name)
-    return format_aem((segment,)).encode()
+    return format_aem((segment,), version).encode()
 
 
 def clock_lines(correlations: Sequence[TimeCorrelation], ticks: IntArray) -> list[ClockLine]:

@@ -116,7 +116,7 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
     if kind in ORBITS:
         return messages.orbit_octets(inputs, craft, kind, request.states)
     if kind in ATTITUDES:
-        return messages.attitude_octets(inputs, craft, kind)
+        return messages.attitude_octets(inputs, craft, kind, request.version)
     return messages.text_kernel(inputs, craft, kind).encode()
 
 

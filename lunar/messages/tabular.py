@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from lunar.ephemeris import Ephemeris
-from lunar.frames import Orientation, quaternion_from_matrix, rtn_from_inertial
+from lunar.frames import Orientation, continuous_quaternions, quaternion_from_matrix, rtn_from_inertial
 from lunar.ground_track import ground_track
 from lunar.timescales import NS, format_utc
 
@@ -45,7 +45,7 @@ def format_tum(ephemeris: Ephemeris) -> str:
     position_m, velocity_m_s = ephemeris.at(epochs)
     icrf_from_rtn = np.swapaxes(rtn_from_inertial(position_m, velocity_m_s), -1, -2)
     # Scalar last in this format.
-    attitude = np.roll(quaternion_from_matrix(icrf_from_rtn), -1, axis=-1)
+    attitude = np.roll(continuous_quaternions(quaternion_from_matrix(icrf_from_rtn)), -1, axis=-1)
     values = np.concatenate([position_m, attitude], axis=1).tolist()
     row = "%d.%09d %.6f %.6f %.6f %.12f %.12f %.12f %.12f"
     lines = [row % (*divmod(int(t), NS), *v) for t, v in zip(epochs, values, strict=True)]
