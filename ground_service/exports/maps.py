@@ -47,6 +47,10 @@ MAPS = ("geojson", "gpkg", "czml")
 
 _WKB = {"Point": 1, "LineString": 2, "Polygon": 3, "MultiLineString": 5, "MultiPolygon": 6}
 _DECIMALS = 8
+_TIMES = ("utc", "start", "stop")
+"""Fields with UTC texts, which are DATETIME in a GeoPackage."""
+
+_GDAL_UTC = 100
 
 
 def map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:
@@ -118,12 +122,17 @@ def geopackage_octets(layers: Sequence[Layer]) -> bytes:
                 layer=layer.name,
                 driver="GPKG",
                 append=path.exists(),
+                gdal_tz_offsets={
+                    name: np.full(len(layer.features), _GDAL_UTC) for name in _TIMES if name in layer.fields
+                },
             )
         return path.read_bytes() if path.exists() else b""
 
 
 def _field_array(layer: Layer, name: str) -> Any:
     values = [one.fields[name] for one in layer.features]
+    if name in _TIMES:
+        return np.array([value.rstrip("Z") for value in values], dtype="datetime64[ms]")
     return np.array(values, dtype=object) if isinstance(values[0], str) else np.array(values)
 
 
