@@ -458,7 +458,8 @@ def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth
         position, velocity = ephemeris.at(np.where(np.abs(utc_ns - inside) <= _EDGE_NS, inside, utc_ns))
         return np.concatenate([position, velocity], axis=1)
 
-    return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation)
+    breaks_utc_ns = tuple(one.start_utc_ns for one in ephemeris.segments[1:])
+    return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation, breaks_utc_ns)
 
 
 def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELENITA") -> Ephemeris:
