@@ -41,7 +41,7 @@ _ALL = (
     Format(
         "spice",
         "zip",
-        "SPICE kernels of all kinds, leap seconds and a meta-kernel",
+        "SPICE kernels of all kinds, leap seconds, the Moon and a meta-kernel",
         "spiceypy",
         "spice",
         states=True,

@@ -24,7 +24,7 @@ from lunar.messages.spice import (
     format_ik,
     format_sclk,
     spacecraft_id,
-    spk_octets,
+    spk_kernel,
 )
 from lunar.timescales import LEAP_DATES, TICKS_PER_SECOND, utc_ns_from_ticks
 
@@ -101,7 +101,7 @@ def orbit_octets(inputs: PassInputs, craft: Craft, kind: str, states: str) -> by
     """Return the orbit of a pass as `oem`, `oem-xml` or `spk`."""
     ephemeris = ephemeris_of(inputs, states, craft)
     if kind == "spk":
-        return spk_octets(ephemeris, spacecraft_id(craft.number))
+        return spk_kernel(ephemeris, spacecraft_id(craft.number)).octets
     return (format_oem_xml(ephemeris) if kind == "oem-xml" else format_oem(ephemeris)).encode()
 
 

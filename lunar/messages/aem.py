@@ -20,7 +20,7 @@ from lunar.errors import EphemerisError, UnknownTimeSystemError
 from lunar.frames import continuous_quaternions
 from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
 from lunar.messages.oem_xml import xml_lines
-from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns
+from lunar.timescales import TIME_SYSTEMS, format_utc, tai_ns_from_utc_ns
 
 VERSIONS = ("1.0", "2.0")
 UNIT_TOLERANCE = 1e-3
@@ -115,7 +115,7 @@ def format_aem(segments: tuple[AttitudeSegment, ...], version: str = VERSIONS[-1
         "",
     ]
     for one in segments:
-        texts = epoch_texts(np.asarray(from_utc_ns(one.utc_ns, one.time_system)))
+        texts = epoch_texts(tai_ns_from_utc_ns(one.utc_ns), one.time_system)
         lines += [
             "META_START",
             *comment_lines(one.comments),

@@ -1,8 +1,8 @@
 """CCSDS messages in XML: Orbit Ephemeris Messages of versions 1.0, 2.0 and 3.0 (written as 2.0); lines of an AEM.
 
 The elements are brought into keyword notation, line by line, and read by `lunar.messages.oem` or `lunar.messages.aem`:
-both notations pass the same checks, and errors name the line of the XML file.  Document type definitions are refused, so entities
-cannot expand or refer to files.
+both notations pass the same checks, and errors name the line of the XML file.  Document type
+definitions are refused, so entities cannot expand or refer to files.
 
 References
 ----------
@@ -19,9 +19,9 @@ import numpy as np
 
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError
-from lunar.messages.kvn import Lines, epoch_texts
+from lunar.messages.kvn import Lines, epoch_texts, utc_epoch_text
 from lunar.messages.oem import parse_oem_lines
-from lunar.timescales import format_utc, from_utc_ns
+from lunar.timescales import format_utc
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
@@ -194,8 +194,7 @@ def _comments(comments: Iterable[str]) -> list[str]:
 
 
 def _segment(segment: EphemerisSegment) -> list[str]:
-    counts = np.asarray(from_utc_ns(segment.utc_ns, segment.time_system))
-    texts = epoch_texts(counts)
+    texts = epoch_texts(segment.tai_ns, segment.time_system)
     meta = [
         ("OBJECT_NAME", segment.object_name),
         ("OBJECT_ID", segment.object_id or segment.object_name),
@@ -205,11 +204,9 @@ def _segment(segment: EphemerisSegment) -> list[str]:
         ("START_TIME", texts[0]),
     ]
     if segment.useable_start_utc_ns is not None or segment.useable_stop_utc_ns is not None:
-        span = np.array([segment.start_utc_ns, segment.stop_utc_ns], dtype=np.int64)
-        useable = np.asarray(from_utc_ns(span, segment.time_system))
         meta += [
-            (f"USEABLE_{end}_TIME", epoch_texts(useable[k : k + 1])[0])
-            for k, end in enumerate(("START", "STOP"))
+            (f"USEABLE_{end}_TIME", epoch_texts(edge, segment.time_system)[0])
+            for edge, end in zip(segment.span_tai_ns, ("START", "STOP"), strict=True)
         ]
     meta += [
         ("STOP_TIME", texts[-1]),
@@ -230,9 +227,7 @@ def _segment(segment: EphemerisSegment) -> list[str]:
 
 
 def _covariance_lines(covariance: Covariance, time_system: str) -> list[str]:
-    epoch = epoch_texts(np.asarray(from_utc_ns(np.array([covariance.utc_ns], dtype=np.int64), time_system)))[
-        0
-    ]
+    epoch = utc_epoch_text(covariance.utc_ns, time_system)
     units = ("km**2", "km**2/s", "km**2/s**2")
     lines = ["<covarianceMatrix>", _element("EPOCH", epoch), _element("COV_REF_FRAME", covariance.frame)]
     for k, row in enumerate(_COVARIANCE):

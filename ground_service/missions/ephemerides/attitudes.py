@@ -1,4 +1,4 @@
-"""Attitudes of a pass archive: `attitude.csv` with a row for each frame, or a CCSDS AEM, text or XML (`attitude.aem`)."""
+"""Attitudes of a pass archive: `attitude.csv` with a row for each frame, or `attitude.aem`, a CCSDS AEM or its XML."""
 
 from __future__ import annotations
 

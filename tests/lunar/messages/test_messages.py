@@ -19,7 +19,7 @@ from lunar.messages.aem import AttitudeSegment, format_aem, parse_aem
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
-from lunar.timescales import NS, from_utc_ns, parse_utc
+from lunar.timescales import NS, from_tai_ns, parse_tai, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
 
@@ -374,7 +374,7 @@ def test_a_horizons_table_is_read(tmp_path: Path) -> None:
     segment = load_ephemeris(path).segments[0]
     assert segment.object_name == "LRO"
     # TDB is 69.184 s ahead of UTC, but for the 1.7 ms of its periodic part.
-    offset = from_utc_ns(segment.utc_ns, "TDB") - (START + np.array([0, 60]) * NS)
+    offset = from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)
     assert np.abs(offset).max() <= 1
     np.testing.assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
     np.testing.assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
@@ -417,6 +417,28 @@ def test_faults_of_a_horizons_table_are_named(
     path.write_text(HORIZONS.replace(old, new))
     with pytest.raises(error, match=message):
         load_ephemeris(path)
+
+
+def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tmp_path: Path) -> None:
+    head, _, _ = HORIZONS.partition("$$SOE\n")
+    row = (
+        "2457754.5, A.D. 2017-Jan-01 00:01:{:02d}.0000, 1.8E+03, 0.0E+00, {}E+00, 0.0E+00, 0.0E+00, 1.6E+00,"
+    )
+    path = tmp_path / "leap.csv"
+    path.write_text(head + "\n".join(["$$SOE", *(row.format(5 + k, k) for k in range(6)), "$$EOE"]))
+    segment = load_ephemeris(path).segments[0]
+    # TDB is 68.184 s ahead of UTC before and 69.184 s after the leap second.
+    assert np.abs(np.diff(segment.tai_ns) - NS).max() <= 1
+    assert abs(segment.tai_ns[4] - parse_tai("2016-12-31T23:59:60.816")) < 2_000_000
+
+
+def test_an_attitude_within_a_leap_second_is_refused_with_that_reason() -> None:
+    for system, clock in (("UTC", "2016-12-31T23:59:60.000"), ("TT", "2017-01-01T00:01:08.184")):
+        text = format_aem((attitudes(1),)).replace("TIME_SYSTEM = UTC", f"TIME_SYSTEM = {system}")
+        with pytest.raises(
+            DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"
+        ):
+            parse_aem(text.replace("2029-08-07T00:00:00.000 ", f"{clock} "))
 
 
 def test_an_spk_is_referred_to_the_converter(tmp_path: Path) -> None:
