@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lunar.datafolder import DataFolder, find_data
+
+if TYPE_CHECKING:
+    from lunar.ephemeris import Ephemeris
 
 
 def user_data_directory() -> Path:
@@ -28,6 +32,16 @@ def data_folder() -> DataFolder:
         return find_data(Path(named))
     default = user_data_directory()
     return find_data(default if default.is_dir() else None)
+
+
+def load_orbit(path: Path) -> Ephemeris:
+    """Return the ephemeris in a file for figures of its states, which must move as gravity moves them."""
+    from lunar.comparison import check_gravity
+    from lunar.messages.ephemeris_files import load_ephemeris
+
+    ephemeris = load_ephemeris(path)
+    check_gravity(ephemeris)
+    return ephemeris
 
 
 def blender_python() -> str:

@@ -5,7 +5,8 @@ motion is smooth: nothing is interpolated across its ends, outside its useable i
 own.  Where two segments meet, the later one holds from its start on, so the state at a manoeuvre is the one
 after it.
 
-Interpolation runs on TAI, so a leap second inside a segment does no harm.
+Interpolation runs on TAI, so a leap second inside a segment does no harm.  States within a leap second have the
+``utc_ns`` of one second later; `EphemerisSegment.tai_ns` and `Ephemeris.at_tai` tell the two apart.
 
 References
 ----------
@@ -16,7 +17,7 @@ k - 1 uses k states.  Newton's form with repeated nodes: Burden and Faires, Nume
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +29,7 @@ from numpy.typing import ArrayLike
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.frames import ICRF
-from lunar.timescales import NS, format_utc, tai_ns_from_utc_ns
+from lunar.timescales import NS, format_tai, tai_ns_from_utc_ns, utc_ns_from_tai_ns
 
 GAP_FACTOR = 10
 """A step longer than this many median steps of its segment is a gap, in which nothing is interpolated."""
@@ -51,8 +52,8 @@ class Covariance:
 class EphemerisSegment:
     """States of one smooth arc; epochs strictly increase.
 
-    ``time_system`` is the one of the file it came from or goes to; ``utc_ns`` is UTC always.  Not slotted:
-    tables for interpolation are kept after first use.
+    ``time_system`` is the one of the file it came from or goes to; ``utc_ns`` is UTC always.  ``tai_ns`` follows from
+    it unless states are within a leap second.  Not slotted: tables for interpolation are kept after first use.
 
     Raises
     ------
@@ -74,9 +75,14 @@ class EphemerisSegment:
     useable_stop_utc_ns: int | None = None
     comments: tuple[str, ...] = ()
     covariances: tuple[Covariance, ...] = ()
+    tai_ns: IntArray = field(default=None, repr=False)  # type: ignore[assignment] # computed if it is not given
 
     def __post_init__(self) -> None:
         n = len(self.utc_ns)
+        if self.tai_ns is None:
+            object.__setattr__(self, "tai_ns", tai_ns_from_utc_ns(self.utc_ns))
+        elif not np.array_equal(utc_ns_from_tai_ns(self.tai_ns), self.utc_ns):
+            raise EphemerisError("an ephemeris segment: expected TAI epochs of its UTC epochs, found others")
         if self.frame != ICRF:
             raise EphemerisError(
                 f"an ephemeris segment: expected states turned into ICRF, found {self.frame}"
@@ -91,9 +97,9 @@ class EphemerisSegment:
                 raise EphemerisError(
                     f"ephemeris state {bad[0]}: expected finite {name}, found NaN or infinity"
                 )
-        late = np.flatnonzero(np.diff(self.utc_ns) <= 0)
+        late = np.flatnonzero(np.diff(self.tai_ns) <= 0)
         if late.size:
-            before, after = (format_utc(int(self.utc_ns[late[0] + k])) for k in (0, 1))
+            before, after = (format_tai(int(self.tai_ns[late[0] + k])) for k in (0, 1))
             raise EphemerisError(
                 f"ephemeris state {late[0] + 1}: expected an epoch after {before}, found {after}"
             )
@@ -102,36 +108,41 @@ class EphemerisSegment:
                 f"an ephemeris segment: expected an interpolation of {', '.join(INTERPOLATIONS)} of "
                 f"degree 1 or more, found {self.interpolation!r} of degree {self.degree}"
             )
-        if self.start_utc_ns > self.stop_utc_ns:
-            span = f"{format_utc(self.start_utc_ns)}..{format_utc(self.stop_utc_ns)}"
+        start, stop = self.span_tai_ns
+        if start > stop:
+            span = f"{format_tai(start)}..{format_tai(stop)}"
             raise EphemerisError(f"an ephemeris segment: expected a useable interval, found {span}")
 
     @property
     def start_utc_ns(self) -> int:
         """Return the first epoch at which a state may be asked for."""
-        first = int(self.utc_ns[0])
-        return first if self.useable_start_utc_ns is None else max(first, self.useable_start_utc_ns)
+        return utc_ns_from_tai_ns(self.span_tai_ns[0])
 
     @property
     def stop_utc_ns(self) -> int:
         """Return the last epoch at which a state may be asked for."""
-        last = int(self.utc_ns[-1])
-        return last if self.useable_stop_utc_ns is None else min(last, self.useable_stop_utc_ns)
+        return utc_ns_from_tai_ns(self.span_tai_ns[1])
 
     @cached_property
-    def _tai_ns(self) -> IntArray:
-        return tai_ns_from_utc_ns(self.utc_ns)
+    def span_tai_ns(self) -> tuple[int, int]:
+        """Return the first and the last instant at which a state may be asked for."""
+        first, last = int(self.tai_ns[0]), int(self.tai_ns[-1])
+        if self.useable_start_utc_ns is not None:
+            first = max(first, tai_ns_from_utc_ns(self.useable_start_utc_ns))
+        if self.useable_stop_utc_ns is not None:
+            last = min(last, tai_ns_from_utc_ns(self.useable_stop_utc_ns))
+        return first, last
 
     @cached_property
     def _uniform_step_ns(self) -> int:
         """Return the step where all are equal, else 0."""
-        steps = np.diff(self._tai_ns)
+        steps = np.diff(self.tai_ns)
         return int(steps[0]) if len(steps) and np.all(steps == steps[0]) else 0
 
     @cached_property
     def _gaps(self) -> BoolArray:
         """Return which steps (n - 1,) are gaps."""
-        steps = np.diff(self._tai_ns)
+        steps = np.diff(self.tai_ns)
         return (
             steps > GAP_FACTOR * np.median(steps) if len(steps) > 2 else np.zeros(len(steps), dtype=np.bool_)
         )
@@ -155,10 +166,11 @@ class Ephemeris:
         if not self.segments:
             raise EphemerisError("an ephemeris: expected at least one segment, found none")
         for earlier, later in pairwise(self.segments):
-            if later.start_utc_ns < earlier.stop_utc_ns:
-                end, start = format_utc(earlier.stop_utc_ns), format_utc(later.start_utc_ns)
+            start, stop = later.span_tai_ns[0], earlier.span_tai_ns[1]
+            if start < stop:
                 raise EphemerisError(
-                    f"an ephemeris: expected the next segment at or after {end}, found it at {start}"
+                    f"an ephemeris: expected the next segment at or after {format_tai(stop)}, "
+                    f"found it at {format_tai(start)}"
                 )
 
     @property
@@ -175,9 +187,20 @@ class Ephemeris:
         kept = [s.utc_ns[(s.utc_ns >= s.start_utc_ns) & (s.utc_ns <= s.stop_utc_ns)] for s in self.segments]
         return np.unique(np.concatenate(kept))
 
+    def arcs(self) -> tuple[EphemerisSegment, ...]:
+        """Return the segments cut at their gaps, for formats whose readers would interpolate across these."""
+        found = []
+        for one in self.segments:
+            cuts = [0, *(np.flatnonzero(one._gaps) + 1).tolist(), len(one.utc_ns)]
+            for first, last in pairwise(cuts):
+                low, high = one.span_tai_ns
+                if one.tai_ns[first] <= high and one.tai_ns[last - 1] >= low:
+                    found.append(one if len(cuts) == 2 else _part(one, first, last))
+        return tuple(found)
+
     def covers(self, utc_ns: ArrayLike) -> BoolArray:
         """Return whether a state is known at epochs ``(...)``."""
-        epochs = np.asarray(utc_ns, dtype=np.int64)
+        epochs = np.asarray(tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)))
         flat = epochs.reshape(-1)
         owner = self._owners(flat)
         good = owner >= 0
@@ -194,7 +217,11 @@ class Ephemeris:
         EphemerisCoverageError
             Where an epoch is outside every useable interval or inside a gap.
         """
-        epochs = np.asarray(utc_ns, dtype=np.int64)
+        return self.at_tai(tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)))
+
+    def at_tai(self, tai_ns: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return positions and velocities as `at` does, also within a leap second."""
+        epochs = np.asarray(tai_ns, dtype=np.int64)
         flat = epochs.reshape(-1)
         owner = self._owners(flat)
         if np.any(owner < 0):
@@ -215,22 +242,21 @@ class Ephemeris:
     def _owners(self, flat: IntArray) -> IntArray:
         """Return for each epoch the index of the segment that holds it, -1 for none."""
         if len(self.segments) == 1:
-            inside = (flat >= self.start_utc_ns) & (flat <= self.stop_utc_ns)
-            return np.where(inside, 0, -1)
-        starts = np.array([s.start_utc_ns for s in self.segments], dtype=np.int64)
-        stops = np.array([s.stop_utc_ns for s in self.segments], dtype=np.int64)
+            start, stop = self.segments[0].span_tai_ns
+            return np.where((flat >= start) & (flat <= stop), 0, -1)
+        starts, stops = np.array([s.span_tai_ns for s in self.segments], dtype=np.int64).T
         owner = np.searchsorted(starts, flat, side="right") - 1
         return np.where((owner >= 0) & (flat <= stops[np.maximum(owner, 0)]), owner, -1)
 
-    def _refuse(self, utc_ns: int) -> None:
+    def _refuse(self, tai_ns: int) -> None:
         spans: list[tuple[int, int]] = []
         for segment in self.segments:
-            joined = bool(spans) and spans[-1][1] == segment.start_utc_ns
-            start = spans.pop()[0] if joined else segment.start_utc_ns
-            spans.append((start, segment.stop_utc_ns))
-        texts = [f"{format_utc(start)}..{format_utc(stop)}" for start, stop in spans[:3]]
+            start, stop = segment.span_tai_ns
+            joined = bool(spans) and spans[-1][1] == start
+            spans.append((spans.pop()[0] if joined else start, stop))
+        texts = [f"{format_tai(start)}..{format_tai(stop)}" for start, stop in spans[:3]]
         more = f" or {len(spans) - 3} later spans" if len(spans) > 3 else ""
-        raise EphemerisCoverageError(format_utc(utc_ns), ", ".join(texts) + more)
+        raise EphemerisCoverageError(format_tai(tai_ns), ", ".join(texts) + more)
 
 
 def ephemeris_from_states(
@@ -251,6 +277,52 @@ def ephemeris_from_states(
     return Ephemeris((segment,))
 
 
+def resampled(ephemeris: Ephemeris, step_s: float | None = None) -> Ephemeris:
+    """Return the states of each arc from its first to its last useable epoch, for formats without such intervals.
+
+    Both ends of each arc are among the states, so an epoch that two arcs share occurs in both.
+
+    Parameters
+    ----------
+    step_s
+        Seconds between states; None takes the given states.
+    """
+    parts = []
+    for one in ephemeris.arcs():
+        start, stop = one.span_tai_ns
+        if step_s is None:
+            inner = one.tai_ns[(one.tai_ns > start) & (one.tai_ns < stop)]
+        else:
+            inner = np.arange(start, stop, max(round(step_s * NS), 1), dtype=np.int64)[1:]
+        tai_ns = np.unique(np.array([start, *inner.tolist(), stop], dtype=np.int64))
+        position_m, velocity_m_s = Ephemeris((one,)).at_tai(tai_ns)
+        parts.append(
+            replace(
+                one,
+                utc_ns=utc_ns_from_tai_ns(tai_ns),
+                tai_ns=tai_ns,
+                position_m=position_m,
+                velocity_m_s=velocity_m_s,
+                useable_start_utc_ns=None,
+                useable_stop_utc_ns=None,
+            )
+        )
+    return replace(ephemeris, segments=tuple(parts))
+
+
+def _part(one: EphemerisSegment, first: int, last: int, **changes: Any) -> EphemerisSegment:
+    """Return a segment of the states from ``first`` to before ``last``."""
+    states = slice(first, last)
+    return replace(
+        one,
+        utc_ns=one.utc_ns[states],
+        tai_ns=one.tai_ns[states],
+        position_m=one.position_m[states],
+        velocity_m_s=one.velocity_m_s[states],
+        **changes,
+    )
+
+
 def clipped(ephemeris: Ephemeris, start_utc_ns: int, stop_utc_ns: int) -> Ephemeris:
     """Return the part of an ephemeris that is useable in an interval, with the states that its interpolation needs.
 
@@ -269,18 +341,17 @@ def clipped(ephemeris: Ephemeris, start_utc_ns: int, stop_utc_ns: int) -> Epheme
         last = min(int(np.searchsorted(one.utc_ns, stop, side="left")) + 1 + margin, len(one.utc_ns))
         inner = (start, stop) != (int(one.utc_ns[first]), int(one.utc_ns[last - 1]))
         parts.append(
-            replace(
+            _part(
                 one,
-                utc_ns=one.utc_ns[first:last],
-                position_m=one.position_m[first:last],
-                velocity_m_s=one.velocity_m_s[first:last],
+                first,
+                last,
                 useable_start_utc_ns=start if inner else None,
                 useable_stop_utc_ns=stop if inner else None,
                 covariances=tuple(c for c in one.covariances if start <= c.utc_ns <= stop),
             )
         )
     if not parts:
-        ephemeris._refuse(start_utc_ns)
+        ephemeris._refuse(tai_ns_from_utc_ns(start_utc_ns))
     return Ephemeris(tuple(parts), ephemeris.originator, ephemeris.comments)
 
 
@@ -307,7 +378,7 @@ def parse_numbers(rows: Sequence[str], width: int) -> FloatArray | None:
 
 def _steps_of(segment: EphemerisSegment, epochs_tai_ns: IntArray) -> IntArray:
     """Return for each epoch the index of the state at or before it, at most n - 2 (0 for a lone state)."""
-    nodes = segment._tai_ns
+    nodes = segment.tai_ns
     if segment._uniform_step_ns:
         index: IntArray = (epochs_tai_ns - nodes[0]) // segment._uniform_step_ns
     else:
@@ -316,27 +387,27 @@ def _steps_of(segment: EphemerisSegment, epochs_tai_ns: IntArray) -> IntArray:
 
 
 def _in_gap(segment: EphemerisSegment, flat: IntArray) -> BoolArray:
+    """Return which TAI epochs (m,) are inside a gap."""
     if not np.any(segment._gaps):
         return np.zeros(len(flat), dtype=np.bool_)
-    epochs = tai_ns_from_utc_ns(flat)
-    step = _steps_of(segment, epochs)
-    at_node = (epochs == segment._tai_ns[step]) | (epochs == segment._tai_ns[step + 1])
+    step = _steps_of(segment, flat)
+    at_node = (flat == segment.tai_ns[step]) | (flat == segment.tai_ns[step + 1])
     return np.asarray(segment._gaps[step] & ~at_node)
 
 
 def _interpolate(
     segment: EphemerisSegment, flat: IntArray, position: FloatArray, velocity: FloatArray
 ) -> None:
-    """Fill positions and velocities (m, 3) at epochs (m,) inside the segment."""
+    """Fill positions and velocities (m, 3) at TAI epochs (m,) inside the segment."""
     gap = _in_gap(segment, flat)
     if np.any(gap):
         asked = int(flat[np.flatnonzero(gap)[0]])
-        k = int(_steps_of(segment, tai_ns_from_utc_ns(np.array([asked], dtype=np.int64)))[0])
-        before, after = (format_utc(int(epoch)) for epoch in segment.utc_ns[k : k + 2])
+        k = int(_steps_of(segment, np.array([asked], dtype=np.int64))[0])
+        before, after = (format_tai(int(epoch)) for epoch in segment.tai_ns[k : k + 2])
         raise EphemerisCoverageError(
-            format_utc(asked), f"the states of a segment with a gap {before}..{after}"
+            format_tai(asked), f"the states of a segment with a gap {before}..{after}"
         )
-    nodes = segment._tai_ns
+    nodes = segment.tai_ns
     n = len(nodes)
     if n == 1:
         position[:], velocity[:] = segment.position_m[0], segment.velocity_m_s[0]
@@ -345,8 +416,7 @@ def _interpolate(
     degree = 1 if segment.interpolation == "LINEAR" else segment.degree
     width = min((degree + 1) // 2 if hermite else degree + 1, n)
     width = max(width, 2)
-    epochs = tai_ns_from_utc_ns(flat)
-    step = _steps_of(segment, epochs)
+    step = _steps_of(segment, flat)
     # Tables of the steps that are needed only: all of them for dense requests, one for a single epoch.
     needed, row = np.unique(step, return_inverse=True) if len(flat) < n else (np.arange(n - 1), step)
     first = np.clip(needed - (width - 1) // 2, 0, n - width)
@@ -368,7 +438,7 @@ def _interpolate(
     for start in range(0, len(flat), _BLOCK):
         part = slice(start, start + _BLOCK)
         which = row[part]
-        x = (epochs[part] - origin_ns[which]) / NS / half_s[which] - 1.0
+        x = (flat[part] - origin_ns[which]) / NS / half_s[which] - 1.0
         coefficients = np.ascontiguousarray(rows.take(which, axis=0).T).reshape(terms, parts, -1)
         value = coefficients[-1]
         if hermite:

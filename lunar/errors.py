@@ -3,9 +3,11 @@
 LunarError
 ├── DataFileError            a file is missing, truncated or has an invalid value
 ├── TimeFormatError          a text that is not a UTC epoch
+│   └── LeapSecondError      a UTC epoch within a leap second, where a count of 86,400 s days has none
 ├── UnknownTimeSystemError   a time scale that cannot be converted
 ├── UnknownFrameError        a reference frame or centre that cannot be converted
 ├── EphemerisError           states that form no ephemeris, or that a file format cannot hold
+│   └── UnmovedByGravity     states that the gravity of the Moon does not move
 ├── EphemerisCoverageError   an epoch outside the span of an ephemeris or orientation, or inside a gap of it
 ├── MissingLibrary           an optional library is not installed
 ├── LensError                a distortion under which some pixels have no unique ray
@@ -52,9 +54,21 @@ class LensError(LunarError):
 class TimeFormatError(LunarError):
     """A text that is not a UTC epoch."""
 
+    expected = "a UTC epoch like 2029-08-07T00:00:00.000Z"
+
     def __init__(self, text: str) -> None:
         self.text = text
-        super().__init__(f"expected a UTC epoch like 2029-08-07T00:00:00.000Z, found {text!r}")
+        super().__init__(f"expected {self.expected}, found {text!r}")
+
+
+class LeapSecondError(TimeFormatError):
+    """A UTC epoch within a leap second; ``next_utc_ns`` is the epoch one second later."""
+
+    expected = "a UTC epoch outside of a leap second, which counts of 86,400 s days leave out"
+
+    def __init__(self, text: str, next_utc_ns: int) -> None:
+        self.next_utc_ns = next_utc_ns
+        super().__init__(text)
 
 
 class UnknownTimeSystemError(LunarError):
@@ -77,6 +91,24 @@ class UnknownFrameError(LunarError):
 
 class EphemerisError(LunarError):
     """States that form no ephemeris, or that a file format cannot hold."""
+
+
+class UnmovedByGravity(EphemerisError):
+    """States that do not move as the gravity of the Moon moves them: radius in m, accelerations in m/s2."""
+
+    def __init__(
+        self, name: str, radius_m: float, expected_m_s2: float, found_m_s2: float, off: float
+    ) -> None:
+        self.where = f"states of {name}"
+        self.expected = (
+            f"an acceleration of {expected_m_s2:.4g} m/s2 by gravity {radius_m / 1e3:.6g} km "
+            "from the centre of the Moon"
+        )
+        self.found = (
+            f"{found_m_s2:.4g} m/s2, {100.0 * off:.3g} % off; "
+            "rotating axes, other units (metres for kilometres) or another centre?"
+        )
+        super().__init__(f"{self.where}: expected {self.expected}, found {self.found}")
 
 
 class EphemerisCoverageError(LunarError):

@@ -43,7 +43,7 @@ CENTURY_S = 36_525.0 * DAY_S
 
 # WGCCRE 2009: E1 to E13 in degrees at J2000 and degrees per day, then their coefficients in degrees for right
 # ascension (sine) and declination (cosine) of the pole, and for the prime meridian (sine).
-_E_DEG = np.array(
+IAU_E_DEG = np.array(
     [
         125.045,
         250.089,
@@ -60,20 +60,28 @@ _E_DEG = np.array(
         25.053,
     ]
 )
-_E_RATE_DEG_DAY = np.array(
+IAU_E_RATE_DEG_DAY = np.array(
     [
         *(-0.0529921, -0.1059842, 13.0120009, 13.3407154, 0.9856003, 26.4057084, 13.0649930),
         *(0.3287146, 1.7484877, -0.1589763, 0.0036096, 0.1643573, 12.9590088),
     ]
 )
-_POLE_RA_DEG = np.array([-3.8787, -0.1204, 0.0700, -0.0172, 0, 0.0072, 0, 0, 0, -0.0052, 0, 0, 0.0043])
-_POLE_DEC_DEG = np.array([1.5419, 0.0239, -0.0278, 0.0068, 0, -0.0029, 0.0009, 0, 0, 0.0008, 0, 0, -0.0009])
-_MERIDIAN_DEG = np.array(
+IAU_POLE_RA_TERMS_DEG = np.array(
+    [-3.8787, -0.1204, 0.0700, -0.0172, 0, 0.0072, 0, 0, 0, -0.0052, 0, 0, 0.0043]
+)
+IAU_POLE_DEC_TERMS_DEG = np.array(
+    [1.5419, 0.0239, -0.0278, 0.0068, 0, -0.0029, 0.0009, 0, 0, 0.0008, 0, 0, -0.0009]
+)
+IAU_MERIDIAN_TERMS_DEG = np.array(
     [
         *(3.5610, 0.1208, -0.0642, 0.0158, 0.0252, -0.0066, -0.0047),
         *(-0.0046, 0.0028, 0.0052, 0.0040, 0.0019, -0.0044),
     ]
 )
+
+IAU_POLE_RA_DEG, IAU_POLE_DEC_DEG = (269.9949, 0.0031, 0.0), (66.5392, 0.0130, 0.0)
+IAU_MERIDIAN_DEG = (38.3213, 13.17635815, -1.4e-12)
+"""Polynomials of the pole in degrees and centuries, and of the prime meridian in degrees and days."""
 
 DE421_PA_FROM_ME_ARCSECONDS = (67.92, 78.56, 0.30)
 """From mean-Earth to DE421 principal axes: R_z(67.92") R_y(78.56") R_x(0.30")."""
@@ -84,7 +92,7 @@ _DAF_RECORD = 1024
 
 
 ICRF = "ICRF"
-ICRF_NAMES = (ICRF, "ICRF1", "ICRF2", "ICRF3", "GCRF")
+ICRF_NAMES = (ICRF, "ICRF1", "ICRF2", "ICRF3", "GCRF", "ICRS")
 J2000_NAMES = ("EME2000", "J2000")
 """Names of inertial axes in ephemeris files."""
 
@@ -170,11 +178,12 @@ def iau_pole_and_meridian_rad(tdb_s: ArrayLike) -> tuple[FloatArray, FloatArray,
     seconds = np.asarray(tdb_s, dtype=np.float64)
     days = seconds / DAY_S
     centuries = seconds / CENTURY_S
-    e_rad = np.radians(_E_DEG + _E_RATE_DEG_DAY * days[..., None])
+    e_rad = np.radians(IAU_E_DEG + IAU_E_RATE_DEG_DAY * days[..., None])
     sine, cosine = np.sin(e_rad), np.cos(e_rad)
-    right_ascension = 269.9949 + 0.0031 * centuries + sine @ _POLE_RA_DEG
-    declination = 66.5392 + 0.0130 * centuries + cosine @ _POLE_DEC_DEG
-    meridian = 38.3213 + 13.17635815 * days - 1.4e-12 * days**2 + sine @ _MERIDIAN_DEG
+    (ra0, ra1, _), (dec0, dec1, _), (w0, w1, w2) = IAU_POLE_RA_DEG, IAU_POLE_DEC_DEG, IAU_MERIDIAN_DEG
+    right_ascension = ra0 + ra1 * centuries + sine @ IAU_POLE_RA_TERMS_DEG
+    declination = dec0 + dec1 * centuries + cosine @ IAU_POLE_DEC_TERMS_DEG
+    meridian = w0 + w1 * days + w2 * days**2 + sine @ IAU_MERIDIAN_TERMS_DEG
     return np.radians(right_ascension), np.radians(declination), np.radians(meridian)
 
 
@@ -343,6 +352,14 @@ def quaternion_from_matrix(matrix: ArrayLike) -> FloatArray:
     q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+
+
+def continuous_quaternions(q: ArrayLike) -> FloatArray:
+    """Return quaternions (n, 4) of the same rotations with signs such that each lies closest to the one before."""
+    given = np.asarray(q, dtype=np.float64)
+    flips = np.sum(given[1:] * given[:-1], axis=1) < 0.0
+    signs = np.cumprod(np.where(np.concatenate([[False], flips]), -1.0, 1.0))
+    return np.asarray(given * signs[: len(given), None])
 
 
 def rotation_vector_from_matrix(matrix: ArrayLike) -> FloatArray:

@@ -11,7 +11,9 @@ Condon-Shortley phase).
 References
 ----------
 Montenbruck and Gill, Satellite Orbits (2000), section 3.2.
-File formats: ICGEM (Barthelmes and Foerste 2011), GMAT ``.cof``, PDS SHADR (ASCII tables of the PDS Geosciences Node).
+File formats: ICGEM (Barthelmes and Foerste 2011), GMAT ``.cof``, PDS SHADR (ASCII tables of the PDS Geosciences Node),
+text of pyshtools (Wieczorek and Meschede 2018), which states radius and GM in m or km and no normalisation.
+Degree 2, order 0 of the Moon: -9.088e-5 fully normalised, -2.032e-4 not (Lemoine et al. 2014, GRGM900C).
 """
 
 from __future__ import annotations
@@ -26,7 +28,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import FloatArray
+from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.errors import DataFileError, OrbitError
+
+GM_TOLERANCE, RADIUS_TOLERANCE, C20_TOLERANCE = 1e-3, 1e-2, 0.05
+"""Relative deviations from the Moon of a field: its GM, the radius that it refers to, and its flattening."""
+
+C20_MOON = -9.088e-5
 
 Record = tuple[int, int, int, float, float]
 """Line number, degree, order, C, S."""
@@ -98,13 +106,13 @@ def packed_gradient(gravity: GravityField, degree: int | None = None) -> FloatAr
 
 
 def load_gravity(path: Path | str, max_degree: int | None = None) -> GravityField:
-    """Return the field of an ICGEM ``.gfc``, GMAT ``.cof`` or PDS SHADR file, recognised by its content.
+    """Return the field of an ICGEM ``.gfc``, GMAT ``.cof``, PDS SHADR or pyshtools file, recognised by its content.
 
     Raises
     ------
     DataFileError
-        Where the file is missing, is none of these, is cut short, lacks coefficients or holds them in another
-        normalisation than the full one.
+        Where the file is missing, is none of these, is cut short, lacks coefficients, holds them in another
+        normalisation than the full one, or is that of another body.
     """
     file = Path(path)
     try:
@@ -117,14 +125,15 @@ def load_gravity(path: Path | str, max_degree: int | None = None) -> GravityFiel
         name, gm, radius, degree, records = _parse_cof(file, lines)
     elif lines and lines[0].count(",") >= 5:
         name, gm, radius, degree, records = _parse_shadr(file, lines)
+    elif (head := _shtools_header(lines)) is not None:
+        name, gm, radius, degree, records = _parse_shtools(file, lines, head)
     else:
         raise DataFileError(
-            file, "", "an ICGEM, GMAT .cof or PDS SHADR gravity field", "none of their headers"
+            file, "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field", "none of their headers"
         )
-    if not (1e11 < gm < 1e15 and 1e6 < radius < 1e8):
-        raise DataFileError(
-            file, "header", "GM in m3/s2 and a radius in m of a moon or planet", f"{gm:g} and {radius:g}"
-        )
+    if abs(gm / GM_MOON_M3_S2 - 1) > GM_TOLERANCE or abs(radius / MOON_RADIUS_M - 1) > RADIUS_TOLERANCE:
+        moon = f"the Moon's GM of {GM_MOON_M3_S2:.6g} m3/s2 and radius of {MOON_RADIUS_M:.6g} m"
+        raise DataFileError(file, "header", moon, f"{gm:.6g} m3/s2 and {radius:.6g} m")
     return _assembled(file, name, gm, radius, degree, records, max_degree)
 
 
@@ -248,6 +257,28 @@ def _parse_shadr(file: Path, lines: list[str]) -> Parsed:
     return file.stem, gm_km * 1e9, radius_km * 1e3, degree, records()
 
 
+def _shtools_header(lines: list[str]) -> int | None:
+    """Return the index of the line with radius, GM, rotation and degree, which one header line may precede."""
+    head = [k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")][:2]
+    for k in head:
+        words = lines[k].split(",")
+        if len(words) in (4, 5) and all(re.fullmatch(r"\s*[-+.\dEeDd]+\s*", word) for word in words):
+            return k
+    return None
+
+
+def _parse_shtools(file: Path, lines: list[str], head: int) -> Parsed:
+    radius, gm, _, degree = (_real(file, f"line {head + 1}", word) for word in lines[head].split(",")[:4])
+    unit_m = 1e3 if radius < 1e5 else 1.0
+
+    def records() -> Iterator[Record]:
+        for number, line in enumerate(lines[head + 1 :], start=head + 2):
+            if line.strip() and not line.startswith("#"):
+                yield _record(file, number, line.split(",")[:4])
+
+    return file.stem, gm * unit_m**3, radius * unit_m, int(degree), records()
+
+
 def _record(file: Path, number: int, words: list[str]) -> Record:
     try:
         n, m, c, s = words
@@ -310,7 +341,8 @@ def _assembled(
     if seen[0, 0] and abs(c_bar[0, 0] - 1.0) > 1e-12:
         raise DataFileError(file, "degree 0, order 0", "1", f"{c_bar[0, 0]!r}")
     c_bar[0, 0] = 1.0
-    if wanted >= 2 and not 1e-9 < abs(c_bar[2, 0]) < 1e-2:
-        raise DataFileError(file, "degree 2, order 0", "a normalised flattening term", f"{c_bar[2, 0]!r}")
+    if wanted >= 2 and abs(c_bar[2, 0] / C20_MOON - 1.0) > C20_TOLERANCE:
+        expected = f"the normalised flattening term {C20_MOON:g} of the Moon"
+        raise DataFileError(file, "degree 2, order 0", expected, f"{float(c_bar[2, 0]):g}")
     c_bar.flags.writeable = s_bar.flags.writeable = False
     return GravityField(name, gm, radius, c_bar, s_bar)

@@ -30,6 +30,15 @@ def earth_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
     return -_moon_from_earth_m(np.asarray(tdb_s, dtype=np.float64))
 
 
+def moon_barycentric_icrf_m(tdb_s: ArrayLike) -> FloatArray:
+    """Return the Moon's position from the barycentre of the solar system, shape ``(..., 3)``, to 20 km."""
+    import erfa
+
+    _, barycentric = erfa.epv00(_J2000_JD, np.asarray(tdb_s, dtype=np.float64) / SECONDS_PER_DAY)
+    earth = ASTRONOMICAL_UNIT_M * np.asarray(barycentric["p"], dtype=np.float64)
+    return earth - earth_position_icrf_m(tdb_s)
+
+
 def sun_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
     """Return the Sun's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000 ``(...)``."""
     import erfa

@@ -1,7 +1,8 @@
 """UTC, TAI, TDB and the on-board clock.
 
 ``utc_ns`` is a count of nanoseconds since 1970-01-01T00:00:00 UTC in days of 86,400 s (the POSIX count): an
-``int`` or an int64 array.  It repeats itself during a leap second.  ``tai_ns`` counts nanoseconds since
+``int`` or an int64 array.  It repeats itself after a leap second, in which only ``tai_ns`` tells instants apart:
+texts of such epochs are read by `parse_tai` and refused by `parse_utc`.  ``tai_ns`` counts nanoseconds since
 1970-01-01T00:00:00 TAI. ``tdb_s`` is a float64 of TDB seconds past J2000 (2000-01-01T12:00:00 TDB), good to
 0.1 us in this century, for dynamics and frames only.  ``ticks`` counts units of 2^-16 s since the on-board
 epoch 2000-01-01T00:00:00 TAI.
@@ -17,11 +18,14 @@ equation 2.6 (good to 10 us from 1600 to 2200).
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, overload
 
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.errors import LeapSecondError, TimeFormatError
+from lunar.utc import LEAP_DATES as LEAP_DATES
 from lunar.utc import NS as NS
 from lunar.utc import format_utc as format_utc
 from lunar.utc import parse_utc as parse_utc
@@ -40,18 +44,6 @@ J2000_TT_AS_UTC_COUNT_NS = 946_728_000 * NS
 ONBOARD_EPOCH_TAI_NS = 946_684_800 * NS
 """2000-01-01T00:00:00 TAI, counted since 1970-01-01T00:00:00 TAI."""
 
-# fmt: off
-LEAP_DATES = [
-    "1972-01-01", "1972-07-01", "1973-01-01", "1974-01-01", "1975-01-01", "1976-01-01", "1977-01-01",
-    "1978-01-01", "1979-01-01", "1980-01-01", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01",
-    "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01",
-    "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01",
-]
-# fmt: on
-_LEAP_UTC_NS: IntArray = np.array(LEAP_DATES, dtype="datetime64[ns]").astype(np.int64)
-_TAI_MINUS_UTC_NS: IntArray = (10 + np.arange(len(LEAP_DATES), dtype=np.int64)) * NS
-_LEAP_TAI_NS: IntArray = _LEAP_UTC_NS + _TAI_MINUS_UTC_NS
-
 # Kaplan 2005, equation 2.6: amplitude in s, rate in rad per Julian century, phase in rad.
 _TDB_TERMS = np.array(
     [
@@ -65,6 +57,13 @@ _TDB_TERMS = np.array(
 )
 
 
+@cache
+def _leap_table(dates: tuple[str, ...]) -> tuple[IntArray, IntArray]:
+    """Return the UTC counts (n,) from which each TAI - UTC holds, and TAI - UTC (n,) in ns."""
+    starts = np.array(dates, dtype="datetime64[ns]").astype(np.int64)
+    return starts, (10 + np.arange(len(dates), dtype=np.int64)) * NS
+
+
 @overload
 def tai_ns_from_utc_ns(utc_ns: int) -> int: ...
 @overload
@@ -72,8 +71,9 @@ def tai_ns_from_utc_ns(utc_ns: IntArray) -> IntArray: ...
 def tai_ns_from_utc_ns(utc_ns: Any) -> Any:
     """Return nanoseconds since 1970-01-01T00:00:00 TAI."""
     counts = np.asarray(utc_ns, dtype=np.int64)
-    index = np.searchsorted(_LEAP_UTC_NS, counts, side="right") - 1
-    return _as_given(counts + _TAI_MINUS_UTC_NS[np.maximum(index, 0)], int)
+    starts, offsets = _leap_table(tuple(LEAP_DATES))
+    index = np.searchsorted(starts, counts, side="right") - 1
+    return _as_given(counts + offsets[np.maximum(index, 0)], int)
 
 
 @overload
@@ -85,8 +85,34 @@ def utc_ns_from_tai_ns(tai_ns: Any) -> Any:
     counts = np.asarray(tai_ns, dtype=np.int64)
     # A leap second starts one second before the new offset holds, and is counted like the first second after
     # it.
-    index = np.searchsorted(_LEAP_TAI_NS, counts, side="right") - 1
-    return _as_given(counts - _TAI_MINUS_UTC_NS[np.maximum(index, 0)], int)
+    starts, offsets = _leap_table(tuple(LEAP_DATES))
+    index = np.searchsorted(starts + offsets, counts, side="right") - 1
+    return _as_given(counts - offsets[np.maximum(index, 0)], int)
+
+
+def in_leap_second(tai_ns: Any) -> Any:
+    """Return whether instants (...) are within a leap second."""
+    counts = np.asarray(tai_ns, dtype=np.int64)
+    return _as_given(tai_ns_from_utc_ns(utc_ns_from_tai_ns(counts)) != counts, bool)
+
+
+def parse_tai(text: str, time_system: str = "UTC") -> int:
+    """Return ``tai_ns`` of a text in one of `TIME_SYSTEMS`, in UTC also within a leap second; raises as `parse_utc`."""
+    try:
+        return int(to_tai_ns(parse_utc(text), time_system))
+    except LeapSecondError as error:
+        if time_system != "UTC":
+            raise TimeFormatError(text) from None
+        return tai_ns_from_utc_ns(error.next_utc_ns) - NS
+
+
+def format_tai(tai_ns: int, digits: int = 3) -> str:
+    """Return the UTC text of an instant, rounded to ``digits`` decimals, with second 60 in a leap second."""
+    step = 10 ** (9 - digits)
+    rounded = (int(tai_ns) + step // 2) // step * step
+    leap = int(in_leap_second(rounded))
+    text = format_utc(utc_ns_from_tai_ns(rounded) - leap * NS, digits)
+    return text.replace(":59:59", ":59:60") if leap else text
 
 
 @overload
@@ -95,8 +121,12 @@ def tdb_s_from_utc_ns(utc_ns: int) -> float: ...
 def tdb_s_from_utc_ns(utc_ns: IntArray) -> FloatArray: ...
 def tdb_s_from_utc_ns(utc_ns: Any) -> Any:
     """Return TDB seconds past J2000."""
-    tai_ns = tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64))
-    tt_s = (tai_ns + (TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS)) / NS
+    return tdb_s_from_tai_ns(tai_ns_from_utc_ns(utc_ns))
+
+
+def tdb_s_from_tai_ns(tai_ns: Any) -> Any:
+    """Return TDB seconds past J2000."""
+    tt_s = (np.asarray(tai_ns, dtype=np.int64) + (TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS)) / NS
     return _as_given(tt_s + tdb_minus_tt_s(tt_s), float)
 
 
@@ -125,23 +155,23 @@ def tdb_minus_tt_s(tt_s: FloatArray | float) -> FloatArray:
     )
 
 
-def to_utc_ns(counts: Any, time_system: str) -> Any:
-    """Return ``utc_ns`` of calendar counts (ns of 86,400 s days since 1970) read in one of `TIME_SYSTEMS`."""
+def to_tai_ns(counts: Any, time_system: str) -> Any:
+    """Return ``tai_ns`` of calendar counts (ns of 86,400 s days since 1970) read in one of `TIME_SYSTEMS`."""
     values = np.asarray(counts, dtype=np.int64)
     if time_system == "UTC":
-        return _as_given(values, int)
+        return _as_given(tai_ns_from_utc_ns(values), int)
     if time_system == "TDB":
         tdb_s = (values - J2000_TT_AS_UTC_COUNT_NS) / NS
         values = values - np.rint(tdb_minus_tt_s(tdb_s) * NS).astype(np.int64)
-    return _as_given(np.asarray(utc_ns_from_tai_ns(values - _COUNT_MINUS_TAI_NS[time_system])), int)
+    return _as_given(values - _COUNT_MINUS_TAI_NS[time_system], int)
 
 
-def from_utc_ns(utc_ns: Any, time_system: str) -> Any:
-    """Return calendar counts (ns of 86,400 s days since 1970) in one of `TIME_SYSTEMS` at ``utc_ns``."""
-    values = np.asarray(utc_ns, dtype=np.int64)
+def from_tai_ns(tai_ns: Any, time_system: str) -> Any:
+    """Return calendar counts (ns of 86,400 s days since 1970) in one of `TIME_SYSTEMS` at ``tai_ns``."""
+    values = np.asarray(tai_ns, dtype=np.int64)
     if time_system == "UTC":
-        return _as_given(values, int)
-    counts = np.asarray(tai_ns_from_utc_ns(values)) + _COUNT_MINUS_TAI_NS[time_system]
+        return _as_given(utc_ns_from_tai_ns(values), int)
+    counts = values + _COUNT_MINUS_TAI_NS[time_system]
     if time_system == "TDB":
         tt_s = (counts - J2000_TT_AS_UTC_COUNT_NS) / NS
         counts = counts + np.rint(tdb_minus_tt_s(tt_s) * NS).astype(np.int64)
@@ -170,6 +200,6 @@ def utc_ns_from_ticks(ticks: Any) -> Any:
     return _as_given(np.asarray(utc_ns_from_tai_ns(np.asarray(tai_ns))), int)
 
 
-def _as_given(values: Any, scalar: type[int] | type[float]) -> Any:
+def _as_given(values: Any, scalar: type[int] | type[float] | type[bool]) -> Any:
     array = np.asarray(values)
     return scalar(array) if array.ndim == 0 else array

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime, timedelta
 
-from lunar.errors import TimeFormatError
+from lunar.errors import LeapSecondError, TimeFormatError
 
 NS = 1_000_000_000
 
@@ -16,6 +16,16 @@ _ISO = re.compile(
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
+# fmt: off
+LEAP_DATES = [
+    "1972-01-01", "1972-07-01", "1973-01-01", "1974-01-01", "1975-01-01", "1976-01-01", "1977-01-01",
+    "1978-01-01", "1979-01-01", "1980-01-01", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01",
+    "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01",
+    "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01",
+]
+# fmt: on
+"""Days before which UTC had a leap second; TAI - UTC is 10 s on the first one.  A new one is added here only."""
+
 FIRST_YEAR, LAST_YEAR = 1700, 2250
 """Years whose nanoseconds since 1970 fit 64 bits."""
 
@@ -23,13 +33,14 @@ FIRST_YEAR, LAST_YEAR = 1700, 2250
 def parse_utc(text: str) -> int:
     """Return ``utc_ns`` of a text like ``2029-08-07T00:00:00.000Z`` or ``2029-219T00:00:00`` (day of year).
 
-    The time of day and the ``Z`` may be absent; a second 60 counts as the first of the next minute; digits
-    past the nanosecond are dropped.
+    The time of day and the ``Z`` may be absent; digits past the nanosecond are dropped.
 
     Raises
     ------
     TimeFormatError
-        Where the text is no such epoch, or names a day or an hour that does not exist.
+        Where the text is no such epoch, or names a day, an hour or a leap second that does not exist.
+    LeapSecondError
+        Where it is within a leap second; `lunar.timescales.parse_tai` reads these too.
     """
     match = _ISO.match(text.strip())
     if match is None:
@@ -47,10 +58,16 @@ def parse_utc(text: str) -> int:
     if not FIRST_YEAR <= date.year <= LAST_YEAR:
         raise TimeFormatError(text)
     hours, minutes, seconds = int(hour or 0), int(minute or 0), int(second or 0)
-    if hours > 23 or minutes > 59 or seconds > 60 or (seconds == 60 and minutes != 59):
+    if hours > 23 or minutes > 59 or seconds > 60:
         raise TimeFormatError(text)
     whole = (date - _EPOCH).days * 86_400 + hours * 3600 + minutes * 60 + seconds
-    return whole * NS + int(((fraction or "") + "000000000")[:9])
+    utc_ns = whole * NS + int(((fraction or "") + "000000000")[:9])
+    if seconds == 60:
+        ends_day = (hours, minutes) == (23, 59)
+        if not ends_day or f"{date + timedelta(days=1):%Y-%m-%d}" not in LEAP_DATES[1:]:
+            raise TimeFormatError(text)
+        raise LeapSecondError(text, utc_ns)
+    return utc_ns
 
 
 def format_utc(utc_ns: int, digits: int = 3) -> str:

@@ -302,8 +302,16 @@ class Operations(Connection):
 
     # exports
 
-    @operation("POST /exports", body=("pass_id", "format", "states"))
-    def export_pass(self, pass_id: int, format: str, out: Path, *, states: str = "reference") -> None:
+    @operation("POST /exports", body=("pass_id", "format", "states", "version"))
+    def export_pass(
+        self,
+        pass_id: int,
+        format: str,
+        out: Path,
+        *,
+        states: str = "reference",
+        version: Literal["1.0", "2.0"] = "2.0",
+    ) -> None:
         """Return a pass in a format of other tools."""
 
     @operation("GET /exports/formats")

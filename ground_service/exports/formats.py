@@ -35,13 +35,13 @@ class Format:
 _ALL = (
     Format("oem", "oem", "CCSDS OEM 2.0 (text) of the reference or of the navigation filter", states=True),
     Format("oem-xml", "xml", "CCSDS OEM 2.0 in XML", states=True),
-    Format("aem", "aem", "CCSDS AEM 1.0: attitude of the camera in each frame"),
+    Format("aem", "aem", "CCSDS AEM 2.0 (or 1.0): attitude of the camera in each frame"),
     Format("spk", "bsp", "SPICE SPK: orbit", "spiceypy", "spice", states=True),
     Format("ck", "bc", "SPICE CK: attitude of the camera", "spiceypy", "spice"),
     Format(
         "spice",
         "zip",
-        "SPICE kernels of all kinds, leap seconds and a meta-kernel",
+        "SPICE kernels of all kinds, leap seconds, the Moon and a meta-kernel",
         "spiceypy",
         "spice",
         states=True,

@@ -110,7 +110,7 @@ def _footprints(camera: PinholeCamera, poses: Poses) -> Layer:
         fields = {
             "frame": int(poses.frame_number[k]),
             "utc": format_utc(int(poses.utc_ns[k])),
-            "complete": int(on_ground.all()),
+            "complete": bool(on_ground.all()),
             "states": poses.states,
         }
         features.append(Feature(cut_ring(degrees_of(ring[on_ground])), fields))

@@ -28,7 +28,7 @@ from ground_service.evaluation.core import PassInputs
 from ground_service.exports.layers import CRS, CRS_URN, Feature, Layer, layers_of
 from ground_service.exports.poses import Poses, poses_of
 from lunar.arrays import FloatArray, IntArray
-from lunar.frames import mcmf_from_spherical, quaternion_from_matrix
+from lunar.frames import continuous_quaternions, mcmf_from_spherical, quaternion_from_matrix
 from lunar.timescales import NS, format_utc
 from tmtc.errors import MissingLibrary
 
@@ -47,6 +47,10 @@ MAPS = ("geojson", "gpkg", "czml")
 
 _WKB = {"Point": 1, "LineString": 2, "Polygon": 3, "MultiLineString": 5, "MultiPolygon": 6}
 _DECIMALS = 8
+_TIMES = ("utc", "start", "stop")
+"""Fields with UTC texts, which are DATETIME in a GeoPackage."""
+
+_GDAL_UTC = 100
 
 
 def map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:
@@ -118,12 +122,17 @@ def geopackage_octets(layers: Sequence[Layer]) -> bytes:
                 layer=layer.name,
                 driver="GPKG",
                 append=path.exists(),
+                gdal_tz_offsets={
+                    name: np.full(len(layer.features), _GDAL_UTC) for name in _TIMES if name in layer.fields
+                },
             )
         return path.read_bytes() if path.exists() else b""
 
 
 def _field_array(layer: Layer, name: str) -> Any:
     values = [one.fields[name] for one in layer.features]
+    if name in _TIMES:
+        return np.array([value.rstrip("Z") for value in values], dtype="datetime64[ms]")
     return np.array(values, dtype=object) if isinstance(values[0], str) else np.array(values)
 
 
@@ -195,10 +204,7 @@ def _spacecraft(poses: Poses) -> dict[str, Any]:
     packet = _track(poses.states, poses.utc_ns, poses.position_mcmf_m)
     # CZML turns body axes to fixed axes, scalar last.
     q_wxyz = quaternion_from_matrix(np.swapaxes(poses.camera_from_mcmf, -1, -2))
-    signs = np.cumprod(
-        np.concatenate([[1.0], np.where(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0.0, -1.0, 1.0)])
-    )
-    epoch, values = _sampled(poses.utc_ns, np.roll(q_wxyz * signs[:, None], -1, axis=1), 12)
+    epoch, values = _sampled(poses.utc_ns, np.roll(continuous_quaternions(q_wxyz), -1, axis=1), 12)
     return packet | {
         "id": "spacecraft",
         "name": f"camera ({poses.states})",

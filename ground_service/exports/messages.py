@@ -24,7 +24,7 @@ from lunar.messages.spice import (
     format_ik,
     format_sclk,
     spacecraft_id,
-    spk_octets,
+    spk_kernel,
 )
 from lunar.timescales import LEAP_DATES, TICKS_PER_SECOND, utc_ns_from_ticks
 
@@ -101,12 +101,12 @@ def orbit_octets(inputs: PassInputs, craft: Craft, kind: str, states: str) -> by
     """Return the orbit of a pass as `oem`, `oem-xml` or `spk`."""
     ephemeris = ephemeris_of(inputs, states, craft)
     if kind == "spk":
-        return spk_octets(ephemeris, spacecraft_id(craft.number))
+        return spk_kernel(ephemeris, spacecraft_id(craft.number)).octets
     return (format_oem_xml(ephemeris) if kind == "oem-xml" else format_oem(ephemeris)).encode()
 
 
-def attitude_octets(inputs: PassInputs, craft: Craft, kind: str) -> bytes:
-    """Return the attitude of the camera in the frames of a pass as `aem` or `ck`.
+def attitude_octets(inputs: PassInputs, craft: Craft, kind: str, version: str) -> bytes:
+    """Return the attitude of the camera in the frames of a pass as `ck`, or `aem` of a version.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def attitude_octets(inputs: PassInputs, craft: Craft, kind: str) -> bytes:
         step = float(np.median(np.diff(ticks))) if len(ticks) > 1 else float(TICKS_PER_SECOND)
         return ck_octets(ticks, q_wxyz, spacecraft_id(craft.number), gap_ticks=int(GAP_STEPS * step))
     segment = AttitudeSegment(utc_ns, q_wxyz, object_name=craft.name, object_id=craft.name)
-    return format_aem((segment,)).encode()
+    return format_aem((segment,), version).encode()
 
 
 def clock_lines(correlations: Sequence[TimeCorrelation], ticks: IntArray) -> list[ClockLine]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, WithJsonSchema
 
@@ -31,6 +31,7 @@ class ExportRequest(Given):
         examples=["reference"],
         description="States of orbits and maps: `reference`, or the name of an estimator",
     )
+    version: Literal["1.0", "2.0"] = Field(default="2.0", description="Version of a CCSDS AEM")
 
 
 class ExportFormatInfo(Entity):

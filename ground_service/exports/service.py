@@ -18,6 +18,7 @@ from typing import IO
 
 import numpy as np
 
+from ground_service.clock import utc_now_ns
 from ground_service.errors import EvaluationError, storage_error
 from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
@@ -36,6 +37,8 @@ from ground_service.passes.service import get_pass
 from ground_service.passes.span import pass_span
 from ground_service.store.files import INCOMING, unfinished_prefix
 from lunar.frames import mcmf_from_spherical
+from lunar.messages.spice import format_pck, moon_kernel
+from lunar.timescales import format_utc
 from tmtc.errors import MissingLibrary
 
 ORBITS = ("oem", "oem-xml", "spk")
@@ -105,7 +108,9 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
     inputs = load_pass_inputs(ground, request.pass_id)
     kind = request.format
     if kind == "netcdf":
-        return netcdf_octets(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
+        history = f"{format_utc(utc_now_ns(), 0)} LINNA: pass {inputs.pass_id} exported as netCDF"
+        about = _about(inputs) | {"history": history}
+        return netcdf_octets(pass_tables(inputs, evaluate_pass(inputs).navigation), about)
     if kind in MAPS:
         return map_octets(inputs, kind, request.states)
     detail = get_pass(ground, request.pass_id)
@@ -116,7 +121,7 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
     if kind in ORBITS:
         return messages.orbit_octets(inputs, craft, kind, request.states)
     if kind in ATTITUDES:
-        return messages.attitude_octets(inputs, craft, kind)
+        return messages.attitude_octets(inputs, craft, kind, request.version)
     return messages.text_kernel(inputs, craft, kind).encode()
 
 
@@ -138,11 +143,17 @@ def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[t
         yield from _some(images, request.pass_id, "archived images")
     elif chosen.name == "spice":
         stem = f"pass-{request.pass_id}"
-        names = [f"{stem}.tls", *(f"{stem}.{FORMATS[kind].ending}" for kind in messages.KERNELS)]
-        yield names[0], messages.leap_seconds().encode()
-        for name, kind in zip(names[1:], messages.KERNELS, strict=True):
+        inputs = load_pass_inputs(ground, request.pass_id)
+        common = {
+            f"{stem}.tls": messages.leap_seconds().encode(),
+            f"{stem}.tpc": format_pck().encode(),
+            f"{stem}-moon.bsp": moon_kernel(inputs.start_utc_ns, inputs.stop_utc_ns),
+        }
+        yield from common.items()
+        own = {kind: f"{stem}.{FORMATS[kind].ending}" for kind in messages.KERNELS}
+        for kind, name in own.items():
             yield name, _octets(ground, request.model_copy(update={"format": kind}))
-        yield f"{stem}.tm", messages.meta_kernel(names).encode()
+        yield f"{stem}.tm", messages.meta_kernel([*common, *own.values()]).encode()
     else:
         inputs = load_pass_inputs(ground, request.pass_id)
         if chosen.name == "csv":

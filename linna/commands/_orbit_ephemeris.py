@@ -46,15 +46,21 @@ def configure_convert(commands: Any) -> None:
     option(convert, "--out FILE", Path, "ending in .oem, .xml, .bsp, .e, .csv or .tum", required=True)
     option(convert, "--spice-id N", int, "SPICE number of the spacecraft in an SPK, such as -85")
     option(convert, "--step S", ABOVE_ZERO, "seconds between states (default: the states of the file)")
+    option(
+        convert,
+        "--type N",
+        ("3", "13"),
+        "type of an SPK: 3 (polynomials) or 13 (states); default: 3 if exact",
+    )
     finish(convert, run_convert)
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
+    from linna.data import load_orbit
     from lunar.comparison import compare
-    from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
-    first, second = load_ephemeris(arguments.a), load_ephemeris(arguments.b)
+    first, second = load_orbit(arguments.a), load_orbit(arguments.b)
     epochs = _epochs(arguments.step, first)
     if epochs is not None:
         epochs = epochs[second.covers(epochs)]
@@ -62,16 +68,22 @@ def run_compare(arguments: argparse.Namespace) -> int:
     figures: dict[str, Any] = {
         "max_m": difference.max_m,
         "rms_m": difference.rms_m,
+        "mean_rtn_m": list(difference.mean_rtn_m),
         "rms_rtn_m": list(difference.rms_rtn_m),
         "samples": difference.samples,
         "start": format_utc(int(difference.utc_ns[0])),
         "stop": format_utc(int(difference.utc_ns[-1])),
     }
-    radial, transverse, normal = difference.rms_rtn_m
+    rows = [
+        f"{name:<4} radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
+        for name, (radial, transverse, normal) in (
+            ("mean", difference.mean_rtn_m),
+            ("rms", difference.rms_rtn_m),
+        )
+    ]
     text = (
         f"{difference.samples} epochs from {figures['start']} to {figures['stop']}\n"
-        f"distance: max {difference.max_m:.6g} m, rms {difference.rms_m:.6g} m\n"
-        f"rms radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
+        f"distance: max {difference.max_m:.6g} m, rms {difference.rms_m:.6g} m\n" + "\n".join(rows)
     )
     return emit(arguments, figures, text=text)
 
@@ -79,25 +91,24 @@ def run_compare(arguments: argparse.Namespace) -> int:
 def run_interpolate(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from linna.data import data_folder
+    from linna.data import data_folder, load_orbit
     from lunar.datafolder import default_orientation
-    from lunar.ground_track import ground_track
-    from lunar.messages.ephemeris_files import load_ephemeris
-    from lunar.timescales import format_utc
+    from lunar.timescales import format_tai, tdb_s_from_tai_ns
+    from lunar.visibility import subsatellite
 
-    ephemeris = load_ephemeris(arguments.ephemeris)
+    ephemeris = load_orbit(arguments.ephemeris)
     epochs = np.array(_read_epochs(arguments.epochs), dtype=np.int64)
     orientation = default_orientation(data_folder())
-    position_m, velocity_m_s = ephemeris.at(epochs)
-    track = ground_track(ephemeris, orientation, epochs)
+    position_m, velocity_m_s = ephemeris.at_tai(epochs)
+    latitude, longitude, altitude_m = subsatellite(position_m, tdb_s_from_tai_ns(epochs), orientation)
     states = [
         {
-            "epoch": format_utc(int(epoch), 9 if epoch % 1_000_000 else 3),
+            "epoch": format_tai(int(epoch), 9 if epoch % 1_000_000 else 3),
             "position_km": (position_m[k] / 1e3).tolist(),
             "velocity_km_s": (velocity_m_s[k] / 1e3).tolist(),
-            "latitude_deg": float(np.degrees(track.latitude_rad[k])),
-            "longitude_deg": float(np.degrees(track.longitude_rad[k])),
-            "altitude_km": float(track.altitude_m[k]) / 1e3,
+            "latitude_deg": float(np.degrees(latitude[k])),
+            "longitude_deg": float(np.degrees(longitude[k])) % 360.0,
+            "altitude_km": float(altitude_m[k]) / 1e3,
         }
         for k, epoch in enumerate(epochs)
     ]
@@ -129,18 +140,18 @@ def run_convert(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris import ephemeris_from_states
+    from lunar.ephemeris import resampled
     from lunar.messages.ephemeris_files import is_spk, load_ephemeris
     from lunar.messages.oem import format_oem
     from lunar.messages.oem_xml import format_oem_xml
-    from lunar.messages.spice import READ_STEP_S, load_spk, spk_octets
+    from lunar.messages.spice import READ_STEP_S, load_spk, spk_kernel
     from lunar.messages.stk import format_stk
     from lunar.messages.tabular import format_csv, format_tum
 
-    writers: dict[str, Callable[[Ephemeris], str | bytes]] = {
+    writers: dict[str, Callable[[Ephemeris], Any]] = {
         ".oem": format_oem,
         ".xml": format_oem_xml,
-        ".bsp": lambda states: spk_octets(states, _spice_id(arguments)),
+        ".bsp": lambda states: spk_kernel(states, _spice_id(arguments), int(arguments.type or 0) or None),
         ".e": format_stk,
         ".csv": lambda states: format_csv(states, default_orientation(data_folder())),
         ".tum": format_tum,
@@ -152,15 +163,24 @@ def run_convert(arguments: argparse.Namespace) -> int:
         ephemeris = load_spk(arguments.ephemeris, arguments.spice_id, arguments.step or READ_STEP_S)
     else:
         ephemeris = load_ephemeris(arguments.ephemeris)
-    epochs = _epochs(arguments.step, ephemeris)
-    if epochs is not None:
-        name = ephemeris.segments[0].object_name
-        ephemeris = ephemeris_from_states(epochs, *ephemeris.at(epochs), object_name=name)
+    if arguments.step or out.suffix.lower() in (".e", ".csv", ".tum"):
+        ephemeris = resampled(ephemeris, arguments.step)
     written = writers[out.suffix.lower()](ephemeris)
+    figures: dict[str, Any] = {
+        "out": str(out),
+        "states": sum(len(segment.utc_ns) for segment in ephemeris.segments),
+        "segments": len(ephemeris.segments),
+        "frame": "ICRF, Moon-centred",
+    }
+    text = f"{figures['states']} states in {figures['segments']} segments, {figures['frame']}"
+    if out.suffix.lower() == ".bsp":
+        figures |= {"states": written.states, "spk_type": written.data_type, "error_m": written.error_m}
+        text = f"SPK of type {written.data_type}, {written.states} states, {figures['frame']}"
+        if written.error_m is not None:
+            text = text.replace("states", "records of polynomials") + f", within {written.error_m:.1e} m"
+        written = written.octets
     save(out, written if isinstance(written, bytes) else written.encode())
-    states = sum(len(segment.utc_ns) for segment in ephemeris.segments)
-    figures = {"out": str(out), "states": states, "segments": len(ephemeris.segments)}
-    return emit(arguments, figures, text=f"{figures['states']} states -> {out}")
+    return emit(arguments, figures, text=f"{text} -> {out}")
 
 
 def _spice_id(arguments: argparse.Namespace) -> int:
@@ -178,10 +198,10 @@ def _epochs(step_s: float | None, ephemeris: Any) -> Any:
 
 
 def _read_epochs(name: str) -> list[int]:
-    """UTC epochs of a file, one a line; blank lines and what follows a # are left out."""
+    """TAI of UTC epochs in a file, one a line; blank lines and what follows a # are left out."""
     from lunar.ephemeris import read_text
     from lunar.errors import DataFileError, TimeFormatError
-    from lunar.timescales import parse_utc
+    from lunar.timescales import parse_tai
 
     text = sys.stdin.read() if name == "-" else read_text(name, "a list of UTC epochs")
     epochs = []
@@ -190,7 +210,7 @@ def _read_epochs(name: str) -> list[int]:
         if not wanted:
             continue
         try:
-            epochs.append(parse_utc(wanted))
+            epochs.append(parse_tai(wanted))
         except TimeFormatError:
             expected = "a UTC epoch like 2029-08-07T00:00:00.000Z"
             raise DataFileError(name, f"line {number}", expected, repr(wanted)) from None

@@ -34,14 +34,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_fov_study(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from linna.data import data_folder
+    from linna.data import data_folder, load_orbit
     from lunar.datafolder import default_orientation
     from lunar.fov_study import PAPER_COUNTS, study_field_of_view
     from lunar.frames import mcmf_from_spherical
     from lunar.ground_track import even_epochs, ground_track
-    from lunar.messages.ephemeris_files import load_ephemeris
 
-    ephemeris = load_ephemeris(arguments.ephemeris)
+    ephemeris = load_orbit(arguments.ephemeris)
     catalogue = open_catalogue(arguments.catalogue, arguments.seed)
     orientation = default_orientation(data_folder())
     epochs = None if arguments.step is None else even_epochs(ephemeris, arguments.step)

@@ -33,6 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"states of orbits and maps: {REFERENCE} (default), or the name of an estimator",
         default=REFERENCE,
     )
+    option(parser, "--version V", ("1.0", "2.0"), "version of a CCSDS AEM", "2.0")
     add_operator_options(parser)
     finish(parser, run)
 
@@ -49,7 +50,13 @@ def run(arguments: argparse.Namespace) -> int:
     log(f"exporting pass {arguments.pass_id} as {arguments.format} ...")
     with ground_client(arguments) as service, tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "export.zip" if unpacked else out
-        service.export_pass(arguments.pass_id, arguments.format, target, states=arguments.states)
+        service.export_pass(
+            arguments.pass_id,
+            arguments.format,
+            target,
+            states=arguments.states,
+            version=arguments.version,
+        )
         files = _unpack(target, out) if unpacked else [out]
     figures = {
         "pass_id": arguments.pass_id,

@@ -153,15 +153,14 @@ def configure_visibility(commands: Any) -> None:
 
 
 def run_visibility(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
+    from linna.data import data_folder, load_orbit
     from lunar.contacts import visibility_spans
     from lunar.datafolder import default_orientation
-    from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     stations = tuple(_station(text) for text in arguments.station)
     orientation = default_orientation(data_folder())
-    ephemeris = load_ephemeris(arguments.ephemeris)
+    ephemeris = load_orbit(arguments.ephemeris)
     found = visibility_spans(ephemeris, orientation, stations, arguments.step)
 
     def listed(spans: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""CCSDS Attitude Ephemeris Message of quaternions in keyword notation: reads versions 1.0 and 2.0, writes 1.0.
+"""CCSDS Attitude Ephemeris Message of quaternions: reads and writes versions 1.0 and 2.0, and reads them in XML.
 
 A message gives the rotation from a reference frame A to a frame B of the spacecraft.  Here a quaternion is
 ``q_wxyz``, Hamilton's, with v_B = q v_A q*; the standard's is its conjugate (the matrix of the standard turns
@@ -17,8 +17,10 @@ import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.errors import EphemerisError, UnknownTimeSystemError
+from lunar.frames import continuous_quaternions
 from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
-from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns
+from lunar.messages.oem_xml import xml_lines
+from lunar.timescales import TIME_SYSTEMS, format_utc, tai_ns_from_utc_ns
 
 VERSIONS = ("1.0", "2.0")
 UNIT_TOLERANCE = 1e-3
@@ -78,7 +80,7 @@ class AttitudeSegment:
 
 
 def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...]:
-    """Return the segments in the text of an AEM; ``source`` names it in errors.
+    """Return the segments in the text of an AEM, in keyword notation or XML; ``source`` names it in errors.
 
     Raises
     ------
@@ -87,7 +89,9 @@ def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...
     UnknownTimeSystemError
         Where the time scale is none that can be converted.
     """
-    reader = Lines(numbered_lines(text.splitlines()), source)
+    is_xml = text.lstrip().startswith("<")
+    lines = xml_lines(text.encode(), source) if is_xml else numbered_lines(text.splitlines())
+    reader = Lines(lines, source)
     reader.header("AEM", VERSIONS)
     segments: list[AttitudeSegment] = []
     while reader.peek() is not None:
@@ -100,16 +104,18 @@ def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...
     return tuple(segments)
 
 
-def format_aem(segments: tuple[AttitudeSegment, ...]) -> str:
-    """Return AEM 1.0 text, quaternions with the scalar last; CREATION_DATE is the first epoch."""
+def format_aem(segments: tuple[AttitudeSegment, ...], version: str = VERSIONS[-1]) -> str:
+    """Return AEM text, quaternions with the scalar last and continuous signs; CREATION_DATE is the first epoch."""
+    # Version 2.0 has neither direction nor order: it is always from A to B with the scalar last.
+    first = version == VERSIONS[0]
     lines = [
-        "CCSDS_AEM_VERS = 1.0",
+        f"CCSDS_AEM_VERS = {version}",
         f"CREATION_DATE = {format_utc(int(segments[0].utc_ns[0])).rstrip('Z')}",
         "ORIGINATOR = LINNA",
         "",
     ]
     for one in segments:
-        texts = epoch_texts(np.asarray(from_utc_ns(one.utc_ns, one.time_system)))
+        texts = epoch_texts(tai_ns_from_utc_ns(one.utc_ns), one.time_system)
         lines += [
             "META_START",
             *comment_lines(one.comments),
@@ -118,17 +124,18 @@ def format_aem(segments: tuple[AttitudeSegment, ...]) -> str:
             "CENTER_NAME = MOON",
             f"REF_FRAME_A = {one.frame_a}",
             f"REF_FRAME_B = {one.frame_b}",
-            "ATTITUDE_DIR = A2B",
+            *(["ATTITUDE_DIR = A2B"] if first else []),
             f"TIME_SYSTEM = {one.time_system}",
             f"START_TIME = {texts[0]}",
             f"STOP_TIME = {texts[-1]}",
             "ATTITUDE_TYPE = QUATERNION",
-            "QUATERNION_TYPE = LAST",
+            *(["QUATERNION_TYPE = LAST"] if first else []),
             "META_STOP",
             "",
             "DATA_START",
         ]
-        vector_last = (one.q_wxyz * [1.0, -1.0, -1.0, -1.0])[:, [1, 2, 3, 0]].tolist()
+        q_wxyz = continuous_quaternions(one.q_wxyz)
+        vector_last = (q_wxyz * [1.0, -1.0, -1.0, -1.0])[:, [1, 2, 3, 0]].tolist()
         row = "%s %.12f %.12f %.12f %.12f"
         lines += [row % (text, *values) for text, values in zip(texts, vector_last, strict=True)]
         lines += ["DATA_STOP", ""]

@@ -15,7 +15,7 @@ import numpy as np
 
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, UnknownFrameError
-from lunar.timescales import NS, format_utc, to_utc_ns
+from lunar.timescales import NS, format_tai, to_tai_ns, utc_ns_from_tai_ns
 
 UNITS_M = {"KM-S": (1e3, 1e3), "M-S": (1.0, 1.0), "KM-D": (1e3, 1e3 / 86_400.0)}
 """Metres and metres per second in units of the table, by its name for them."""
@@ -62,17 +62,19 @@ def parse_horizons(text: str, source: str = "Horizons table") -> Ephemeris:
         if not np.all(np.isfinite(states[-1])):
             raise DataFileError(source, f"line {number}", "finite numbers", repr(line[:60]))
         if len(epochs) > 1 and epochs[-1] <= epochs[-2]:
-            expected = f"an epoch after {format_utc(epochs[-2])}"
-            raise DataFileError(source, f"line {number}", expected, format_utc(epochs[-1]))
+            expected = f"an epoch after {format_tai(epochs[-2])}"
+            raise DataFileError(source, f"line {number}", expected, format_tai(epochs[-1]))
     if not states:
         raise DataFileError(source, f"line {first + 1}", "at least one state", "none")
     values = np.array(states)
+    tai_ns = np.array(epochs, dtype=np.int64)
     segment = EphemerisSegment(
-        np.array(epochs, dtype=np.int64),
+        utc_ns_from_tai_ns(tai_ns),
         scale[0] * values[:, :3],
         scale[1] * values[:, 3:],
         object_name=name,
         object_id=name,
+        tai_ns=tai_ns,
     )
     return Ephemeris((segment,), "JPL Horizons")
 
@@ -119,4 +121,4 @@ def _epoch_ns(text: str) -> int:
         raise ValueError(text)
     whole = datetime.strptime(match[1] + " +0000", "%Y-%b-%d %H:%M:%S %z").timestamp()
     count = int(whole) * NS + int(((match[2] or "") + "000000000")[:9])
-    return int(to_utc_ns(count, "TDB"))
+    return int(to_tai_ns(count, "TDB"))

@@ -5,10 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lunar.arrays import IntArray
-from lunar.errors import DataFileError, TimeFormatError
-from lunar.timescales import NS, parse_utc, to_utc_ns
+from lunar.errors import DataFileError, LeapSecondError, TimeFormatError
+from lunar.timescales import (
+    NS,
+    from_tai_ns,
+    in_leap_second,
+    parse_tai,
+    tai_ns_from_utc_ns,
+    utc_ns_from_tai_ns,
+)
 
 _HEADER_KEYS = ("CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 
@@ -116,9 +123,16 @@ class Lines:
         return comments, meta, where
 
     def epoch(self, value: str, time_system: str, at: int | None = None) -> int:
-        """Return ``utc_ns`` of an epoch in a time system."""
+        """Return ``utc_ns`` of an epoch in a time system, which is not within a leap second."""
+        tai_ns = self.tai(value, time_system, at)
+        if in_leap_second(tai_ns):
+            raise self.error(LeapSecondError.expected, f"{value!r} {time_system}", at)
+        return utc_ns_from_tai_ns(tai_ns)
+
+    def tai(self, value: str, time_system: str, at: int | None = None) -> int:
+        """Return ``tai_ns`` of an epoch in a time system."""
         try:
-            return int(to_utc_ns(parse_utc(value), time_system))
+            return parse_tai(value, time_system)
         except TimeFormatError:
             raise self.error("an epoch like 2029-08-07T00:00:00.000", repr(value), at) from None
 
@@ -137,10 +151,18 @@ def comment_lines(comments: Iterable[str]) -> list[str]:
     return [f"COMMENT {line}".rstrip() for comment in comments for line in (comment.splitlines() or [""])]
 
 
-def epoch_texts(counts: IntArray) -> list[str]:
-    """Return calendar texts, with three decimals where that is exact for all of them and else nine."""
+def epoch_texts(tai_ns: ArrayLike, time_system: str) -> list[str]:
+    """Return calendar texts in a time system, with three decimals where that is exact for all and else nine."""
+    instants = np.atleast_1d(np.asarray(tai_ns, dtype=np.int64))
+    leap = in_leap_second(instants) & (time_system == "UTC")
+    counts = from_tai_ns(instants, time_system) - NS * leap
     unit = "ms" if np.all(counts % (NS // 1000) == 0) else "ns"
-    return [
-        str(text)
-        for text in np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]"))
-    ]
+    texts = np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]")).tolist()
+    for k in np.flatnonzero(leap).tolist():
+        texts[k] = texts[k].replace(":59:59", ":59:60")
+    return [str(text) for text in texts]
+
+
+def utc_epoch_text(utc_ns: int, time_system: str) -> str:
+    """Return the calendar text in a time system of one UTC epoch."""
+    return epoch_texts(tai_ns_from_utc_ns(utc_ns), time_system)[0]

@@ -29,8 +29,22 @@ from lunar.ephemeris import (
 )
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
-from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns, to_utc_ns
+from lunar.messages.kvn import (
+    Lines,
+    comment_lines,
+    epoch_texts,
+    is_number,
+    numbered_lines,
+    utc_epoch_text,
+)
+from lunar.timescales import (
+    TIME_SYSTEMS,
+    format_tai,
+    format_utc,
+    tai_ns_from_utc_ns,
+    to_tai_ns,
+    utc_ns_from_tai_ns,
+)
 
 VERSIONS = ("1.0", "2.0", "3.0")
 CENTRES = ("MOON",)
@@ -38,6 +52,8 @@ STATES_LIMIT = 1_000_000
 """States of a file: two years of states each minute."""
 
 BLOCK_ROWS = 10_000
+_CAST_ROWS = 256
+"""Texts that numpy turns into epochs at a time: it refuses a text among more than 500 by a segmentation fault."""
 
 _MANDATORY = (
     "OBJECT_NAME",
@@ -96,9 +112,10 @@ def parse_oem_lines(reader: Lines) -> Ephemeris:
     if not segments:
         raise reader.error("META_START", "the end of the file")
     for k, (earlier, later) in enumerate(pairwise(segments), start=2):
-        if later.start_utc_ns < earlier.stop_utc_ns:
-            expected = f"a start at or after {format_utc(earlier.stop_utc_ns)}, the end of the segment before"
-            raise DataFileError(reader.source, f"segment {k}", expected, format_utc(later.start_utc_ns))
+        start, stop = later.span_tai_ns[0], earlier.span_tai_ns[1]
+        if start < stop:
+            expected = f"a start at or after {format_tai(stop)}, the end of the segment before"
+            raise DataFileError(reader.source, f"segment {k}", expected, format_tai(start))
     return Ephemeris(tuple(segments), header["ORIGINATOR"], tuple(comments))
 
 
@@ -144,19 +161,21 @@ def _read_segment(reader: Lines, left: int) -> EphemerisSegment:
             f"an INTERPOLATION out of {', '.join(INTERPOLATIONS)}", repr(method), where["INTERPOLATION"]
         )
     degree = _degree(reader, meta, where, method)
-    times: dict[str, int] = {
+    useable: dict[str, int] = {
         key: reader.epoch(meta[key], system, where[key])
-        for key in ("START_TIME", "USEABLE_START_TIME", "USEABLE_STOP_TIME", "STOP_TIME")
+        for key in ("USEABLE_START_TIME", "USEABLE_STOP_TIME")
         if key in meta
     }
+    ends = {key: reader.tai(meta[key], system, where[key]) for key in ("START_TIME", "STOP_TIME")}
     comments += reader.comments()
-    utc_ns, states, lines_at = _read_states(reader, system, left)
-    _check_epochs(reader, utc_ns, times, lines_at)
+    tai_ns, states, lines_at = _read_states(reader, system, left)
+    spans = ends | {key: tai_ns_from_utc_ns(value) for key, value in useable.items()}
+    _check_epochs(reader, tai_ns, spans, lines_at)
     position_m, velocity_m_s = 1e3 * states[:, :3], 1e3 * states[:, 3:6]
     if frame in J2000_NAMES:
         position_m, velocity_m_s = position_m @ icrf_from_j2000().T, velocity_m_s @ icrf_from_j2000().T
     return EphemerisSegment(
-        utc_ns,
+        utc_ns_from_tai_ns(tai_ns),
         position_m,
         velocity_m_s,
         centre="MOON",
@@ -166,10 +185,11 @@ def _read_segment(reader: Lines, left: int) -> EphemerisSegment:
         time_system=system,
         interpolation=method,
         degree=degree,
-        useable_start_utc_ns=times.get("USEABLE_START_TIME"),
-        useable_stop_utc_ns=times.get("USEABLE_STOP_TIME"),
+        useable_start_utc_ns=useable.get("USEABLE_START_TIME"),
+        useable_stop_utc_ns=useable.get("USEABLE_STOP_TIME"),
         comments=tuple(comments),
         covariances=tuple(_read_covariances(reader, system, meta["REF_FRAME"])),
+        tai_ns=tai_ns,
     )
 
 
@@ -185,7 +205,7 @@ def _degree(reader: Lines, meta: dict[str, str], where: dict[str, int], method: 
 
 
 def _read_states(reader: Lines, system: str, left: int) -> tuple[IntArray, FloatArray, IntArray]:
-    """Return epochs (n,), states (n, 6 or 9) in km and line numbers (n,); at most ``left`` of them."""
+    """Return epochs (n,) in TAI, states (n, 6 or 9) in km and line numbers (n,); at most ``left`` of them."""
     if not (reader.peek() or " ")[0].isdigit():
         found = reader.peek()
         expected = "a state: epoch x y z vx vy vz"
@@ -197,13 +217,15 @@ def _read_states(reader: Lines, system: str, left: int) -> tuple[IntArray, Float
         left -= len(rows)
         if left < 0:
             raise reader.error(f"at most {STATES_LIMIT} states", "more")
-        blocks.append((*_parse_states(reader, rows, at, width), np.array(at)))
+        blocks.append((*_parse_states(reader, rows, at, width, system), np.array(at)))
     epochs, numbers, lines = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    return np.asarray(to_utc_ns(epochs, system)), numbers, lines
+    return epochs, numbers, lines
 
 
-def _parse_states(reader: Lines, rows: list[str], at: list[int], width: int) -> tuple[IntArray, FloatArray]:
-    """Return the epochs and numbers of a block of rows with ``width`` values each."""
+def _parse_states(
+    reader: Lines, rows: list[str], at: list[int], width: int, system: str
+) -> tuple[IntArray, FloatArray]:
+    """Return the epochs in TAI and numbers of a block of rows with ``width`` values each."""
     table = None
     if width in (7, 10):
         # The reader of numpy takes epochs and numbers in one go; what it refuses is gone through line by line.
@@ -225,51 +247,55 @@ def _parse_states(reader: Lines, rows: list[str], at: list[int], width: int) -> 
     bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
     if bad.size:
         raise reader.error("finite numbers", "NaN or infinity", at[int(bad[0])])
-    return _epochs(reader, table["epoch"], at), numbers
+    return _epochs(reader, table["epoch"], at, system), numbers
 
 
-def _epochs(reader: Lines, texts: NDArray[np.bytes_], at: list[int]) -> IntArray:
-    # numpy reads calendar dates in one go; other notations and faults go through the slow reader, which names the line.
+def _epochs(reader: Lines, texts: NDArray[np.bytes_], at: list[int], system: str) -> IntArray:
+    # numpy reads calendar dates in one go; other notations, leap seconds and faults go through the slow reader, which
+    # names the line.
     if np.all(np.strings.endswith(texts, b"Z")):
         texts = np.strings.rstrip(texts, b"Z")
     if texts[0][4:5] == b"-" and texts[0][7:8] == b"-":
         with suppress(ValueError):
-            return texts.astype("datetime64[ns]").astype(np.int64)
+            parts = [
+                texts[k : k + _CAST_ROWS].astype("datetime64[ns]") for k in range(0, len(texts), _CAST_ROWS)
+            ]
+            return np.asarray(to_tai_ns(np.concatenate(parts).astype(np.int64), system))
     return np.array(
-        [reader.epoch(text.decode("latin-1"), "UTC", line) for text, line in zip(texts, at, strict=True)],
+        [reader.tai(text.decode("latin-1"), system, line) for text, line in zip(texts, at, strict=True)],
         dtype=np.int64,
     )
 
 
-def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], at: IntArray) -> None:
-    late = np.flatnonzero(np.diff(utc_ns) <= 0)
+def _check_epochs(reader: Lines, tai_ns: IntArray, times: dict[str, int], at: IntArray) -> None:
+    late = np.flatnonzero(np.diff(tai_ns) <= 0)
     if late.size:
         k = int(late[0])
         raise reader.error(
-            f"an epoch after {format_utc(int(utc_ns[k]), 6)}",
-            format_utc(int(utc_ns[k + 1]), 6),
+            f"an epoch after {format_tai(int(tai_ns[k]), 6)}",
+            format_tai(int(tai_ns[k + 1]), 6),
             int(at[k + 1]),
         )
     start_ns, stop_ns, grace_ns = times["START_TIME"], times["STOP_TIME"], 10**6  # Both may be rounded.
-    outside = np.flatnonzero((utc_ns < start_ns - grace_ns) | (utc_ns > stop_ns + grace_ns))
+    outside = np.flatnonzero((tai_ns < start_ns - grace_ns) | (tai_ns > stop_ns + grace_ns))
     if outside.size:
-        span = f"{format_utc(start_ns)}..{format_utc(stop_ns)} (START_TIME..STOP_TIME)"
+        span = f"{format_tai(start_ns)}..{format_tai(stop_ns)} (START_TIME..STOP_TIME)"
         k = int(outside[0])
-        raise reader.error(f"an epoch within {span}", format_utc(int(utc_ns[k])), int(at[k]))
-    is_cut = stop_ns > utc_ns[-1] + grace_ns
-    if is_cut or start_ns < utc_ns[0] - grace_ns:
+        raise reader.error(f"an epoch within {span}", format_tai(int(tai_ns[k])), int(at[k]))
+    is_cut = stop_ns > tai_ns[-1] + grace_ns
+    if is_cut or start_ns < tai_ns[0] - grace_ns:
         side, key = (-1, "STOP_TIME") if is_cut else (0, "START_TIME")
         raise reader.error(
-            f"a {'last' if side else 'first'} state at {key} = {format_utc(times[key])}",
-            f"{format_utc(int(utc_ns[side]))}; the segment is cut short",
+            f"a {'last' if side else 'first'} state at {key} = {format_tai(times[key])}",
+            f"{format_tai(int(tai_ns[side]))}; the segment is cut short",
             int(at[side]),
         )
-    low = times.get("USEABLE_START_TIME", int(utc_ns[0]))
-    high = times.get("USEABLE_STOP_TIME", int(utc_ns[-1]))
-    if low > high or low > utc_ns[-1] or high < utc_ns[0]:
+    low = times.get("USEABLE_START_TIME", int(tai_ns[0]))
+    high = times.get("USEABLE_STOP_TIME", int(tai_ns[-1]))
+    if low > high or low > tai_ns[-1] or high < tai_ns[0]:
         raise reader.error(
-            f"a useable interval within {format_utc(int(utc_ns[0]))}..{format_utc(int(utc_ns[-1]))}",
-            f"{format_utc(low)}..{format_utc(high)}",
+            f"a useable interval within {format_tai(int(tai_ns[0]))}..{format_tai(int(tai_ns[-1]))}",
+            f"{format_tai(low)}..{format_tai(high)}",
             int(at[0]),
         )
 
@@ -305,8 +331,7 @@ def _read_covariances(reader: Lines, system: str, frame: str) -> Iterator[Covari
 def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
     if system not in TIME_SYSTEMS:
         raise UnknownTimeSystemError(system, TIME_SYSTEMS)
-    counts = from_utc_ns(segment.utc_ns, system)
-    texts = epoch_texts(counts)
+    texts = epoch_texts(segment.tai_ns, system)
     lines = [
         "META_START",
         *comment_lines(segment.comments),
@@ -319,8 +344,7 @@ def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
     ]
     if segment.useable_start_utc_ns is not None or segment.useable_stop_utc_ns is not None:
         # Some readers want both or none.
-        useable = from_utc_ns(np.array([segment.start_utc_ns, segment.stop_utc_ns]), system)
-        first, last = (epoch_texts(useable[k : k + 1])[0] for k in (0, 1))
+        first, last = (epoch_texts(edge, system)[0] for edge in segment.span_tai_ns)
         lines += [f"USEABLE_START_TIME = {first}", f"USEABLE_STOP_TIME = {last}"]
     lines += [
         f"STOP_TIME = {texts[-1]}",
@@ -335,7 +359,7 @@ def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
     if segment.covariances:
         lines += ["", "COVARIANCE_START"]
         for covariance in segment.covariances:
-            lines.append(f"EPOCH = {epoch_texts(from_utc_ns(np.array([covariance.utc_ns]), system))[0]}")
+            lines.append(f"EPOCH = {utc_epoch_text(covariance.utc_ns, system)}")
             lines.append(f"COV_REF_FRAME = {covariance.frame}")
             lines += [" ".join(f"{v:.15e}" for v in covariance.matrix[k, : k + 1] / 1e6) for k in range(6)]
         lines.append("COVARIANCE_STOP")

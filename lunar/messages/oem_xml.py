@@ -1,12 +1,12 @@
-"""CCSDS Orbit Ephemeris Message in XML: reads versions 1.0, 2.0 and 3.0, writes 2.0.
+"""CCSDS messages in XML: Orbit Ephemeris Messages of versions 1.0, 2.0 and 3.0 (written as 2.0); lines of an AEM.
 
-The elements are brought into keyword notation, line by line, and read by `lunar.messages.oem`: both notations pass the
-same checks, and errors name the line of the XML file.  Document type definitions are refused, so entities
-cannot expand or refer to files.
+The elements are brought into keyword notation, line by line, and read by `lunar.messages.oem` or `lunar.messages.aem`:
+both notations pass the same checks, and errors name the line of the XML file.  Document type
+definitions are refused, so entities cannot expand or refer to files.
 
 References
 ----------
-CCSDS 505.0-B-2 (2021), XML Specification for Navigation Data Messages, section on the OEM.
+CCSDS 505.0-B-2 (2021), XML Specification for Navigation Data Messages, sections on the OEM and AEM.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import numpy as np
 
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError
-from lunar.messages.kvn import Lines, epoch_texts
+from lunar.messages.kvn import Lines, epoch_texts, utc_epoch_text
 from lunar.messages.oem import parse_oem_lines
-from lunar.timescales import format_utc, from_utc_ns
+from lunar.timescales import format_utc
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
@@ -29,8 +29,15 @@ _COVARIANCE = [[f"C{row}_{column}" for column in _AXES[: k + 1]] for k, row in e
 _UNITS = dict.fromkeys(("X", "Y", "Z"), "km") | dict.fromkeys(("X_DOT", "Y_DOT", "Z_DOT"), "km/s")
 _DEPTH = 16
 BLOCK_OCTETS = 1 << 16
-_GROUPS = ("header", "metadata", "stateVector", "covarianceMatrix")
-_FRAMES = ("ndm", "oem", "body", "segment", "data", *_GROUPS)
+_ROWS = {
+    "stateVector": _STATE,
+    **dict.fromkeys(("quaternionEphemeris", "quaternionState"), ("EPOCH", "Q1", "Q2", "Q3", "QC")),
+}
+"""Elements that become a line of numbers, by name: an AEM has the scalar of a quaternion last."""
+
+_GROUPS = ("header", "metadata", "covarianceMatrix", *_ROWS)
+_MESSAGES = ("oem", "aem")
+_FRAMES = ("ndm", *_MESSAGES, "body", "segment", "data", "attitudeState", "quaternion", *_GROUPS)
 
 
 def parse_oem_xml(octets: bytes, source: str = "OEM XML") -> Ephemeris:
@@ -43,8 +50,12 @@ def parse_oem_xml(octets: bytes, source: str = "OEM XML") -> Ephemeris:
     UnknownFrameError, UnknownTimeSystemError
         Where axes, centre or time scale are none that can be converted.
     """
-    reader = _Reader(source)
-    return parse_oem_lines(Lines(reader.read(octets), source))
+    return parse_oem_lines(Lines(xml_lines(octets, source), source))
+
+
+def xml_lines(octets: bytes, source: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines in keyword notation of a message in XML, with line numbers; raises as `parse_oem_xml`."""
+    return _Reader(source).read(octets)
 
 
 def format_oem_xml(ephemeris: Ephemeris) -> str:
@@ -111,14 +122,17 @@ class _Reader:
         self.text.clear()
         if len(self.path) > _DEPTH:
             raise self._error(f"at most {_DEPTH} levels of elements", f"<{name[:40]}>")
-        if name == "oem":
-            self._line(f"{attributes.get('id', 'CCSDS_OEM_VERS')} = {attributes.get('version', '')}")
+        if name in _MESSAGES:
+            key = attributes.get("id", f"CCSDS_{name.upper()}_VERS")
+            self._line(f"{key} = {attributes.get('version', '')}")
         elif name == "metadata":
             self._line("META_START")
-        elif name in ("stateVector", "covarianceMatrix"):
+        elif name in _GROUPS:
             self.values = {}
-        elif self.path[0] not in ("oem", "ndm"):
-            raise self._error("an element <oem> or <ndm>", f"<{name[:40]}>")
+        elif name == "data" and "aem" in self.path:
+            self._line("DATA_START")
+        elif self.path[0] not in ("ndm", *_MESSAGES):
+            raise self._error("an element <oem>, <aem> or <ndm>", f"<{name[:40]}>")
         unit = attributes.get("units")
         if unit is not None and name in _UNITS and unit != _UNITS[name]:
             raise self._error(f"units={_UNITS[name]!r} of {name}", repr(unit))
@@ -130,8 +144,10 @@ class _Reader:
         group = self.path[-1] if self.path else ""
         if name == "metadata":
             self._line("META_STOP")
-        elif name == "stateVector":
-            self._line(" ".join(self._values(_STATE)))
+        elif name in _ROWS:
+            self._line(" ".join(self._values(_ROWS[name])))
+        elif name == "data" and "aem" in self.path:
+            self._line("DATA_STOP")
         elif name == "covarianceMatrix":
             self._covariance()
         elif name in _FRAMES:
@@ -140,12 +156,14 @@ class _Reader:
             # Comments between states belong to nothing that is kept.
             if group in ("header", "metadata"):
                 self._line(f"COMMENT {value}".rstrip())
+        elif name == "QUATERNION_TYPE":
+            return  # In XML the elements name the parts of a quaternion.
         elif group in ("header", "metadata"):
             self._line(f"{name} = {value}")
-        elif group in ("stateVector", "covarianceMatrix"):
+        elif group in (*_GROUPS, "quaternion"):
             self.values[name] = value
         else:
-            raise self._error(f"an element of an OEM in <{group}>", f"<{name[:40]}>")
+            raise self._error(f"an element of an OEM or AEM in <{group}>", f"<{name[:40]}>")
 
     def _values(self, names: Iterable[str]) -> list[str]:
         for name in names:
@@ -176,8 +194,7 @@ def _comments(comments: Iterable[str]) -> list[str]:
 
 
 def _segment(segment: EphemerisSegment) -> list[str]:
-    counts = np.asarray(from_utc_ns(segment.utc_ns, segment.time_system))
-    texts = epoch_texts(counts)
+    texts = epoch_texts(segment.tai_ns, segment.time_system)
     meta = [
         ("OBJECT_NAME", segment.object_name),
         ("OBJECT_ID", segment.object_id or segment.object_name),
@@ -187,11 +204,9 @@ def _segment(segment: EphemerisSegment) -> list[str]:
         ("START_TIME", texts[0]),
     ]
     if segment.useable_start_utc_ns is not None or segment.useable_stop_utc_ns is not None:
-        span = np.array([segment.start_utc_ns, segment.stop_utc_ns], dtype=np.int64)
-        useable = np.asarray(from_utc_ns(span, segment.time_system))
         meta += [
-            (f"USEABLE_{end}_TIME", epoch_texts(useable[k : k + 1])[0])
-            for k, end in enumerate(("START", "STOP"))
+            (f"USEABLE_{end}_TIME", epoch_texts(edge, segment.time_system)[0])
+            for edge, end in zip(segment.span_tai_ns, ("START", "STOP"), strict=True)
         ]
     meta += [
         ("STOP_TIME", texts[-1]),
@@ -212,9 +227,7 @@ def _segment(segment: EphemerisSegment) -> list[str]:
 
 
 def _covariance_lines(covariance: Covariance, time_system: str) -> list[str]:
-    epoch = epoch_texts(np.asarray(from_utc_ns(np.array([covariance.utc_ns], dtype=np.int64), time_system)))[
-        0
-    ]
+    epoch = utc_epoch_text(covariance.utc_ns, time_system)
     units = ("km**2", "km**2/s", "km**2/s**2")
     lines = ["<covarianceMatrix>", _element("EPOCH", epoch), _element("COV_REF_FRAME", covariance.frame)]
     for k, row in enumerate(_COVARIANCE):

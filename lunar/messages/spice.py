@@ -1,4 +1,4 @@
-"""SPICE kernels: SPK (orbit), CK (attitude), SCLK (clock), FK (frames) and IK (camera); SPK can be read.
+"""SPICE kernels: SPK (orbit), CK (attitude), SCLK (clock), FK (frames), IK (camera), PCK (Moon); SPK can be read.
 
 The binary kernels are written and read with spiceypy, which is an optional dependency.  The text kernels need none.
 Frame and instrument numbers follow from the number of the spacecraft, as NAIF recommends: -S000 is the spacecraft,
@@ -6,7 +6,7 @@ Frame and instrument numbers follow from the number of the spacecraft, as NAIF r
 
 References
 ----------
-NAIF Required Reading: SPK (types 9 and 13), CK (type 3), SCLK (type 1), FRAMES, GETFOV, TIME.
+NAIF Required Reading: SPK (types 2, 3, 9 and 13), CK (type 3), SCLK (type 1), PCK, FRAMES, GETFOV, TIME.
 """
 
 from __future__ import annotations
@@ -22,11 +22,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
+from lunar.constants import MOON_RADIUS_M, SECONDS_PER_DAY
 from lunar.ephemeris import Ephemeris, EphemerisSegment
-from lunar.errors import DataFileError, EphemerisError, MissingLibrary
+from lunar.errors import DataFileError, EphemerisError, MissingLibrary, UnknownFrameError
+from lunar.frames import (
+    CENTURY_S,
+    DAY_S,
+    IAU_E_DEG,
+    IAU_E_RATE_DEG_DAY,
+    IAU_MERIDIAN_DEG,
+    IAU_MERIDIAN_TERMS_DEG,
+    IAU_POLE_DEC_DEG,
+    IAU_POLE_DEC_TERMS_DEG,
+    IAU_POLE_RA_DEG,
+    IAU_POLE_RA_TERMS_DEG,
+    matrix_from_quaternion,
+    rotation_vector_from_matrix,
+)
+from lunar.third_bodies import moon_barycentric_icrf_m
 from lunar.timescales import (
     J2000_TT_AS_UTC_COUNT_NS,
     NS,
@@ -44,6 +61,12 @@ READ_STEP_S = 60.0
 """Step between states taken from an SPK: Hermite interpolation of degree 7 in a low orbit is then exact to 1 um."""
 
 STATES_LIMIT = 2_000_000
+
+EXACT_M = 1e-4
+"""Polynomials so close to an ephemeris count as exact: a float64 of SPICE's seconds is 0.2 mm in a low orbit."""
+
+_MOST_TERMS, _MOON_TERMS = 28, 14
+_COMMENT_CHARACTERS = 1000
 
 # TDB - TT of SPICE's leap-second kernels: amplitude in s, eccentricity, mean anomaly in rad and rad/s.
 _K, _EB, _M0, _M1 = 1.657e-3, 1.671e-2, 6.239996, 1.99096871e-7
@@ -73,20 +96,22 @@ def camera_id(spacecraft: int) -> int:
 
 def et_from_utc_ns(utc_ns: IntArray | int) -> FloatArray:
     """Return SPICE's ephemeris time (...) in s: TDB past J2000 by the formula of its leap-second kernels."""
-    tai_ns = np.asarray(tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)))
-    tt_s = (tai_ns + (TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS)) / NS
+    return et_from_tai_ns(tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)))
+
+
+def et_from_tai_ns(tai_ns: IntArray | int) -> FloatArray:
+    """Return SPICE's ephemeris time (...) in s of TAI epochs."""
+    tt_s = (np.asarray(tai_ns, dtype=np.int64) + (TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS)) / NS
     return np.asarray(tt_s + _tdb_minus_tt_s(tt_s))
 
 
-def utc_ns_from_et(et_s: FloatArray | float) -> IntArray:
-    """Return UTC (...) of SPICE's ephemeris times, to 0.1 us."""
+def tai_ns_from_et(et_s: FloatArray | float) -> IntArray:
+    """Return TAI (...) of SPICE's ephemeris times, to 0.1 us."""
     et = np.asarray(et_s, dtype=np.float64)
     tt = et - _tdb_minus_tt_s(et - _tdb_minus_tt_s(et))
     whole = np.floor(tt)
-    tai_ns = whole.astype(np.int64) * NS + np.rint((tt - whole) * NS).astype(np.int64)
-    return np.asarray(
-        utc_ns_from_tai_ns(tai_ns + (J2000_TT_AS_UTC_COUNT_NS - TT_MINUS_TAI_NS)), dtype=np.int64
-    )
+    tt_ns = whole.astype(np.int64) * NS + np.rint((tt - whole) * NS).astype(np.int64)
+    return np.asarray(tt_ns + (J2000_TT_AS_UTC_COUNT_NS - TT_MINUS_TAI_NS))
 
 
 def _tdb_minus_tt_s(seconds: FloatArray) -> FloatArray:
@@ -94,38 +119,65 @@ def _tdb_minus_tt_s(seconds: FloatArray) -> FloatArray:
     return np.asarray(_K * np.sin(anomaly + _EB * np.sin(anomaly)))
 
 
-def spk_octets(ephemeris: Ephemeris, spacecraft: int) -> bytes:
-    """Return an SPK of an ephemeris: type 13 for Hermite interpolation, type 9 otherwise, a segment for each.
+@dataclass(frozen=True, slots=True)
+class SpkKernel:
+    """An SPK: its octets, type (3, 13 or 9), and number of states, in type 3 of records.
 
-    The window of states is that of the ephemeris where SPICE has it (an even number of states); segments of one state
-    are left out.
+    ``error_m`` is the largest distance of the polynomials of type 3 from the ephemeris, None in other types.
+    """
+
+    octets: bytes
+    data_type: int
+    states: int
+    error_m: float | None = None
+
+
+def spk_kernel(ephemeris: Ephemeris, spacecraft: int, data_type: int | None = None) -> SpkKernel:
+    """Return an SPK of an ephemeris with a segment for each arc.
+
+    Type 3 has Chebyshev polynomials, which most readers know.  Type 13 (Hermite interpolation, otherwise type 9) has
+    the states; its window is that of the ephemeris where SPICE has it (an even number of states).  Without a
+    ``data_type``, it is 3 where that is within `EXACT_M` of the ephemeris.  Arcs of one state are left out.
 
     Raises
     ------
     MissingLibrary
         If spiceypy is not installed.
     EphemerisError
-        If no segment has two states.
+        If no arc has two states.
     """
-    segments = [one for one in ephemeris.segments if len(one.utc_ns) > 1]
-    if not segments:
+    arcs = [one for one in ephemeris.arcs() if one.span_tai_ns[0] < one.span_tai_ns[1]]
+    if not arcs:
         raise EphemerisError("an SPK: expected a segment of at least two states, found none")
+    series = [_chebyshev_series(one) for one in arcs] if data_type != 13 else []
+    error_m = max((one.error_m for one in series), default=math.inf)
+    chosen = data_type or (3 if error_m <= EXACT_M else 13)
+    if chosen == 3:
+        comment = f"Chebyshev polynomials within {error_m:.1e} m of the ephemeris."
+        states = sum(len(one.coefficients) for one in series)
+    else:
+        chosen = 13 if all(one.interpolation == "HERMITE" for one in arcs) else 9
+        comment, states = "States of the ephemeris.", sum(len(one.utc_ns) for one in arcs)
 
     def write(spice: Any, path: str) -> None:
-        handle = spice.spkopn(path, "LINNA", 0)
-        for one in segments:
-            _write_spk_segment(spice, handle, one, spacecraft)
+        handle = spice.spkopn(path, "LINNA", _COMMENT_CHARACTERS)
+        spice.dafac(handle, [f"Spacecraft {spacecraft} about the Moon. {comment}"])
+        for number, one in enumerate(arcs):
+            et = et_from_tai_ns(np.array(one.span_tai_ns))
+            name = one.object_name[:40].encode("ascii", "replace").decode()
+            head = (handle, spacecraft, MOON, FRAME, float(et[0]), float(et[1]), name)
+            if chosen == 3:
+                _write_series(spice, head, series[number])
+            else:
+                _write_states(spice, head, one)
         spice.spkcls(handle)
 
-    return _written(write)
+    return SpkKernel(_written(write), chosen, states, error_m if chosen == 3 else None)
 
 
-def _write_spk_segment(spice: Any, handle: int, one: EphemerisSegment, spacecraft: int) -> None:
-    et = et_from_utc_ns(one.utc_ns)
+def _write_states(spice: Any, head: tuple[Any, ...], one: EphemerisSegment) -> None:
+    et = et_from_tai_ns(one.tai_ns)
     states = np.concatenate([one.position_m, one.velocity_m_s], axis=1) / 1e3
-    useable = et_from_utc_ns(np.array([one.start_utc_ns, one.stop_utc_ns], dtype=np.int64))
-    name = one.object_name[:40].encode("ascii", "replace").decode()
-    head = (handle, spacecraft, MOON, FRAME, float(useable[0]), float(useable[1]), name)
     if one.interpolation == "HERMITE":
         window = min((one.degree + 1) // 2, len(et))
         # Windows of SPICE have an even number of states; the degree of type 13 is 2 w - 1.
@@ -136,10 +188,101 @@ def _write_spk_segment(spice: Any, handle: int, one: EphemerisSegment, spacecraf
         spice.spkw09(*head, max(degree - (degree + 1) % 2, 1), len(et), states, et)
 
 
+def _write_series(spice: Any, head: tuple[Any, ...], series: _Series) -> None:
+    records, _, terms = series.coefficients.shape
+    octets = np.ascontiguousarray(series.coefficients / 1e3)
+    spice.spkw03(*head, series.record_s, records, terms - 1, octets.reshape(-1), series.start_et_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Series:
+    """Chebyshev coefficients (records, 6, terms) in m and m/s of equal spans of time, and the largest error."""
+
+    start_et_s: float
+    record_s: float
+    coefficients: FloatArray
+    error_m: float
+
+
+def _chebyshev_series(one: EphemerisSegment) -> _Series:
+    """Return the series with the longest records that are exact, else those with a record for each step."""
+    step_s = float(np.median(np.diff(one.tai_ns))) / NS
+    start_s, stop_s = (float(value) for value in et_from_tai_ns(np.array(one.span_tai_ns)))
+    arc = Ephemeris((one,))
+    for steps, terms in ((16, 24), (8, 16), (4, 16), (2, 12), (1, min(one.degree, _MOST_TERMS - 1) + 1)):
+        records = max(math.ceil((stop_s - start_s) / (steps * step_s) - 1e-6), 1)
+        series = _fitted(start_s, (stop_s - start_s) / records, records, terms, arc.at_tai, one.span_tai_ns)
+        if series.error_m <= EXACT_M:
+            break
+    return series
+
+
+def _fitted(
+    start_s: float,
+    record_s: float,
+    records: int,
+    terms: int,
+    state: Callable[[IntArray], tuple[FloatArray, FloatArray]],
+    span_tai_ns: tuple[int, int],
+) -> _Series:
+    """Return the series through states at the Chebyshev nodes; its error is that at twice as many other places."""
+    half_s = record_s / 2.0
+    middle = start_s + half_s + record_s * np.arange(records)
+    # Seconds of TDB and TAI differ by 3e-10, which are 0.1 mm in some minutes.
+    rate = (_tdb_minus_tt_s(middle + half_s) - _tdb_minus_tt_s(middle - half_s)) / record_s
+
+    def at(places: FloatArray) -> FloatArray:
+        offset_ns = np.rint((half_s * NS * (1.0 - rate))[:, None] * places).astype(np.int64)
+        values = np.concatenate(
+            state(np.clip(tai_ns_from_et(middle)[:, None] + offset_ns, *span_tai_ns)), axis=2
+        )
+        return values.transpose(0, 2, 1)
+
+    nodes, others = chebyshev.chebpts1(terms), np.linspace(-1.0, 1.0, 2 * terms + 1)
+    coefficients = at(nodes) @ np.linalg.inv(chebyshev.chebvander(nodes, terms - 1)).T
+    off = coefficients @ chebyshev.chebvander(others, terms - 1).T - at(others)
+    error_m = float(np.linalg.norm(off[:, :3], axis=1).max())
+    return _Series(start_s, record_s, coefficients, error_m)
+
+
+def moon_kernel(start_utc_ns: int, stop_utc_ns: int) -> bytes:
+    """Return an SPK (type 2) of the Moon about the barycentre of the solar system, with an hour before and after.
+
+    SPICE asks for this when it intersects a line of sight with the Moon, although the place relative to a spacecraft
+    does not depend on it.  A planetary kernel that is loaded later takes its place.
+
+    Raises
+    ------
+    MissingLibrary
+        If spiceypy is not installed.
+    """
+    first, last = et_from_utc_ns(np.array([start_utc_ns - 3600 * NS, stop_utc_ns + 3600 * NS])).tolist()
+    records = math.ceil((last - first) / SECONDS_PER_DAY)
+    record_s = (last - first) / records
+    nodes = chebyshev.chebpts1(_MOON_TERMS)
+    at = first + record_s * (np.arange(records)[:, None] + 0.5 + nodes / 2.0)
+    series = np.linalg.inv(chebyshev.chebvander(nodes, _MOON_TERMS - 1)) @ (moon_barycentric_icrf_m(at) / 1e3)
+    coefficients = np.ascontiguousarray(series.transpose(0, 2, 1)).reshape(-1)
+
+    def write(spice: Any, path: str) -> None:
+        handle = spice.spkopn(path, "LINNA", _COMMENT_CHARACTERS)
+        spice.dafac(
+            handle,
+            ["The Moon about the barycentre, within 20 km (ERFA); load DE440 (NAIF) after it for better."],
+        )
+        head = (handle, MOON, 0, FRAME, first, last, "MOON TO 20 KM")
+        spice.spkw02(*head, record_s, records, _MOON_TERMS - 1, coefficients, first)
+        spice.spkcls(handle)
+
+    return _written(write)
+
+
 def ck_octets(
     ticks: IntArray, q_wxyz: FloatArray, spacecraft: int, *, gap_ticks: int = 10 * TICKS_PER_SECOND
 ) -> bytes:
     """Return a CK (type 3) of the camera: attitudes are interpolated between images at most ``gap_ticks`` apart.
+
+    Angular rates are those of the turns to the images before and after, and 0 for an image alone.
 
     Parameters
     ----------
@@ -156,18 +299,19 @@ def ck_octets(
     if len(ticks) == 0:
         raise EphemerisError("a CK: expected at least one attitude, found none")
     times = ticks.astype(np.float64)
-    starts = times[np.concatenate(([True], np.diff(ticks) > gap_ticks))]
+    apart = np.diff(ticks) > gap_ticks
+    starts = times[np.concatenate(([True], apart))]
+    rates = _angular_rates(ticks, q_wxyz, ~apart)
 
     def write(spice: Any, path: str) -> None:
         handle = spice.ckopn(path, "LINNA", 0)
-        rates = np.zeros((len(times), 3))
         spice.ckw03(
             handle,
             times[0],
             times[-1],
             camera_id(spacecraft),
             FRAME,
-            False,
+            True,
             "LINNA camera",
             len(times),
             times,
@@ -179,6 +323,38 @@ def ck_octets(
         spice.ckcls(handle)
 
     return _written(write)
+
+
+def _angular_rates(ticks: IntArray, q_wxyz: FloatArray, joined: BoolArray) -> FloatArray:
+    """Return angular velocities (n, 3) in rad/s and ICRF, of attitudes (n, 4) of which neighbours are ``joined``."""
+    camera = matrix_from_quaternion(q_wxyz)
+    turns = rotation_vector_from_matrix(np.swapaxes(camera[1:], 1, 2) @ camera[:-1])
+    between = np.where(joined[:, None], turns * TICKS_PER_SECOND / np.diff(ticks)[:, None], 0.0)
+    edge, none = np.zeros((1, 3)), np.zeros(1, dtype=np.int64)
+    sides = np.concatenate([none, joined]) + np.concatenate([joined, none])
+    total = np.concatenate([edge, between]) + np.concatenate([between, edge])
+    return np.ascontiguousarray(total / np.maximum(sides, 1)[:, None])
+
+
+def format_pck() -> str:
+    """Return a kernel of constants: radius of the Moon, and its orientation by the series of the IAU (IAU_MOON)."""
+    angles = np.column_stack([IAU_E_DEG, IAU_E_RATE_DEG_DAY * CENTURY_S / DAY_S]).ravel()
+    values = {
+        "BODY301_RADII": [MOON_RADIUS_M / 1e3] * 3,
+        "BODY301_POLE_RA": IAU_POLE_RA_DEG,
+        "BODY301_POLE_DEC": IAU_POLE_DEC_DEG,
+        "BODY301_PM": IAU_MERIDIAN_DEG,
+        "BODY301_NUT_PREC_RA": IAU_POLE_RA_TERMS_DEG,
+        "BODY301_NUT_PREC_DEC": IAU_POLE_DEC_TERMS_DEG,
+        "BODY301_NUT_PREC_PM": IAU_MERIDIAN_TERMS_DEG,
+        "BODY3_NUT_PREC_ANGLES": angles,
+    }
+    lines = [
+        f"{name} = (\n" + "\n".join(f"    {value!r}" for value in map(float, row)) + "\n)"
+        for name, row in values.items()
+    ]
+    text = "The Moon of the IAU WGCCRE 2009, degrees. It differs from DE421 by some hundred metres on the ground."
+    return "\n".join(["KPL/PCK", "", text, "", "\\begindata", "", *lines, "", "\\begintext", ""])
 
 
 def format_sclk(lines: Sequence[ClockLine], spacecraft: int) -> str:
@@ -289,6 +465,9 @@ def _spice_name(name: str) -> str:
 def load_spk(path: Path | str, target: int | None = None, step_s: float = READ_STEP_S) -> Ephemeris:
     """Return the ephemeris of a spacecraft about the Moon in an SPK, with states every ``step_s`` seconds.
 
+    Each segment of the kernel is one of the ephemeris, with both its ends: nothing is interpolated across these.
+    Where segments overlap, the last in the file counts, as in SPICE.
+
     Parameters
     ----------
     target
@@ -300,6 +479,8 @@ def load_spk(path: Path | str, target: int | None = None, step_s: float = READ_S
         If spiceypy is not installed.
     DataFileError
         If the file is no SPK, has no such spacecraft, or does not give its states about the Moon.
+    UnknownFrameError
+        If the axes of a segment are none that SPICE turns into ICRF without further kernels.
     """
     with _spice() as spice:
         try:
@@ -307,16 +488,15 @@ def load_spk(path: Path | str, target: int | None = None, step_s: float = READ_S
         except spice.utils.exceptions.SpiceyError as error:
             raise DataFileError(path, "", "an SPK", _reason(error)) from None
         chosen = _chosen(path, bodies, target)
-        cover = spice.spkcov(str(path), chosen)
-        spans = [spice.wnfetd(cover, k) for k in range(spice.wncard(cover))]
-        states = sum((stop - start) / step_s + 2 for start, stop in spans)
-        if not states <= STATES_LIMIT:
-            raise DataFileError(path, "", f"at most {STATES_LIMIT} states of {step_s:g} s", f"{states:.0f}")
         handle = spice.spklef(str(path))
         try:
-            segments = [
-                _spk_span(spice, chosen, start, stop, step_s) for start, stop in spans if stop > start
-            ]
+            arcs = _spk_arcs(spice, handle, chosen)
+            states = sum((arc.stop_s - arc.start_s) / step_s + 2 for arc in arcs)
+            if not states <= STATES_LIMIT:
+                raise DataFileError(
+                    path, "", f"at most {STATES_LIMIT} states of {step_s:g} s", f"{states:.0f}"
+                )
+            segments = [_spk_segment(spice, handle, f"{path}: body {chosen}", arc, step_s) for arc in arcs]
         except spice.utils.exceptions.SpiceyError as error:
             raise DataFileError(path, f"body {chosen}", "states about the Moon", _reason(error)) from None
         finally:
@@ -338,14 +518,70 @@ def _chosen(path: Path | str, bodies: list[int], target: int | None) -> int:
     return target
 
 
-def _spk_span(spice: Any, body: int, start: float, stop: float, step_s: float) -> EphemerisSegment:
-    et = np.linspace(start, stop, max(math.ceil((stop - start) / step_s), 1) + 1)
-    utc_ns = utc_ns_from_et(et)
-    # Epochs are whole nanoseconds; the first and the last one stay inside of the interval.
-    at = np.clip(et_from_utc_ns(utc_ns), start, stop)
-    states = 1e3 * np.array([spice.spkgeo(body, float(one), FRAME, MOON)[0] for one in at])
-    name = str(body)
-    return EphemerisSegment(utc_ns, states[:, :3], states[:, 3:], object_name=name, object_id=name)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Arc:
+    """Part of a segment of an SPK: descriptor, centre and frame numbers, and its first and last ephemeris time."""
+
+    descriptor: FloatArray
+    centre: int
+    frame: int
+    start_s: float
+    stop_s: float
+
+
+def _spk_arcs(spice: Any, handle: int, body: int) -> list[_Arc]:
+    """Return the parts of the segments of a body that count, in time order."""
+    arcs: list[_Arc] = []
+    spice.dafbbs(handle)
+    while spice.daffpa():
+        descriptor = spice.dafgs()[:5]
+        (start, stop), (target, centre, frame, *_) = spice.dafus(descriptor, 2, 6)
+        if target != body:
+            continue
+        parts = [(float(start), float(stop))]
+        for later in arcs:
+            parts = [
+                part
+                for a, b in parts
+                for part in ((a, min(b, later.start_s)), (max(a, later.stop_s), b))
+                if part[0] < part[1]
+            ]
+        arcs += [_Arc(descriptor, int(centre), int(frame), a, b) for a, b in parts if a < b]
+    return sorted(arcs, key=lambda arc: arc.start_s)
+
+
+def _spk_segment(spice: Any, handle: int, place: str, arc: _Arc, step_s: float) -> EphemerisSegment:
+    count = max(math.ceil((arc.stop_s - arc.start_s) / step_s), 1) + 1
+    # A float64 of seconds is good to 0.1 us.
+    tai_ns = (
+        np.rint(tai_ns_from_et(np.linspace(arc.start_s, arc.stop_s, count)) / 1000).astype(np.int64) * 1000
+    )
+    states = []
+    for et in et_from_tai_ns(tai_ns).tolist():
+        state = spice.spkpvn(handle, arc.descriptor, et)[1]
+        state = _turn(spice, place, arc.frame, et) @ state
+        if arc.centre != MOON:
+            state = state + spice.spkgeo(arc.centre, et, FRAME, MOON)[0]
+        states.append(state)
+    values, name = 1e3 * np.array(states), place.rpartition(" ")[2]
+    return EphemerisSegment(
+        utc_ns_from_tai_ns(tai_ns),
+        values[:, :3],
+        values[:, 3:],
+        object_name=name,
+        object_id=name,
+        tai_ns=tai_ns,
+    )
+
+
+def _turn(spice: Any, place: str, frame: int, et: float) -> FloatArray:
+    """Return the matrix (6, 6) that turns states of a frame into ICRF."""
+    name = spice.frmnam(frame)
+    try:
+        return np.asarray(spice.sxform(name, FRAME, et) if name != FRAME else np.eye(6))
+    except spice.utils.exceptions.SpiceyError:
+        known = (FRAME, "others that SPICE turns into it without further kernels")
+        raise UnknownFrameError(name or str(frame), known, place) from None
 
 
 def _reason(error: Exception) -> str:

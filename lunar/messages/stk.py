@@ -12,13 +12,12 @@ Ansys STK help, "Ephemeris File Format (*.e)".
 from __future__ import annotations
 
 import re
-from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers
+from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, resampled
 from lunar.errors import (
     DataFileError,
     EphemerisError,
@@ -27,7 +26,7 @@ from lunar.errors import (
     UnknownTimeSystemError,
 )
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.timescales import NS, parse_utc, tai_ns_from_utc_ns, utc_ns_from_tai_ns
+from lunar.timescales import NS, format_tai, parse_tai, utc_ns_from_tai_ns
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
 _UNITS_M = {"METERS": 1.0, "KILOMETERS": 1000.0, "METER": 1.0, "KILOMETER": 1000.0}
@@ -94,7 +93,7 @@ def parse_stk(text: str, source: str = "STK text") -> Ephemeris:
         else:
             known = "EphemerisTimePosVel, EphemerisTimePosVelAcc or a known keyword"
             raise DataFileError(source, f"line {number}", known, repr(line[:60]))
-    epoch_utc_ns = _scenario_epoch(source, header)
+    epoch_tai_ns = _scenario_epoch(source, header)
     scale_m, turn = _units_and_axes(source, header)
     rows, first_line, at = _rows(source, lines, at, width)
     if not any(line.upper() == "END EPHEMERIS" for _, line in lines[at:]):
@@ -105,14 +104,19 @@ def parse_stk(text: str, source: str = "STK text") -> Ephemeris:
         value, number = header["NUMBEROFEPHEMERISPOINTS"]
         if value != str(len(rows)):
             raise DataFileError(source, f"line {number}", f"NumberOfEphemerisPoints {len(rows)}", value)
-    utc_ns = _epochs(epoch_utc_ns, rows[:, 0])
+    tai_ns = _epochs(epoch_tai_ns, rows[:, 0])
     position_m, velocity_m_s = scale_m * rows[:, 1:4] @ turn.T, scale_m * rows[:, 4:7] @ turn.T
     method, degree = _interpolation(source, header)
     segments = []
-    for part in _parts(source, utc_ns, _epochs(epoch_utc_ns, np.array(boundary_s)), lines, first_line):
+    for part in _parts(source, tai_ns, _epochs(epoch_tai_ns, np.array(boundary_s)), lines, first_line):
         segments.append(
             EphemerisSegment(
-                utc_ns[part], position_m[part], velocity_m_s[part], interpolation=method, degree=degree
+                utc_ns_from_tai_ns(tai_ns[part]),
+                position_m[part],
+                velocity_m_s[part],
+                interpolation=method,
+                degree=degree,
+                tai_ns=tai_ns[part],
             )
         )
     return Ephemeris(tuple(segments), "STK", comments)
@@ -128,14 +132,13 @@ def format_stk(ephemeris: Ephemeris) -> str:
     EphemerisError
         Where there is a gap between segments, which the format cannot hold.
     """
-    segments = [_useable(segment) for segment in ephemeris.segments]
+    segments = resampled(ephemeris).segments
     for earlier, later in pairwise(segments):
-        if later.utc_ns[0] != earlier.utc_ns[-1]:
+        if later.tai_ns[0] != earlier.tai_ns[-1]:
             raise EphemerisError(
                 "an STK .e file: expected segments that follow each other, found a gap between two"
             )
-    start_utc_ns = int(segments[0].utc_ns[0])
-    start_tai_ns = tai_ns_from_utc_ns(start_utc_ns)
+    start_tai_ns = int(segments[0].tai_ns[0])
     method = segments[0].interpolation.capitalize() if segments[0].interpolation != "LINEAR" else "Lagrange"
     samples = segments[0].degree // 2 if method == "Hermite" else segments[0].degree
     lines = [
@@ -143,7 +146,7 @@ def format_stk(ephemeris: Ephemeris) -> str:
         *(f"# {comment}".rstrip() for comment in ephemeris.comments),
         "BEGIN Ephemeris",
         f"NumberOfEphemerisPoints {sum(len(s.utc_ns) for s in segments)}",
-        f"ScenarioEpoch {_format_epoch(start_utc_ns)}",
+        f"ScenarioEpoch {_format_epoch(start_tai_ns)}",
         f"InterpolationMethod {method}",
         f"InterpolationSamplesM1 {max(samples, 1)}",
         "CentralBody Moon",
@@ -152,11 +155,11 @@ def format_stk(ephemeris: Ephemeris) -> str:
     ]
     if len(segments) > 1:
         lines.append("BEGIN SegmentBoundaryTimes")
-        lines += [_seconds(int(tai_ns_from_utc_ns(int(s.utc_ns[-1]))) - start_tai_ns) for s in segments[:-1]]
+        lines += [_seconds(int(s.tai_ns[-1]) - start_tai_ns) for s in segments[:-1]]
         lines.append("END SegmentBoundaryTimes")
     lines.append("EphemerisTimePosVel")
     for segment in segments:
-        elapsed = (tai_ns_from_utc_ns(segment.utc_ns) - start_tai_ns).tolist()
+        elapsed = (segment.tai_ns - start_tai_ns).tolist()
         states = np.concatenate([segment.position_m, segment.velocity_m_s], axis=1).tolist()
         row = "%s %.6f %.6f %.6f %.9f %.9f %.9f"
         lines += [row % (_seconds(t), *state) for t, state in zip(elapsed, states, strict=True)]
@@ -207,7 +210,7 @@ def _scenario_epoch(source: str, header: dict[str, tuple[str, int]]) -> int:
         raise DataFileError(source, f"line {number}", "an epoch like 7 Aug 2029 00:00:00.000", repr(value))
     try:
         clock = match[4] if len(match[4].split(":")[0]) == 2 else "0" + match[4]
-        return parse_utc(f"{match[3]}-{_MONTHS.index(month) + 1:02d}-{int(match[1]):02d}T{clock}")
+        return parse_tai(f"{match[3]}-{_MONTHS.index(month) + 1:02d}-{int(match[1]):02d}T{clock}")
     except TimeFormatError:
         raise DataFileError(source, f"line {number}", "an epoch that exists", repr(value)) from None
 
@@ -247,50 +250,36 @@ def _interpolation(source: str, header: dict[str, tuple[str, int]]) -> tuple[str
     return ("HERMITE", 7) if method.upper() == "LAGRANGEVOP" else ("LAGRANGE", int(value))
 
 
-def _epochs(epoch_utc_ns: int, elapsed_s: FloatArray) -> IntArray:
+def _epochs(epoch_tai_ns: int, elapsed_s: FloatArray) -> IntArray:
     whole = np.floor(elapsed_s)
     elapsed_ns = whole.astype(np.int64) * NS + np.rint((elapsed_s - whole) * NS).astype(np.int64)
-    return utc_ns_from_tai_ns(np.asarray(tai_ns_from_utc_ns(epoch_utc_ns) + elapsed_ns, dtype=np.int64))
+    return np.asarray(epoch_tai_ns + elapsed_ns, dtype=np.int64)
 
 
 def _parts(
-    source: str, utc_ns: IntArray, boundary_utc_ns: IntArray, lines: list[tuple[int, str]], first: int
+    source: str, tai_ns: IntArray, boundary_tai_ns: IntArray, lines: list[tuple[int, str]], first: int
 ) -> list[slice]:
     """Return the slices of the smooth arcs."""
-    steps = np.diff(utc_ns)
+    steps = np.diff(tai_ns)
     if np.any(steps < 0):
         k = int(np.flatnonzero(steps < 0)[0]) + 1
         raise DataFileError(
             source, f"line {lines[first + k][0]}", "a time after the one before", "an earlier one"
         )
-    starts = [0, *(np.flatnonzero(steps == 0) + 1).tolist(), len(utc_ns)]
+    starts = [0, *(np.flatnonzero(steps == 0) + 1).tolist(), len(tai_ns)]
     parts = []
     for begin, end in pairwise(starts):
         # A boundary inside an arc whose epoch occurs once: its state belongs to both sides.
-        cuts = np.flatnonzero(np.isin(utc_ns[begin + 1 : end - 1], boundary_utc_ns)) + begin + 1
+        cuts = np.flatnonzero(np.isin(tai_ns[begin + 1 : end - 1], boundary_tai_ns)) + begin + 1
         edges = [begin, *cuts.tolist(), end - 1]
         parts += [slice(a, b + 1) for a, b in pairwise(edges) if b > a or end - begin == 1]
     return parts
 
 
-def _useable(segment: EphemerisSegment) -> EphemerisSegment:
-    """Return the segment with the states inside its useable interval only."""
-    kept = (segment.utc_ns >= segment.start_utc_ns) & (segment.utc_ns <= segment.stop_utc_ns)
-    if not np.any(kept):
-        raise EphemerisError("an STK .e file: expected a state within the useable interval, found none")
-    return EphemerisSegment(
-        segment.utc_ns[kept],
-        segment.position_m[kept],
-        segment.velocity_m_s[kept],
-        interpolation=segment.interpolation,
-        degree=segment.degree,
-    )
-
-
-def _format_epoch(utc_ns: int) -> str:
-    whole, rest = divmod(utc_ns, NS)
-    date = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=whole)
-    return f"{date.day} {_MONTHS[date.month - 1]} {date.year} {date:%H:%M:%S}.{rest:09d}"
+def _format_epoch(tai_ns: int) -> str:
+    date, _, clock = format_tai(tai_ns, 9).rstrip("Z").partition("T")
+    year, month, day = map(int, date.split("-"))
+    return f"{day} {_MONTHS[month - 1]} {year} {clock}"
 
 
 def _seconds(elapsed_ns: int) -> str:

@@ -451,14 +451,16 @@ def _executed(scenario: Scenario, maneuvers: tuple[Maneuver, ...]) -> tuple[True
 
 
 def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth:
+    breaks_utc_ns = tuple(one.start_utc_ns for one in ephemeris.segments[1:])
+    edges = np.array([ephemeris.start_utc_ns, *breaks_utc_ns, ephemeris.stop_utc_ns], dtype=np.int64)
+
     def state(tdb_s: FloatArray) -> FloatArray:
         utc_ns = utc_ns_from_tdb_s(tdb_s)
-        # TDB seconds resolve some tens of nanoseconds: an instant at the edge may come back just outside.
-        inside = np.clip(utc_ns, ephemeris.start_utc_ns, ephemeris.stop_utc_ns)
-        position, velocity = ephemeris.at(np.where(np.abs(utc_ns - inside) <= _EDGE_NS, inside, utc_ns))
-        return np.concatenate([position, velocity], axis=1)
+        # TDB seconds resolve some tens of nanoseconds: an instant at an edge may come back on its other side.
+        edge = edges[np.maximum(np.searchsorted(edges, utc_ns + _EDGE_NS, side="right") - 1, 0)]
+        return np.concatenate(ephemeris.at(np.where(np.abs(utc_ns - edge) <= _EDGE_NS, edge, utc_ns)), axis=1)
 
-    return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation)
+    return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation, breaks_utc_ns)
 
 
 def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELENITA") -> Ephemeris:

@@ -1,14 +1,17 @@
 """The commands on ephemerides as users run them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from linna import cli
 from lunar.catalogue import PAPER_CLASS_COUNTS
+from lunar.ephemeris import Ephemeris
 from lunar.messages.oem import save_oem
 from lunar.messages.stk import format_stk
+from lunar.timescales import NS
 from tests.lunar.orbits import polar_orbit
 
 
@@ -46,8 +49,11 @@ def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_pa
     assert figures["samples"] == 48 * 60 + 1
     assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)
     assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
+    assert figures["mean_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
     assert cli.run(["orbit", "compare", str(oem_path), str(other), "--step", "3600"]) == 0
-    assert capsys.readouterr().out.startswith("49 epochs from 2029-08-07T00:00:00.000Z")
+    text = capsys.readouterr().out
+    assert text.startswith("49 epochs from 2029-08-07T00:00:00.000Z")
+    assert "mean radial 10 m, transverse" in text and "rms  radial 10 m, transverse" in text
 
 
 @pytest.mark.parametrize("ending", [".oem", ".xml", ".e", ".csv", ".tum"])
@@ -63,10 +69,35 @@ def test_an_ephemeris_converts_to_every_format(oem_path, tmp_path, capsys, endin
 
 def test_an_ephemeris_goes_through_spice_and_back(oem_path, tmp_path, capsys):
     kernel, back = tmp_path / "orbit.bsp", tmp_path / "back.oem"
-    run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85")
+    made = run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85")
+    assert made["spk_type"] == 3 and made["error_m"] < 1e-4
+    older = run_json(
+        capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85", "--type", "13"
+    )
+    assert (older["spk_type"], older["states"], older["error_m"]) == (13, 2881, None)
     run_json(capsys, "orbit", "convert", kernel, "--out", back, "--spice-id", "-85", "--step", "30")
     # A float64 of seconds is good to 0.2 mm at orbital speed.
     assert run_json(capsys, "orbit", "compare", oem_path, back)["max_m"] < 1e-3
+
+
+@pytest.mark.parametrize(("ending", "count"), [(".oem", 242), (".csv", 223), (".tum", 223), (".e", 223)])
+def test_a_conversion_prints_as_many_states_as_it_writes(tmp_path, capsys, ending, count):
+    """Two arcs of 121 states share an epoch; 20 states of the second are beyond its useable interval."""
+    first = polar_orbit(2.0).segments[0]
+    stop = int(first.utc_ns[-1])
+    later = replace(first, utc_ns=first.utc_ns + 7200 * NS, useable_stop_utc_ns=stop + 6030 * NS, tai_ns=None)
+    path, out = tmp_path / "two.oem", tmp_path / f"out{ending}"
+    save_oem(Ephemeris((first, later)), path)
+    assert run_json(capsys, "orbit", "convert", path, "--out", out)["states"] == count
+    rows = [line for line in out.read_text().splitlines() if line[0:1].isdigit() and len(line) > 60]
+    assert len(rows) == count
+
+
+def test_figures_of_states_that_gravity_does_not_move_are_refused(tmp_path, capsys):
+    (one,) = polar_orbit(2.0).segments
+    save_oem(Ephemeris((replace(one, velocity_m_s=0.9 * one.velocity_m_s),)), tmp_path / "slow.oem")
+    line = error_line(capsys, "orbit", "visibility", tmp_path / "slow.oem")
+    assert "expected an acceleration of" in line and "% off" in line
 
 
 def test_a_kernel_without_the_number_of_the_spacecraft_is_one_line(oem_path, tmp_path, capsys):

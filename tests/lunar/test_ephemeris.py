@@ -1,5 +1,7 @@
 """Segments, coverage and interpolation, against SciPy, SPICE and orbits in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import spiceypy
@@ -7,11 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 
-from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
-from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
+from lunar.comparison import check_gravity
+from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states, resampled
+from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError, UnmovedByGravity
+from lunar.frames import IauOrientation
 from lunar.messages.ephemeris_files import load_ephemeris
-from lunar.timescales import NS, parse_utc
-from tests.lunar.orbits import START, circle, times
+from lunar.timescales import NS, parse_utc, tdb_s_from_tai_ns
+from tests.lunar.orbits import START, circle, polar_orbit, times
 
 
 def arc(elapsed_s, **fields):
@@ -226,3 +230,82 @@ def test_missing_and_binary_files_are_refused(tmp_path):
 def test_states_in_other_axes_make_no_ephemeris():
     with pytest.raises(EphemerisError, match="expected states turned into ICRF, found inertial axes"):
         ephemeris_from_states([0, 1], np.ones((2, 3)), np.ones((2, 3)), frame="inertial axes of the payload")
+
+
+# Arcs
+
+
+def test_resampling_keeps_arcs_with_both_states_of_a_shared_epoch_and_crosses_no_gap():
+    before = arc(np.arange(0.0, 631.0, 30.0))
+    after_s = np.concatenate([np.arange(630.0, 901.0, 30.0), np.arange(3600.0, 3901.0, 30.0)])
+    after = arc(after_s, useable_stop_utc_ns=START + 3850 * NS)
+    higher = replace(after.segments[0], position_m=1.01 * after.segments[0].position_m)
+    ephemeris = Ephemeris((before.segments[0], higher), comments=("two solutions",))
+    for step_s, counts in ((None, (22, 10, 10)), (60.0, (12, 6, 6)), (600.0, (3, 2, 2))):
+        found = resampled(ephemeris, step_s)
+        assert tuple(len(one.utc_ns) for one in found.segments) == counts
+        spans = [
+            tuple((value - START) // NS for value in (one.start_utc_ns, one.stop_utc_ns))
+            for one in found.segments
+        ]
+        assert spans == [(0, 630), (630, 900), (3600, 3850)]
+        ends = [found.segments[0].position_m[-1], found.segments[1].position_m[0]]
+        np.testing.assert_allclose(ends, np.outer([1.0, 1.01], circle(630.0)[0]), rtol=1e-12)
+        assert found.comments == ephemeris.comments
+
+
+# Gravity
+
+
+def with_states(ephemeris, change):
+    return Ephemeris(tuple(replace(one, **change(one)) for one in ephemeris.segments))
+
+
+def scaled(position, velocity):
+    return lambda one: {"position_m": position * one.position_m, "velocity_m_s": velocity * one.velocity_m_s}
+
+
+def fixed_to_the_moon(one):
+    turn = IauOrientation().mcmf_from_icrf(tdb_s_from_tai_ns(one.tai_ns))
+    position, velocity = (np.einsum("nij,nj->ni", turn, part) for part in (one.position_m, one.velocity_m_s))
+    return {"position_m": position, "velocity_m_s": velocity - np.cross([0.0, 0.0, 2.6617e-6], position)}
+
+
+def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination_error_and_a_burn():
+    orbit = polar_orbit(4.0, radius_m=1_768_180.0 + 30.0)
+    check_gravity(orbit)
+    burn = np.where(np.arange(241)[:, None] > 120, 1.0001, 1.0)
+    check_gravity(with_states(orbit, lambda one: {"velocity_m_s": burn * one.velocity_m_s}))
+    check_gravity(
+        with_states(polar_orbit(0.01, step_s=1.0), scaled(1.003, 1.003))
+    )  # 36 s of 0.9 %: a mascon?
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            scaled(1e3, 1e3),
+            r"gravity 1\.76818e\+06 km from the centre of the Moon, found 423\.6 m/s2, 1\.59e\+07 % off",
+        ),
+        (scaled(1e-3, 1e-3), "gravity 1.76818 km from .*, found 0.0015"),
+        (
+            scaled(1.0, 1e-3),
+            r"expected an acceleration of 1\.6 m/s2 by gravity 1768.18 km .* found 9\.197 m/s2",
+        ),
+        (scaled(3.95, 4.5), "gravity 6984.31 km from .* another centre"),
+        (scaled(1.003, 1.003), r"found 1\.5\d+ m/s2, 0\.9\d\d % off"),
+        (fixed_to_the_moon, r"found 1\.5\d+ m/s2, 0\.\d+ % off; rotating axes"),
+    ],
+    ids=[
+        "metres for kilometres",
+        "kilometres for metres",
+        "velocity in km/s",
+        "orbit about the Earth",
+        "scale",
+        "axes",
+    ],
+)
+def test_states_that_gravity_does_not_move_are_refused_with_the_numbers(change, message):
+    with pytest.raises(UnmovedByGravity, match=message):
+        check_gravity(with_states(polar_orbit(4.0), change))

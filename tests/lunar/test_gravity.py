@@ -243,8 +243,25 @@ SHADR = """ 1.738E+03, 4.9E+03, 0.0, 2, 2, 1, 0.0, 0.0
 """
 
 
-@pytest.mark.parametrize("text", [ICGEM, COF, SHADR], ids=["icgem", "cof", "shadr"])
-def test_the_three_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
+SHTOOLS = """# comments are left out
+a field, for tests
+1.7380000000000000e+06, 4.9000000000000000e+12, 2.6617073000000001e-06, 2
+0, 0, 1.0, 0.0
+1, 0, 0.0, 0.0
+1, 1, 0.0, 0.0
+2, 0, -9.0e-05, 0.0
+2, 1, 1.0e-09, 2.0e-09
+2, 2, 3.4e-05, -1.0e-10
+"""
+SHTOOLS_KM = "1.738E+03, 4.9E+03, 2.66E-06, 2, 2\n" + SHADR.partition("\n")[2]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM],
+    ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"],
+)
+def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
     path = tmp_path / "tiny"
     path.write_text(text)
     field = load_gravity(path)
@@ -268,7 +285,17 @@ def test_the_three_formats_hold_the_same_field(text: str, tmp_path: Path) -> Non
         (ICGEM.replace("3.4e-05", "3.4e-0x"), "line 11", "degree, order and two coefficients"),
         (ICGEM.replace("3.4e-05", "nan"), "line 11", "finite coefficients"),
         (ICGEM.replace("max_degree 2\n", ""), "header, max_degree", "a number"),
-        (ICGEM.replace("0.49D+13", "0.49"), "header", "GM in m3/s2"),
+        (ICGEM.replace("0.49D+13", "0.49"), "header", "Moon's GM of 4.9028e+12 m3/s2"),
+        (ICGEM.replace("0.49D+13", "3.986004415E+14"), "header", "radius of 1.7374e+06 m"),
+        (ICGEM.replace("1.738E+06", "1.738E+03"), "header", "radius of 1.7374e+06 m"),
+        (SHADR.replace("1.738E+03", "3.396E+03"), "header", "radius of 1.7374e+06 m"),
+        (SHTOOLS.replace("1.738", "3.396"), "header", "radius of 1.7374e+06 m"),
+        (SHTOOLS.replace("-9.0e-05", "-2.032e-04"), "degree 2, order 0", "normalised flattening"),
+        (
+            SHTOOLS.replace("2, 2, 3.4e-05, -1.0e-10\n", ""),
+            "degree 2, order 2",
+            "all coefficients to degree 2",
+        ),
         (ICGEM.replace("-9.0D-05", "-9.0"), "degree 2, order 0", "normalised flattening"),
         (COF.replace("END\n", ""), "end of file", "END"),
         (
@@ -279,8 +306,8 @@ def test_the_three_formats_hold_the_same_field(text: str, tmp_path: Path) -> Non
         (COF.replace("RECOEF    2  2", "RECOEF    3  2"), "line 6", "order <= degree <= 2"),
         (SHADR.replace("2, 2, 1,", "2, 2, 0,"), "line 1, normalisation state", "fully normalised"),
         (SHADR[:-30], "line 4", "degree, order and two coefficients"),
-        ("hello\n", "", "an ICGEM, GMAT .cof or PDS SHADR gravity field"),
-        ("", "", "an ICGEM, GMAT .cof or PDS SHADR gravity field"),
+        ("hello\n", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
+        ("", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
     ],
 )
 def test_a_bad_file_is_named_with_the_place_and_what_was_expected(

@@ -6,18 +6,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lunar.errors import TimeFormatError
+from lunar.errors import LeapSecondError, TimeFormatError
 from lunar.timescales import (
+    LEAP_DATES,
     NS,
     TIME_SYSTEMS,
+    format_tai,
     format_utc,
-    from_utc_ns,
+    from_tai_ns,
+    in_leap_second,
+    parse_tai,
     parse_utc,
     tai_ns_from_utc_ns,
     tdb_minus_tt_s,
     tdb_s_from_utc_ns,
     ticks_from_utc_ns,
-    to_utc_ns,
+    to_tai_ns,
     utc_ns_from_tai_ns,
     utc_ns_from_tdb_s,
     utc_ns_from_ticks,
@@ -43,8 +47,69 @@ def test_day_of_year_calendar_space_and_missing_time_name_the_same_epoch():
     assert {parse_utc(text) for text in texts} == {1_880_755_200 * NS}
 
 
-def test_a_leap_second_counts_as_the_first_second_of_the_next_day():
-    assert parse_utc("2016-12-31T23:59:60.5Z") == parse_utc("2017-01-01T00:00:00.5Z")
+def test_an_epoch_within_a_leap_second_is_refused_with_that_reason_where_it_has_no_count():
+    with pytest.raises(
+        LeapSecondError, match=r"epoch outside of a leap second, .* found '2016-12-31T23:59:60.5Z'"
+    ):
+        parse_utc("2016-12-31T23:59:60.5Z")
+
+
+@pytest.mark.parametrize("text", ["2016-12-30T23:59:60", "2016-12-31T22:59:60", "2029-06-30T23:59:60"])
+def test_a_leap_second_that_does_not_exist_is_no_epoch(text):
+    with pytest.raises(TimeFormatError, match="expected a UTC epoch like"):
+        parse_tai(text)
+
+
+def tai_of_erfa(text):
+    date, clock = text.split("T")
+    hours, minutes, seconds = clock.split(":")
+    utc = erfa.dtf2d("UTC", *map(int, date.split("-")), int(hours), int(minutes), float(seconds))
+    days, rest = erfa.utctai(*utc)
+    return round((days - 2_440_587.5) * 86_400) * NS + round(rest * 86_400 * 1e9)
+
+
+@pytest.fixture(params=["2016-12-31", "2029-06-30"])
+def leap_day(request):
+    """The last day with a leap second, and one that the table does not have yet."""
+    table = erfa.leap_seconds.get()
+    if request.param == "2029-06-30":
+        LEAP_DATES.append("2029-07-01")
+        erfa.leap_seconds.set(np.append(table, np.array([(2029, 7, 38.0)], dtype=table.dtype)))
+    yield request.param
+    erfa.leap_seconds.set(table)
+    if request.param == "2029-06-30":
+        LEAP_DATES.pop()
+
+
+@pytest.mark.filterwarnings("ignore:ERFA function")
+def test_instants_around_and_within_a_leap_second_are_those_of_erfa_in_every_time_system(leap_day):
+    next_day = str(np.datetime64(leap_day) + 1)
+    texts = [
+        f"{leap_day}T23:59:59.25",
+        f"{leap_day}T23:59:60",
+        f"{leap_day}T23:59:60.999",
+        f"{next_day}T00:00:00.5",
+    ]
+    for text in texts:
+        tai = parse_tai(text)
+        # Two float64 of days are good to 0.01 ns, the text to a nanosecond.
+        assert abs(tai - tai_of_erfa(text)) <= 20_000, text
+        assert format_tai(tai, 9).rstrip("Z") == f"{text:0<29}" if "." in text else f"{text}.000000000"
+        assert in_leap_second(tai) == (":60" in text)
+        for system in ("TAI", "TT", "TDB", "GPS"):
+            counts = from_tai_ns(tai, system)
+            assert to_tai_ns(counts, system) == tai
+            assert parse_tai(str(np.datetime64(counts, "ns")), system) == tai
+        assert from_tai_ns(tai, "TT") - tai == 32_184_000_000
+        assert from_tai_ns(tai, "GPS") - tai == -19 * NS
+        seconds = (from_tai_ns(tai, "TT") / NS - 946_728_000.0) / 86_400.0
+        tdb = from_tai_ns(tai, "TDB") - from_tai_ns(tai, "TT")
+        assert tdb / NS == pytest.approx(erfa.dtdb(2_451_545.0, seconds, 0.0, 0.0, 0.0, 0.0), abs=20e-6)
+
+
+def test_rounding_within_a_leap_second_carries_into_the_next_day():
+    assert format_tai(parse_tai("2016-12-31T23:59:60.9996")) == "2017-01-01T00:00:00.000Z"
+    assert format_tai(parse_tai("2016-12-31T23:59:59.9996")) == "2016-12-31T23:59:60.000Z"
 
 
 @pytest.mark.parametrize(
@@ -117,12 +182,13 @@ def test_every_reading_of_the_onboard_clock_survives_utc_and_back(ticks):
 @pytest.mark.parametrize("system", TIME_SYSTEMS)
 def test_every_time_system_of_a_file_converts_there_and_back(system):
     utc_ns = parse_utc("2029-08-07T00:00:00") + np.arange(5) * 86_400 * NS
-    assert np.array_equal(to_utc_ns(from_utc_ns(utc_ns, system), system), utc_ns)
+    tai_ns = tai_ns_from_utc_ns(utc_ns)
+    assert np.array_equal(to_tai_ns(from_tai_ns(tai_ns, system), system), tai_ns)
 
 
 def test_gps_time_is_ahead_of_utc_by_18_s_since_2017():
     utc_ns = parse_utc("2029-08-07T00:00:00")
-    assert from_utc_ns(utc_ns, "GPS") - utc_ns == 18 * NS
+    assert from_tai_ns(tai_ns_from_utc_ns(utc_ns), "GPS") - utc_ns == 18 * NS
 
 
 def test_numbers_give_numbers_and_arrays_give_arrays_of_the_same_shape():

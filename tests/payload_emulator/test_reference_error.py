@@ -1,16 +1,17 @@
 """Errors of the reference: their sizes, their dynamics, and that shipped scenarios have them."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lunar.ephemeris import ephemeris_from_states
-from lunar.frames import rtn_from_inertial
+from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
+from lunar.frames import IauOrientation, rtn_from_inertial
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import SHIPPED, ReferenceSection, load_scenario, parse_scenario
-from payload_emulator.session.world import with_reference_error
+from payload_emulator.session.world import _truth_of_ephemeris, sample_truth, with_reference_error
 
 GM = 4.9028e12
 RADIUS_M = 1_767_400.0
@@ -97,3 +98,19 @@ def test_the_reference_of_a_shipped_scenario_is_not_the_truth(path: Path) -> Non
         return
     sigma = load_scenario(path).reference.sigma_rtn_m
     assert 10.0 <= math.hypot(*sigma) <= 100.0
+
+
+def test_the_arcs_of_a_flown_ephemeris_are_those_of_the_reference() -> None:
+    """The second orbit solution is 10 km higher; the state at its start is its own, 20 ns of TDB notwithstanding."""
+    one = circle().segments[0]
+    first = replace(one, utc_ns=one.utc_ns[:60], tai_ns=None, **states_of(one, slice(None, 60), 1.0))
+    second = replace(one, utc_ns=one.utc_ns[59:], tai_ns=None, **states_of(one, slice(59, None), 1.00565))
+    flown = Ephemeris((first, second))
+    found = sample_truth(_truth_of_ephemeris(flown, IauOrientation()), TIMES_NS[[30, 90]])
+    assert found.segments[0].stop_utc_ns == found.segments[1].start_utc_ns == TIMES_NS[59]
+    radii = np.linalg.norm([found.segments[0].position_m[-1], found.segments[1].position_m[0]], axis=1)
+    np.testing.assert_allclose(radii, [RADIUS_M, 1.00565 * RADIUS_M], atol=1.0)
+
+
+def states_of(one: EphemerisSegment, part: slice, scale: float) -> dict[str, np.ndarray]:
+    return {"position_m": scale * one.position_m[part], "velocity_m_s": one.velocity_m_s[part]}

@@ -1,4 +1,4 @@
-"""Attitudes of a pass archive: `attitude.csv` with a row for each frame, or a CCSDS AEM (`attitude.aem`)."""
+"""Attitudes of a pass archive: `attitude.csv` with a row for each frame, or `attitude.aem`, a CCSDS AEM or its XML."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
         raise InvalidInput(source, "", "UTF-8 text", "other octets") from None
-    if lines and lines[0].startswith("CCSDS_AEM_VERS"):
+    if lines and lines[0].lstrip().startswith(("CCSDS_AEM_VERS", "<")):
         return _of_message("\n".join(lines), source)
     if not lines or lines[0] != HEADER:
         raise InvalidInput(source, "line 1", HEADER, repr(lines[0][:80]) if lines else "nothing")

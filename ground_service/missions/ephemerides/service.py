@@ -18,8 +18,9 @@ from ground_service.missions.store import missions_in_force
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
+from lunar.comparison import check_gravity
 from lunar.ephemeris import Ephemeris as States
-from lunar.errors import LunarError
+from lunar.errors import LunarError, UnmovedByGravity
 from lunar.messages.ephemeris_files import load_ephemeris
 
 
@@ -37,12 +38,16 @@ def add_ephemeris(
     Raises
     ------
     InvalidInput
-        If the file cannot be read as an ephemeris, or is that of an object that no mission description names.
+        If the file cannot be read as an ephemeris, gravity does not move its states, or it is that of an object that no
+        mission description names.
     Forbidden
         If it is that of an object of another mission than those of the caller.
     """
     try:
         ephemeris = load_ephemeris(stored.path)
+        check_gravity(ephemeris)
+    except UnmovedByGravity as error:
+        raise InvalidInput("ephemeris", error.where, error.expected, error.found) from None
     except LunarError as error:
         reason = str(error).replace(str(stored.path), name)
         raise InvalidInput("ephemeris", "", "a CCSDS OEM, STK .e or Horizons file", reason) from None

@@ -88,7 +88,8 @@ def test_the_server_gives_the_file_with_its_name(rich_pass: RichPass, tmp_path: 
         import_archive(ground, rich_pass.folder)
         headers = {"Authorization": f"Bearer {add_user(ground, 'viewer', 'viewer')}"}
         assert client.post("/api/v1/exports", json={"pass_id": 1, "format": "aem"}).status_code == 401
-        answer = client.post("/api/v1/exports", json={"pass_id": 1, "format": "aem"}, headers=headers)
+        asked = {"pass_id": 1, "format": "aem", "version": "1.0"}
+        answer = client.post("/api/v1/exports", json=asked, headers=headers)
         assert answer.status_code == 200
         assert answer.headers["Content-Disposition"] == 'attachment; filename="pass-1.aem"'
         assert answer.content.startswith(b"CCSDS_AEM_VERS = 1.0")

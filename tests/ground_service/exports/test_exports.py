@@ -4,6 +4,8 @@ import csv
 import importlib.util
 import io
 import json
+import re
+import sqlite3
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -146,6 +148,19 @@ def test_spice_kernels_together_see_the_detected_crater_in_its_pixel(
             if 0 < k < FRAMES - 1:  # the ends of a CK are sharp, and the clock has ticks of 15 us
                 turn = spice.pxform("J2000", "SELENITA_CAMERA", et)
                 np.testing.assert_allclose(turn, rich_pass.camera_from_icrf[k], atol=1e-6)
+                rate = (spice.pxform("J2000", "SELENITA_CAMERA", et + 1.0) - turn) / 1.0
+                found = spice.sxform("J2000", "SELENITA_CAMERA", et + 0.5)
+                np.testing.assert_allclose(found[3:, :3], rate, rtol=0, atol=2e-4)
+                # Where does the camera look?
+                line = ("SELENITA", "SELENITA_CAMERA", [0.0, 0.0, 1.0])
+                seen, *_ = spice.sincpt("ELLIPSOID", "MOON", et, "IAU_MOON", "NONE", *line)
+                boresight = rich_pass.camera_from_icrf[k].T @ [0.0, 0.0, 1.0]
+                craft = 1e-3 * reference.at(utc_ns)[0]
+                middle = -craft @ boresight
+                distance = middle - np.sqrt(middle**2 - craft @ craft + 1737.4**2)
+                fixed = IauOrientation().mcmf_from_icrf(tdb_s_from_utc_ns(int(utc_ns)))
+                # 1e-6 rad of the CK at 30 km, and 2 us of the two formulae of TDB.
+                np.testing.assert_allclose(seen, fixed @ (craft + distance * boresight), rtol=0, atol=1e-4)
         shape, frame, _, _, corners = spice.getfov(camera_id(CRAFT), 8)
     assert (shape, frame) == ("POLYGON", "SELENITA_CAMERA")
     np.testing.assert_allclose(PinholeCamera().project(corners), PinholeCamera().corners_px(), atol=1e-9)
@@ -174,6 +189,14 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
         assert 'SPHEROID["Moon (2015) - Sphere",1737400,0' in info["crs"]
     assert counts["footprints"] == FRAMES
     assert counts["tracks"] == 4
+    with sqlite3.connect(tmp_path / "pass.gpkg") as database:
+        columns = {
+            row[1]: row[2] for name in layers for row in database.execute(f"PRAGMA table_info({name})")
+        }
+        times = database.execute("SELECT start, stop FROM tracks").fetchall()
+    expected = {"utc": "DATETIME", "start": "DATETIME", "stop": "DATETIME", "complete": "BOOLEAN"}
+    assert {name: columns[name] for name in expected} == expected
+    assert times[0] == tuple(format_utc(int(rich_pass.utc_ns[k])) for k in (0, -1))
     read = pyogrio.read_info(tmp_path / "pass.geojson")
     assert "1737400" in read["crs"]
 
@@ -300,6 +323,9 @@ def test_netcdf_has_the_tables_as_groups(rich_ground: Ground, rich_pass: RichPas
     rows = unzipped(export(rich_ground, "csv"))
     with xarray.open_datatree(path, engine="h5netcdf") as tree:
         assert tree.attrs["title"] == "synthetic pass"
+        assert re.fullmatch(
+            r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ LINNA: pass 1 exported as netCDF", tree.attrs["history"]
+        )
         frames = tree["frames"].to_dataset()
         np.testing.assert_array_equal(
             frames["utc"].values.astype("datetime64[ns]").astype(np.int64), rich_pass.utc_ns

@@ -1,5 +1,6 @@
 """Windows outside the reference ephemerides: refused where the ground needs the ephemeris."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from ground_service.missions.ephemerides.service import add_ephemeris, withdraw_
 from ground_service.missions.ephemerides.store import covering_ephemerides
 from ground_service.missions.service import add_mission
 from ground_service.planning.service import WindowEntry, add_window
+from lunar.ephemeris import Ephemeris
+from lunar.messages.oem import load_oem, save_oem
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import add_reference
+from tests.ground_service.conftest import add_reference, save_circle
 
 OUTSIDE = parse_utc("2031-01-01T00:00:00Z")
 MISSION = """name = "covered"
@@ -47,6 +50,18 @@ def test_a_window_must_lie_in_the_ephemeris_that_it_names(ground: Ground, synthe
     named = add_ephemeris(ground, file, name="reference")
     with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
         add_window(ground, window(named.id), actor="ann")
+
+
+def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(
+    ground: Ground, tmp_path: Path
+) -> None:
+    (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
+    metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
+    save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
+    message = r"ephemeris: states of SELENITA: expected an acceleration of \S+ m/s2 .* found .* metres for kilo"
+    with pytest.raises(InvalidInput, match=message):
+        add_ephemeris(ground, ground.files.put_file(tmp_path / "m.oem"), name="metres")
+    assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
 
 
 def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(

@@ -14,12 +14,12 @@ from lxml import etree
 from lunar.compressed import read_expanded
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError
-from lunar.frames import matrix_from_quaternion
+from lunar.frames import continuous_quaternions, matrix_from_quaternion
 from lunar.messages.aem import AttitudeSegment, format_aem, parse_aem
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
-from lunar.timescales import NS, from_utc_ns, parse_utc
+from lunar.timescales import NS, from_tai_ns, parse_tai, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
 
@@ -232,7 +232,7 @@ def attitudes(count: int = 6) -> AttitudeSegment:
     q = np.random.default_rng(4).normal(size=(count, 4))
     return AttitudeSegment(
         START + np.arange(count) * 15 * NS,
-        q / np.linalg.norm(q, axis=1, keepdims=True),
+        continuous_quaternions(q / np.linalg.norm(q, axis=1, keepdims=True)),
         comments=("star tracker",),
     )
 
@@ -267,7 +267,7 @@ def test_an_aem_is_read_as_it_was_written(count: int, second: int) -> None:
 
 
 def test_order_and_direction_of_quaternions_are_as_stated() -> None:
-    text = format_aem((attitudes(),))
+    text = format_aem((attitudes(),), "1.0")
     lines = []
     for line in text.splitlines():
         fields = line.split()
@@ -279,27 +279,58 @@ def test_order_and_direction_of_quaternions_are_as_stated() -> None:
     np.testing.assert_allclose(found.q_wxyz, attitudes().q_wxyz, atol=1e-11)
 
 
-def test_version_2_without_order_and_direction_is_read() -> None:
-    text = format_aem((attitudes(),)).replace("CCSDS_AEM_VERS = 1.0", "CCSDS_AEM_VERS = 2.0")
-    text = text.replace("ATTITUDE_DIR = A2B\n", "").replace("QUATERNION_TYPE = LAST\n", "")
-    np.testing.assert_allclose(parse_aem(text)[0].q_wxyz, attitudes().q_wxyz, atol=1e-11)
+def test_an_aem_is_written_as_version_2_or_in_the_old_form_with_continuous_signs() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 6)
+    q_wxyz = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=1)
+    flipped = AttitudeSegment(attitudes().utc_ns, q_wxyz * np.array([1, -1, -1, 1, -1, 1])[:, None])
+    texts = {version: format_aem((flipped,), version) for version in ("1.0", "2.0")}
+    assert format_aem((flipped,)) == texts["2.0"]
+    assert "CCSDS_AEM_VERS = 2.0\n" in texts["2.0"] and "CCSDS_AEM_VERS = 1.0\n" in texts["1.0"]
+    for keyword in ("ATTITUDE_DIR", "QUATERNION_TYPE"):
+        assert keyword in texts["1.0"] and keyword not in texts["2.0"]
+    for text in texts.values():
+        np.testing.assert_allclose(parse_aem(text)[0].q_wxyz, q_wxyz, atol=1e-11)
+
+
+AEM_XML = """<?xml version="1.0" encoding="UTF-8"?>
+<aem id="CCSDS_AEM_VERS" version="2.0"><header><CREATION_DATE>2029-08-07T00:00:00</CREATION_DATE>
+<ORIGINATOR>TEST</ORIGINATOR></header><body><segment><metadata><OBJECT_NAME>A</OBJECT_NAME><OBJECT_ID>B</OBJECT_ID>
+<REF_FRAME_A>ICRF</REF_FRAME_A><REF_FRAME_B>INSTRUMENT_1</REF_FRAME_B><TIME_SYSTEM>UTC</TIME_SYSTEM>
+<START_TIME>2029-08-07T00:00:00</START_TIME><STOP_TIME>2029-08-07T00:00:15</STOP_TIME>
+<ATTITUDE_TYPE>QUATERNION</ATTITUDE_TYPE><QUATERNION_TYPE>FIRST</QUATERNION_TYPE></metadata><data><attitudeState>
+<quaternionEphemeris><EPOCH>2029-08-07T00:00:00</EPOCH>
+<quaternion><QC>0.6</QC><Q1>0.0</Q1><Q2>0.8</Q2><Q3>0.0</Q3></quaternion></quaternionEphemeris></attitudeState>
+<attitudeState><quaternionState><EPOCH>2029-08-07T00:00:15</EPOCH>
+<quaternion><Q1>0.0</Q1><Q2>0.0</Q2><Q3>1.0</Q3><QC>0.0</QC></quaternion></quaternionState></attitudeState>
+</data></segment></body></aem>"""
+
+
+def test_an_aem_in_xml_is_read_by_the_names_of_its_elements() -> None:
+    (segment,) = parse_aem(AEM_XML)
+    np.testing.assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
+    np.testing.assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
+
+
+def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line() -> None:
+    with pytest.raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
+        parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("CCSDS_AEM_VERS = 1.0", "CCSDS_OEM_VERS = 2.0", "line 1: expected CCSDS_AEM_VERS"),
+        ("CCSDS_AEM_VERS = 2.0", "CCSDS_OEM_VERS = 2.0", "line 1: expected CCSDS_AEM_VERS"),
         (
-            "CCSDS_AEM_VERS = 1.0",
+            "CCSDS_AEM_VERS = 2.0",
             "CCSDS_AEM_VERS = 7.0",
             "expected an AEM version out of 1.0, 2.0, found '7.0'",
         ),
         ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE", "expected ATTITUDE_TYPE = QUATERNION"),
         ("DATA_STOP", "", "expected more lines, found the end of the file"),
         ("REF_FRAME_B = INSTRUMENT_1\n", "", "expected REF_FRAME_B before META_STOP, found none"),
-        ("T00:00:15.000 ", "T00:00:15.000 7 ", "line 22: expected an epoch and a quaternion of 4 numbers"),
-        ("T00:00:30.000 ", "T00:00:15.000 ", "line 23: expected an epoch after 2029-08-07T00:00:15"),
-        ("T00:00:15.000 ", "T00:00:15.000 9", "line 22: expected a quaternion of unit length"),
+        ("T00:00:15.000 ", "T00:00:15.000 7 ", "line 20: expected an epoch and a quaternion of 4 numbers"),
+        ("T00:00:30.000 ", "T00:00:15.000 ", "line 21: expected an epoch after 2029-08-07T00:00:15"),
+        ("T00:00:15.000 ", "T00:00:15.000 9", "line 20: expected a quaternion of unit length"),
     ],
 )
 def test_faults_of_an_aem_are_named_with_their_line(old: str, new: str, message: str) -> None:
@@ -343,7 +374,7 @@ def test_a_horizons_table_is_read(tmp_path: Path) -> None:
     segment = load_ephemeris(path).segments[0]
     assert segment.object_name == "LRO"
     # TDB is 69.184 s ahead of UTC, but for the 1.7 ms of its periodic part.
-    offset = from_utc_ns(segment.utc_ns, "TDB") - (START + np.array([0, 60]) * NS)
+    offset = from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)
     assert np.abs(offset).max() <= 1
     np.testing.assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
     np.testing.assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
@@ -386,6 +417,28 @@ def test_faults_of_a_horizons_table_are_named(
     path.write_text(HORIZONS.replace(old, new))
     with pytest.raises(error, match=message):
         load_ephemeris(path)
+
+
+def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tmp_path: Path) -> None:
+    head, _, _ = HORIZONS.partition("$$SOE\n")
+    row = (
+        "2457754.5, A.D. 2017-Jan-01 00:01:{:02d}.0000, 1.8E+03, 0.0E+00, {}E+00, 0.0E+00, 0.0E+00, 1.6E+00,"
+    )
+    path = tmp_path / "leap.csv"
+    path.write_text(head + "\n".join(["$$SOE", *(row.format(5 + k, k) for k in range(6)), "$$EOE"]))
+    segment = load_ephemeris(path).segments[0]
+    # TDB is 68.184 s ahead of UTC before and 69.184 s after the leap second.
+    assert np.abs(np.diff(segment.tai_ns) - NS).max() <= 1
+    assert abs(segment.tai_ns[4] - parse_tai("2016-12-31T23:59:60.816")) < 2_000_000
+
+
+def test_an_attitude_within_a_leap_second_is_refused_with_that_reason() -> None:
+    for system, clock in (("UTC", "2016-12-31T23:59:60.000"), ("TT", "2017-01-01T00:01:08.184")):
+        text = format_aem((attitudes(1),)).replace("TIME_SYSTEM = UTC", f"TIME_SYSTEM = {system}")
+        with pytest.raises(
+            DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"
+        ):
+            parse_aem(text.replace("2029-08-07T00:00:00.000 ", f"{clock} "))
 
 
 def test_an_spk_is_referred_to_the_converter(tmp_path: Path) -> None:

@@ -8,7 +8,9 @@ from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemErro
 from lunar.frames import icrf_from_j2000
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem, load_oem, parse_oem, save_oem
-from lunar.timescales import NS, format_utc, parse_utc
+from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
+from lunar.timescales import NS, TIME_SYSTEMS, format_utc, parse_tai, parse_utc, utc_ns_from_tai_ns
+from tests.lunar.orbits import circle
 
 # The independent package keeps time with ERFA, which warns of UTC more than five years after its own release.
 START = parse_utc("2029-08-07T00:00:00")
@@ -322,3 +324,55 @@ def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_kn
     path.write_text(replaced("TIME_SYSTEM          = UTC", "TIME_SYSTEM = LTC"))
     with pytest.raises(UnknownTimeSystemError, match=r"faulty\.oem: line 11: expected .*TDB.*, found 'LTC'"):
         load_oem(path)
+
+
+# Leap seconds
+
+
+def over_the_leap_second(step_s, time_system="UTC"):
+    """States of a circle from 2016-12-31T23:50:00 UTC on, and the seconds since then."""
+    elapsed = np.arange(0, 1200 if step_s > 1 else 620, step_s)
+    tai_ns = parse_tai("2016-12-31T23:50:00") + elapsed * NS
+    fields = {"tai_ns": tai_ns, "time_system": time_system}
+    return Ephemeris(
+        (EphemerisSegment(utc_ns_from_tai_ns(tai_ns), *circle(elapsed.astype(float)), **fields),)
+    )
+
+
+@pytest.mark.parametrize("step_s", [1, 60])
+@pytest.mark.parametrize("system", TIME_SYSTEMS)
+def test_states_across_a_leap_second_are_read_as_written_and_interpolated_on_tai(system, step_s):
+    given = over_the_leap_second(step_s, system)
+    text = format_oem(given)
+    assert ("2016-12-31T23:59:60.000" in text) == (system == "UTC")
+    for found in (parse_oem(text), parse_oem_xml(format_oem_xml(given).encode())):
+        assert np.abs(found.segments[0].tai_ns - given.segments[0].tai_ns).max() <= (system == "TDB")
+        for clock, elapsed in (("2016-12-31T23:59:55", 595.0), ("2016-12-31T23:59:60.5", 600.5),
+                               ("2017-01-01T00:00:00.5", 601.5), ("2017-01-01T00:00:05", 606.0)):  # fmt: skip
+            position, _ = found.at_tai(parse_tai(clock))
+            np.testing.assert_allclose(position, circle(elapsed)[0], rtol=0, atol=1e-5)
+
+
+def test_epochs_within_a_leap_second_that_have_no_place_are_refused_with_that_reason():
+    text = format_oem(over_the_leap_second(60)).replace(
+        "STOP_TIME", "USEABLE_STOP_TIME = 2016-12-31T23:59:60.5\nSTOP_TIME"
+    )
+    with pytest.raises(DataFileError, match="line 12: expected a UTC epoch outside of a leap second"):
+        parse_oem(text)
+
+
+@pytest.mark.parametrize("name", ["ICRS", "GCRF"])
+def test_other_names_of_icrf_axes_are_read(name):
+    found = parse_oem(VERSION_3.replace("REF_FRAME = ICRF", f"REF_FRAME = {name}", 1))
+    assert found.segments[0].frame == "ICRF"
+
+
+@pytest.mark.parametrize("fault", ["2029-13-07T00:00:00", "9noon"])
+def test_an_epoch_that_is_none_among_a_thousand_is_named_with_its_line(fault):
+    """Numpy ends the process by a segmentation fault where it refuses one of more than 500 texts."""
+    lines = format_oem(over_the_leap_second(1)).splitlines()
+    lines[-20] = fault + lines[-20][19:]
+    with pytest.raises(
+        DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"
+    ):
+        parse_oem("\n".join(lines))

@@ -1,7 +1,11 @@
 """SPICE kernels, read back with SPICE itself."""
 
 import builtins
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -9,22 +13,30 @@ import spiceypy
 
 from lunar.camera import PinholeCamera
 from lunar.ephemeris import Ephemeris, EphemerisSegment
-from lunar.errors import DataFileError, EphemerisError, MissingLibrary
+from lunar.errors import DataFileError, EphemerisError, MissingLibrary, UnknownFrameError
 from lunar.frames import matrix_from_quaternion
 from lunar.messages.spice import (
     ClockLine,
     camera_id,
     ck_octets,
+    et_from_tai_ns,
     et_from_utc_ns,
     format_fk,
     format_ik,
     format_sclk,
     load_spk,
     spacecraft_id,
-    spk_octets,
-    utc_ns_from_et,
+    spk_kernel,
+    tai_ns_from_et,
 )
-from lunar.timescales import NS, TICKS_PER_SECOND, parse_utc, ticks_from_utc_ns
+from lunar.timescales import (
+    NS,
+    TICKS_PER_SECOND,
+    parse_tai,
+    parse_utc,
+    tai_ns_from_utc_ns,
+    ticks_from_utc_ns,
+)
 from tests.lunar.spice_pool import kernels
 
 START = parse_utc("2029-08-07T00:00:00")
@@ -57,15 +69,27 @@ def test_ephemeris_time_is_that_of_spice(tmp_path: Path) -> None:
         expected = [spice.str2et(text) for text in texts]
     # One unit of a float64 of 1e9 s is 0.12 us.
     np.testing.assert_allclose(et_from_utc_ns(utc_ns), expected, rtol=0, atol=3e-7)
-    assert np.abs(utc_ns_from_et(np.array(expected)) - utc_ns).max() <= 300
+    assert np.abs(tai_ns_from_et(np.array(expected)) - tai_ns_from_utc_ns(utc_ns)).max() <= 300
 
 
+def test_ephemeris_time_within_a_leap_second_is_that_of_spice(tmp_path: Path) -> None:
+    texts = ["2016-12-31T23:59:59.75", "2016-12-31T23:59:60.25", "2017-01-01T00:00:00.25"]
+    with kernels(tmp_path) as spice:
+        expected = [spice.str2et(text) for text in texts]
+    found = et_from_tai_ns(np.array([parse_tai(text) for text in texts]))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-7)
+
+
+@pytest.mark.parametrize("data_type", [3, 13])
 @pytest.mark.parametrize(("interpolation", "degree"), [("HERMITE", 7), ("LAGRANGE", 9), ("LINEAR", 1)])
-def test_spk_gives_the_states_of_the_ephemeris(tmp_path: Path, interpolation: str, degree: int) -> None:
+def test_spk_gives_the_states_of_the_ephemeris(
+    tmp_path: Path, interpolation: str, degree: int, data_type: int
+) -> None:
     ephemeris = Ephemeris((arc(0, 7200, interpolation=interpolation, degree=degree),))
     asked = START + np.arange(0, 7200 * NS, 13 * NS + 7_000_001)
     position, velocity = ephemeris.at(asked)
-    with kernels(tmp_path, orbit=spk_octets(ephemeris, CRAFT)) as spice:
+    kernel = spk_kernel(ephemeris, CRAFT, data_type)
+    with kernels(tmp_path, orbit=kernel.octets) as spice:
         states = 1e3 * np.array([spice.spkgeo(CRAFT, et, "J2000", 301)[0] for et in et_from_utc_ns(asked)])
     # 0.3 us of a float64 of seconds at 1.7 km/s are 0.5 mm. Windows of SPICE may lie one state to the side.
     np.testing.assert_allclose(states[:, :3], position, rtol=0, atol=1e-3)
@@ -80,7 +104,7 @@ def test_spk_keeps_the_segments_and_their_useable_intervals(tmp_path: Path) -> N
         START + seconds * NS, *circular(seconds.astype(float), 1e-3), useable_start_utc_ns=burn
     )
     ephemeris = Ephemeris((before, after))
-    with kernels(tmp_path, orbit=spk_octets(ephemeris, CRAFT)) as spice:
+    with kernels(tmp_path, orbit=spk_kernel(ephemeris, CRAFT).octets) as spice:
         for seconds_after in (-1, 1):
             epoch = burn + seconds_after * NS
             state, _ = spice.spkgeo(CRAFT, float(et_from_utc_ns(epoch)), "J2000", 301)
@@ -91,13 +115,14 @@ def test_spk_keeps_the_segments_and_their_useable_intervals(tmp_path: Path) -> N
 
 def test_spk_of_lone_states_is_refused() -> None:
     with pytest.raises(EphemerisError, match="expected a segment of at least two states, found none"):
-        spk_octets(Ephemeris((arc(0, 0),)), CRAFT)
+        spk_kernel(Ephemeris((arc(0, 0),)), CRAFT)
 
 
-def test_spk_is_read_as_the_ephemeris_it_came_from(tmp_path: Path) -> None:
+@pytest.mark.parametrize("data_type", [3, 13])
+def test_spk_is_read_as_the_ephemeris_it_came_from(tmp_path: Path, data_type: int) -> None:
     ephemeris = Ephemeris((arc(0, 7200),))
     path = tmp_path / "orbit.bsp"
-    path.write_bytes(spk_octets(ephemeris, CRAFT))
+    path.write_bytes(spk_kernel(ephemeris, CRAFT, data_type).octets)
     read = load_spk(path)
     assert read.segments[0].object_name == str(CRAFT)
     asked = read.utc_ns[1:-1]
@@ -106,6 +131,69 @@ def test_spk_is_read_as_the_ephemeris_it_came_from(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.at(between)[0], ephemeris.at(between)[0], rtol=0, atol=2e-3)
     with pytest.raises(DataFileError, match=rf"expected body -5, found bodies {CRAFT}"):
         load_spk(path, -5)
+
+
+def test_an_spk_is_of_polynomials_where_these_are_exact_and_states_their_error() -> None:
+    smooth = spk_kernel(Ephemeris((arc(0, 7200),)), CRAFT)
+    assert (smooth.data_type, smooth.states) == (3, 8)  # records of 16 minutes
+    assert smooth.error_m is not None and smooth.error_m < 1e-4
+    rng = np.random.default_rng(1)
+    seconds = np.cumsum(rng.uniform(30.0, 90.0, 60))
+    position, velocity = circular(seconds)
+    jagged = position + rng.normal(scale=50.0, size=(60, 3))
+    uneven = EphemerisSegment(START + (seconds * NS).astype(np.int64), jagged, velocity)
+    assert spk_kernel(Ephemeris((uneven,)), CRAFT).data_type == 13
+    forced = spk_kernel(Ephemeris((uneven,)), CRAFT, 3)
+    assert forced.error_m is not None and forced.error_m > 1.0
+
+
+def test_segments_of_an_spk_stay_segments_with_the_shared_epoch_in_both(tmp_path: Path) -> None:
+    """The second solution is 10 km higher, and a third overlaps it: the last in the file counts."""
+    first, second, third = arc(0, 600), arc(600, 1800), arc(1200, 1500)
+    higher = EphemerisSegment(second.utc_ns, second.position_m * 1.00565, second.velocity_m_s)
+    lower = EphemerisSegment(third.utc_ns, third.position_m * 0.99, third.velocity_m_s)
+    both = tmp_path / "both.bsp"
+    both.write_bytes(spk_kernel(Ephemeris((first, higher)), CRAFT).octets)
+    with spiceypy_file(both) as (spice, handle):
+        et = et_from_utc_ns(lower.utc_ns)
+        states = np.concatenate([lower.position_m, lower.velocity_m_s], axis=1) / 1e3
+        spice.spkw13(handle, CRAFT, 301, "J2000", et[0], et[-1], "late", 7, len(et), states, et)
+    found = load_spk(both)
+    spans = [(one.start_utc_ns - START, one.stop_utc_ns - START) for one in found.segments]
+    assert spans == [(a * NS, b * NS) for a, b in ((0, 600), (600, 1200), (1200, 1500), (1500, 1800))]
+    for segment, given in zip(found.segments, (first, higher, lower, higher), strict=True):
+        expected, _ = Ephemeris((given,)).at_tai(segment.tai_ns)
+        np.testing.assert_allclose(segment.position_m, expected, rtol=0, atol=2e-3)
+
+
+@contextmanager
+def spiceypy_file(path: Path) -> Iterator[tuple[ModuleType, int]]:
+    handle = spiceypy.spkopa(str(path))
+    try:
+        yield spiceypy, handle
+    finally:
+        spiceypy.spkcls(handle)
+
+
+def test_an_spk_in_axes_that_need_other_kernels_is_refused_by_its_frame(tmp_path: Path) -> None:
+    path = tmp_path / "fixed.bsp"
+    path.write_bytes(spk_kernel(Ephemeris((arc(0, 600),)), CRAFT).octets)
+    octets = path.read_bytes()
+    one = struct.pack("<iiii", CRAFT, 301, 1, 3)
+    assert octets.count(one) == 1
+    path.write_bytes(octets.replace(one, struct.pack("<iiii", CRAFT, 301, 123456, 3)))
+    expected = rf"body {CRAFT}: expected a reference frame out of J2000, .*, found '123456'"
+    with pytest.raises(UnknownFrameError, match=expected):
+        load_spk(path)
+
+
+def test_a_gap_of_an_ephemeris_is_one_of_its_spk(tmp_path: Path) -> None:
+    seconds = np.concatenate([np.arange(0, 601, 60), np.arange(3600, 4201, 60)])
+    ephemeris = Ephemeris((EphemerisSegment(START + seconds * NS, *circular(seconds.astype(float))),))
+    for data_type in (3, 13):
+        path = tmp_path / f"{data_type}.bsp"
+        path.write_bytes(spk_kernel(ephemeris, CRAFT, data_type).octets)
+        assert [one.covers(START + 1800 * NS) for one in (ephemeris, load_spk(path))] == [False, False]
 
 
 def test_a_file_that_is_no_spk_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -183,4 +271,4 @@ def test_without_spiceypy_one_line_names_the_extra(monkeypatch: pytest.MonkeyPat
     with pytest.raises(
         MissingLibrary, match=r"expected the library spiceypy, found none; install linna\[spice\]"
     ):
-        spk_octets(Ephemeris((arc(0, 600),)), CRAFT)
+        spk_kernel(Ephemeris((arc(0, 600),)), CRAFT)

@@ -38,11 +38,10 @@ from ground_service.passes.service import define_pass, list_events
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
 from linna.cli import run
-from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
-from lunar.ephemeris import ephemeris_from_states
-from lunar.messages.oem import save_oem
+from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from tests.ground_service.conftest import circular_states, save_circle
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
@@ -253,16 +252,16 @@ def test_a_new_reference_ephemeris_gives_new_light_times(
     monkeypatch.undo()
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     receive(ground, spacecraft.reports)
-    times = START + np.arange(-10, REPORTS + 10, dtype=np.int64) * 60 * NS
-    earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(times))))
-    distance = np.linalg.norm(earth, axis=1, keepdims=True)
-    far_side = -earth / distance * 3.0 * MOON_RADIUS_M
+    sent = np.array(spacecraft.sent)
+    earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(sent))))
+    nearer_m = np.linalg.norm(earth, axis=1) - np.linalg.norm(earth - circular_states(sent)[0], axis=1)
     before = [one.light_time_s for one in residuals(ground, vehicle)]
-    save_oem(ephemeris_from_states(times, far_side, np.zeros_like(far_side)), tmp_path / "far.oem")
-    add_ephemeris(ground, ground.files.put_file(tmp_path / "far.oem"), name="far")
+    orbit = save_circle(tmp_path / "orbit.oem", START - 600 * NS, 2.0)
+    add_ephemeris(ground, ground.files.put_file(orbit), name="orbit")
     after = [one.light_time_s for one in residuals(ground, vehicle)]
-    # From the Moon's centre to three radii behind it, as seen from the Earth.
-    np.testing.assert_allclose(np.array(after) - before, 3.0 * MOON_RADIUS_M / SPEED_OF_LIGHT_M_S, atol=1e-5)
+    # From the Moon's centre to the orbit around it, which moves by 2 km while the light travels.
+    np.testing.assert_allclose(np.array(before) - after, nearer_m / SPEED_OF_LIGHT_M_S, atol=1e-5)
+    assert np.abs(nearer_m).max() > 1e5
     assert len(ground.read(correlations_in_force, vehicle)) == 2
     assert len(ground.read(correlations_on_record, vehicle)) == 4
 
