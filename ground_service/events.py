@@ -242,14 +242,6 @@ class HandoverChanged(Event):
     held_by: str | None = None
 
 
-class DisplayChanged(Event):
-    """An object of the telemetry displays was stored, or deleted if `version` is None."""
-
-    event_kind = "display"
-    key: str
-    version: int | None = None
-
-
 class FollowUpFailed(Event):
     """Follow-up work of events failed and is not repeated."""
 

@@ -22,8 +22,7 @@ Decision = Literal["all", "list", "content", "service", "spacecraft"]
 
 ALL = {
     "start_session", "get_session", "end_session", "get_status", "list_export_formats", "list_jobs",
-    "get_job", "list_ephemerides", "list_catalogues", "add_catalogue", "list_displays", "get_display",
-    "keep_display", "delete_display", "list_builds", "moon_map",
+    "get_job", "list_ephemerides", "list_catalogues", "add_catalogue", "list_builds", "moon_map",
 }  # fmt: skip
 """Operations that concern no spacecraft: documents and data products that all missions share, and progress of jobs."""
 

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from ground_service.access import model as access
     from ground_service.contacts.commanding import model as commanding
     from ground_service.contacts.links import model as links
-    from ground_service.displays import model as displays
     from ground_service.evaluation import model as evaluation
     from ground_service.evaluation.landmarks import model as landmarks
     from ground_service.evaluation.performance import model as performance
@@ -33,8 +32,8 @@ else:
     import_lazily(
         globals(),
         "access.model passes.alarms.model worker.automation.model contacts.commanding.model "
-        "displays.model missions.ephemerides.model evaluation.model exports.model ingest.model "
-        "jobs.model evaluation.landmarks.model contacts.links.model missions.model passes.model "
+        "missions.ephemerides.model evaluation.model exports.model ingest.model jobs.model "
+        "evaluation.landmarks.model contacts.links.model missions.model passes.model "
         "evaluation.performance.model planning.model regression.model planning.request_model "
         "missions.timekeeping.model worker.model ",
     )
@@ -594,26 +593,6 @@ class Operations(Connection):
     @operation("POST /alarms/{alarm_id}/shelve", body=("until", "comment"))
     def shelve_alarm(self, alarm_id: int, until: str, *, comment: str = "") -> alarms.AlarmDetail:
         """Suppress an alarm until a time; a time in the past ends this."""
-
-    # displays
-
-    @operation("GET /displays", reads="displays.store.list_displays")
-    def list_displays(self) -> Listing[displays.DisplaySummary]:
-        """List the stored objects of the telemetry displays, the one that changed last first."""
-
-    @operation("GET /displays/{key}")
-    def get_display(self, key: str) -> displays.Display:
-        """Show a stored object of the telemetry displays."""
-
-    @operation("PUT /displays/{key}", body=("name", "type", "version", "document"))
-    def keep_display(
-        self, key: str, name: str, type: str, version: int, document: Mapping[str, Any]
-    ) -> displays.Display:
-        """Keep an object of the telemetry displays; it replaces the stated version only."""
-
-    @operation("DELETE /displays/{key}")
-    def delete_display(self, key: str) -> None:
-        """Delete a stored object of the telemetry displays."""
 
     # automation
 

@@ -627,20 +627,6 @@ ALARM_POSITIONS = table(
 )
 """Last packet of a vehicle that has been examined for alarms."""
 
-DISPLAY_OBJECTS = table(
-    "display_objects",
-    key("key", String(64)),
-    *columns(Text, "name", "type"),
-    column("version", Integer),
-    column("document", Text),
-    column("octets", Integer),
-    column("created_by", String(64)),
-    column("created_utc_ns", BigInteger),
-    column("changed_by", String(64)),
-    column("changed_utc_ns", BigInteger),
-)
-"""Object of the telemetry displays as JSON; `version` counts its changes."""
-
 EVENT_POSITIONS = table(
     "event_positions",
     key("consumer", String(32)),
