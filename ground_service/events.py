@@ -205,16 +205,6 @@ class LandmarkChanged(Event):
     proposed: int
 
 
-class AutomationChanged(Event):
-    """An action of an automation rule was recorded, decided, or has ended; `event` is the event that caused it."""
-
-    event_kind = "automation"
-    id: int
-    event: int
-    action: str
-    state: str
-
-
 class LimitsBroken(Event):
     """Trends of housekeeping parameters are outside their limits."""
 

@@ -28,8 +28,8 @@ ALL = {
 
 LISTS = {
     "list_passes", "list_ingests", "list_monthly_reports", "list_landmarks", "list_missions",
-    "list_windows", "list_requests", "list_telecommands", "list_alarms", "list_automation_actions",
-    "list_handovers", "list_spacecraft", "list_links", "list_contacts", "list_automation_rules",
+    "list_windows", "list_requests", "list_telecommands", "list_alarms",
+    "list_handovers", "list_spacecraft", "list_links", "list_contacts",
 }  # fmt: skip
 """Lists from which the rows of other spacecraft are left out."""
 
@@ -55,7 +55,6 @@ ROWS: dict[str, tuple[Owner, ...]] = {
     "alarm_id": ("alarms",),
     "ingest_id": ("ingests",),
     "landmark_id": ("landmarks",),
-    "action_id": ("automation_actions",),
     "report_id": ("reports", "monthly_reports"),
     "revision": ("missions",),
     "name": ("links",),

@@ -1,4 +1,4 @@
-"""Remove the layouts of the telemetry displays.
+"""Remove the layouts of the telemetry displays and the actions of automation rules.
 
 Revision: 1.5, after 1.4
 """
@@ -14,4 +14,5 @@ depends_on = None
 
 
 def upgrade() -> None:
-    op.drop_table("display_objects")
+    for table in ("display_objects", "automation_actions"):
+        op.drop_table(table)
