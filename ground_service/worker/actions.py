@@ -31,7 +31,7 @@ from ground_service.events import (
 )
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
-from ground_service.missions.automation import Automation
+from ground_service.missions.automation import Automation, Channel
 from ground_service.planning import store as planning
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.progress import HEARD_TICKS, close_window, note_reason, span_of
@@ -131,9 +131,10 @@ STEPS: Mapping[str, Callable[[Connection, LoggedEvent], Iterator[Step]]] = {
 """Follow-up by kind of event."""
 
 
-def has_steps(connection: Connection, event: LoggedEvent) -> bool:
-    """Return whether anything is evaluated, reported or kept after an event."""
-    return event.kind in STEPS and next(STEPS[event.kind](connection, event), None) is not None
+def steps_after(connection: Connection, event: LoggedEvent) -> Iterator[Step]:
+    """Yield the follow-up of an event; none for other kinds, such as those that rules of earlier versions named."""
+    if event.kind in STEPS:
+        yield from STEPS[event.kind](connection, event)
 
 
 def run_steps(ground: Ground, number: int) -> dict[str, Any]:
@@ -148,7 +149,7 @@ def run_steps(ground: Ground, number: int) -> dict[str, Any]:
     failed = []
     with ground.database.reading() as connection:
         event = _event(connection, number)
-        steps = list(STEPS[event.kind](connection, event))
+        steps = list(steps_after(connection, event))
     for step in steps:
         ground.check_stopping()
         with fault_of(f"{step.name}, event {number}") as faults:
@@ -270,12 +271,13 @@ MESSAGES: Mapping[str, Callable[[Connection, LoggedEvent], Iterator[Message]]] =
 """Notifications by kind of event."""
 
 
-def has_messages(connection: Connection, event: LoggedEvent) -> bool:
-    """Return whether a receiver of a mission description in force is notified of an event."""
-    if event.kind not in MESSAGES or not (channels := missions.channels_in_force(connection)):
-        return False
-    known = {None, *(spacecraft for spacecraft, _, _ in channels)}
-    return any(message.spacecraft_id in known for message in MESSAGES[event.kind](connection, event))
+def messages_after(connection: Connection, event: LoggedEvent) -> Iterator[tuple[Message, int, str, Channel]]:
+    """Yield the notifications of an event with the spacecraft, name and channel of each receiver in force."""
+    channels = missions.channels_in_force(connection) if event.kind in MESSAGES else []
+    for message in MESSAGES[event.kind](connection, event) if channels else ():
+        for spacecraft, name, channel in channels:
+            if message.spacecraft_id in (None, spacecraft):
+                yield message, spacecraft, name, channel
 
 
 def send_messages(ground: Ground, number: int) -> dict[str, Any]:
@@ -288,24 +290,19 @@ def send_messages(ground: Ground, number: int) -> dict[str, Any]:
     """
     with ground.database.reading() as connection:
         event = _event(connection, number)
-        messages = list(MESSAGES[event.kind](connection, event))
-        channels = missions.channels_in_force(connection)
+        messages = list(messages_after(connection, event))
     done: dict[str, Any] = {"event": number}
     failed = []
-    for message in messages:
-        subject = f"LINNA: {message.text}"
-        for spacecraft, name, channel in channels:
-            if message.spacecraft_id not in (None, spacecraft):
-                continue
-            ground.check_stopping()
-            identity = f"{_identity(f'notification {number} {spacecraft}')}.{name}"
-            content = _content(message, event, spacecraft)
-            receiver = f"{name} of spacecraft {spacecraft}"
-            try:
-                send(ground.home, channel, identity, subject, content, networks=ground.networks)
-                done[receiver] = "delivered"
-            except GroundError as error:
-                failed.append(f"{receiver}: {public_text(error)}")
+    for message, spacecraft, name, channel in messages:
+        ground.check_stopping()
+        identity = f"{_identity(f'notification {number} {spacecraft}')}.{name}"
+        subject, content = f"LINNA: {message.text}", _content(message, event, spacecraft)
+        receiver = f"{name} of spacecraft {spacecraft}"
+        try:
+            send(ground.home, channel, identity, subject, content, networks=ground.networks)
+            done[receiver] = "delivered"
+        except GroundError as error:
+            failed.append(f"{receiver}: {public_text(error)}")
     if failed:
         raise NotDelivered("; ".join(failed))
     return done

@@ -48,7 +48,7 @@ from ground_service.planning.standing import needs_plan, planned_with
 from ground_service.planning.store import get_record
 from ground_service.store import events
 from ground_service.store.events import LoggedEvent
-from ground_service.worker.actions import MESSAGES, STEPS, has_messages, has_steps
+from ground_service.worker.actions import MESSAGES, STEPS, messages_after, steps_after
 from ground_service.worker.jobs import run_job
 
 log = logging.getLogger(__name__)
@@ -139,9 +139,9 @@ def _work_of(ground: Ground, event: LoggedEvent) -> Iterator[Work]:
     if event.kind in FOLLOWING:
         yield from FOLLOWING[event.kind](ground, event)
     with ground.database.reading() as connection:
-        if has_steps(connection, event):
+        if any(True for _ in steps_after(connection, event)):
             yield "act", event.number
-        if has_messages(connection, event):
+        if any(True for _ in messages_after(connection, event)):
             yield "notify", event.number
 
 

@@ -6,7 +6,10 @@ import logging
 
 import pytest
 
+from ground_service.ground import Ground
+from ground_service.missions import store
 from ground_service.missions.model import format_mission, parse_mission, read_document
+from ground_service.missions.service import without_tokens
 
 HEAD = 'name = "m"\n'
 RULE = '[[automation.rules]]\nname = "a"\non = "window ended"\ndo = ["report"]\n'
@@ -54,6 +57,17 @@ def test_a_stored_description_with_an_empty_list_of_rules_evaluates_nothing() ->
     assert parse_mission(HEAD + RULE, stored=True).automation.evaluate is None
     stated = f"{HEAD}[automation]\nevaluate = true\nrules = []\n"
     assert parse_mission(stored=True, text=stated).automation.evaluate is True
+
+
+def test_a_stored_revision_with_rules_opens_and_names_its_receivers(either: Ground) -> None:
+    text = f"{HEAD}[spacecraft]\nid = 76\n{RULE}[automation.channels.hook]\nwebhook = 'https://x.example/T0KEN'\n"
+    mission = parse_mission(text, stored=True)
+    key, _ = either.write(store.add_revision, mission, text, actor="ann", now_utc_ns=1)
+    [(spacecraft, name, channel)] = either.read(store.channels_in_force)
+    assert (spacecraft, name, channel.webhook) == (76, "hook", "https://x.example/T0KEN")
+    shown = without_tokens(either.read(store.detail, key))
+    assert "T0KEN" not in shown.text and RULE in shown.text
+    assert shown.document.notify["hook"].webhook == "https://x.example/..."
 
 
 def test_receivers_survive_the_format() -> None:

@@ -18,11 +18,12 @@ from ground_service.evaluation import service as evaluation
 from ground_service.evaluation.landmarks.model import LandmarkFilter
 from ground_service.evaluation.landmarks.store import list_landmarks
 from ground_service.evaluation.store import newest_report
-from ground_service.events import ContactEnded, PassEvaluated, publish
+from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, publish
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.model import Job, JobFilter
+from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import list_jobs, repeat_failed, unfinished_jobs
 from ground_service.missions.catalogues import add_catalogue, catalogue_of
 from ground_service.missions.ephemerides.service import add_ephemeris
@@ -39,6 +40,7 @@ from ground_service.regression.pass_archives import LIVE
 from ground_service.worker import actions
 from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.follow_up import FollowUp, follow_in_process
+from ground_service.worker.jobs import run_job
 from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import (
@@ -301,6 +303,15 @@ def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
     InlineDispatcher(either).resume()
     assert either.read(get_window, window_id).state == "processed"
     assert {one.state for one in follow_up(either)} == {"done"}
+
+
+def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(ground: Ground) -> None:
+    ground.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
+    for kind in ("automation", "notification"):
+        done = run_job(ground, enter_job(ground, kind, {"event": 1}))
+        assert (done.state, done.result) == ("done", {"event": 1})
+    failed = run_job(ground, enter_job(ground, "automation", {"event": 99}))
+    assert failed.error == "event 99: not found"
 
 
 @pytest.mark.parametrize("evaluate", [False, None])
