@@ -19,7 +19,7 @@ from ground_service.evaluation.landmarks.service import update_landmarks
 from ground_service.evaluation.performance.service import due_report_of_vehicle
 from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.service import make_report, reevaluate
-from ground_service.evaluation.store import newest_report
+from ground_service.evaluation.store import get_report, newest_report
 from ground_service.events import (
     AlarmChanged,
     ArchiveImported,
@@ -36,7 +36,6 @@ from ground_service.planning import store as planning
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.progress import HEARD_TICKS, close_window, note_reason, span_of
 from ground_service.regression.pass_archives import keep_pass
-from ground_service.store import repository
 from ground_service.store.events import LoggedEvent, read_events
 from ground_service.store.vehicles import get_vehicle
 from ground_service.worker.notifications import send
@@ -232,7 +231,7 @@ def _of_failed_window(connection: Connection, logged: LoggedEvent) -> Iterator[M
 
 def _of_report(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
     event = PassEvaluated.of(logged)
-    summary = repository.get(connection, repository.REPORTS, event.report_id, "report")["summary"]
+    summary = get_report(connection, event.report_id).summary
     text = f"report of pass {event.pass_id}: {summary.get('verdict') or 'no verdict'}"
     yield Message("report done", text, _spacecraft(connection, event.vehicle_id), event.pass_id)
 
