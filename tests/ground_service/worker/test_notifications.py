@@ -440,8 +440,10 @@ def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
         for key, spacecraft in ((1, 76), (2, 77)):
             row_of(connection, METADATA.tables["vehicles"], id=key, ccsds_id=spacecraft, instance="flight")
         row_of(connection, METADATA.tables["passes"], id=1, vehicle_id=1)
+        row_of(connection, METADATA.tables["files"], sha256="0" * 64)
+        files = {"html_sha256": "0" * 64, "json_sha256": "0" * 64}
         summary = {"verdict": "requirements met"}
-        row_of(connection, METADATA.tables["reports"], id="r", pass_id=1, summary=summary)
+        row_of(connection, METADATA.tables["reports"], id="r", pass_id=1, summary=summary, **files)
     window = SimpleNamespace(id=1, name="mare", reason="too late", vehicle_id=1, pass_id=None)
     monkeypatch.setattr(actions, "_window_of", lambda _, key: window if key == 1 else None)
     local.write(publish, event)
