@@ -234,7 +234,7 @@ def test_the_annotation_of_a_plot_is_kept_in_the_browser(mct, shown):
         mct.emulate_media(color_scheme=scheme)
         again = open_plot(mct, shown.url)
         wait_until(
-            lambda plot=again: marked(plot) > plain + 500, f"the marks are not drawn in the {scheme} theme"
+            lambda plot=again: marked(plot) > plain + 300, f"the marks are not drawn in the {scheme} theme"
         )
 
 
