@@ -1,8 +1,8 @@
 """Clocks of the service: the wall clock, and the mission time, which a simulated mission sets.
 
 The wall clock counts for leases, time-outs, tokens and the audit log. The mission time counts for everything that
-depends on the time at the spacecraft: contacts, plans, windows and the delays of automation. A mission description can
-state its clock; otherwise it is the wall clock.
+depends on the time at the spacecraft: contacts, plans and windows. A mission description can state its clock;
+otherwise it is the wall clock.
 """
 
 from __future__ import annotations

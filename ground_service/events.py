@@ -205,16 +205,6 @@ class LandmarkChanged(Event):
     proposed: int
 
 
-class AutomationChanged(Event):
-    """An action of an automation rule was recorded, decided, or has ended; `event` is the event that caused it."""
-
-    event_kind = "automation"
-    id: int
-    event: int
-    action: str
-    state: str
-
-
 class LimitsBroken(Event):
     """Trends of housekeeping parameters are outside their limits."""
 
@@ -240,14 +230,6 @@ class HandoverChanged(Event):
     spacecraft_id: int
     instance: str
     held_by: str | None = None
-
-
-class DisplayChanged(Event):
-    """An object of the telemetry displays was stored, or deleted if `version` is None."""
-
-    event_kind = "display"
-    key: str
-    version: int | None = None
 
 
 class FollowUpFailed(Event):

@@ -90,10 +90,7 @@ class Ground:
 
     @contextmanager
     def alone(self, work: str) -> Iterator[None]:
-        """Wait until no other thread or process does a piece of work, and keep others out.
-
-        Actions cause later events only, whose actions may run inside: nobody waits for an earlier event.
-        """
+        """Wait until no other thread or process does a piece of work, and keep others out."""
         mine = (self.home, work)
         with _changed:
             while mine in _running:

@@ -43,8 +43,6 @@ OPERATIONS = (
     Router("ground_service.planning.request_routes", "requests", "requests"),
     Router("ground_service.contacts.commanding.routes", "telecommands", "telecommands"),
     Router("ground_service.passes.alarms.routes", "alarms", "alarms"),
-    Router("ground_service.displays.routes", "displays", "displays"),
-    Router("ground_service.worker.automation.routes", "automation", "automation"),
     Router("ground_service.regression.routes", "regressions", "regressions"),
     Router("ground_service.access.routes", "access", "users"),
     Router("ground_service.worker.status_routes", "status", "status"),

@@ -41,10 +41,6 @@ TASKS: dict[str, dict[str, tuple[str, str]]] = {
             "landmarks",
             "craters learned from flight: candidates, decisions, new catalogue, labels, upload",
         ),
-        "automation": (
-            "automation",
-            "list the rules and actions of the automation, approve or refuse actions",
-        ),
         "command": ("command", "queue, release, uplink and verify telecommands"),
     },
     "build and gate": {

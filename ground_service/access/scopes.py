@@ -22,15 +22,14 @@ Decision = Literal["all", "list", "content", "service", "spacecraft"]
 
 ALL = {
     "start_session", "get_session", "end_session", "get_status", "list_export_formats", "list_jobs",
-    "get_job", "list_ephemerides", "list_catalogues", "add_catalogue", "list_displays", "get_display",
-    "keep_display", "delete_display", "list_builds", "moon_map",
+    "get_job", "list_ephemerides", "list_catalogues", "add_catalogue", "list_builds", "moon_map",
 }  # fmt: skip
 """Operations that concern no spacecraft: documents and data products that all missions share, and progress of jobs."""
 
 LISTS = {
     "list_passes", "list_ingests", "list_monthly_reports", "list_landmarks", "list_missions",
-    "list_windows", "list_requests", "list_telecommands", "list_alarms", "list_automation_actions",
-    "list_handovers", "list_spacecraft", "list_links", "list_contacts", "list_automation_rules",
+    "list_windows", "list_requests", "list_telecommands", "list_alarms",
+    "list_handovers", "list_spacecraft", "list_links", "list_contacts",
 }  # fmt: skip
 """Lists from which the rows of other spacecraft are left out."""
 
@@ -56,7 +55,6 @@ ROWS: dict[str, tuple[Owner, ...]] = {
     "alarm_id": ("alarms",),
     "ingest_id": ("ingests",),
     "landmark_id": ("landmarks",),
-    "action_id": ("automation_actions",),
     "report_id": ("reports", "monthly_reports"),
     "revision": ("missions",),
     "name": ("links",),

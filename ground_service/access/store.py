@@ -226,7 +226,7 @@ def delete_answers(connection: Connection, before_utc_ns: int) -> int:
 
 Owner = Literal[
     "passes", "windows", "standing_requests", "telecommands", "alarms", "ingests", "landmarks",
-    "automation_actions", "reports", "monthly_reports", "missions", "links",
+    "reports", "monthly_reports", "missions", "links",
 ]  # fmt: skip
 """Table whose rows belong to a spacecraft."""
 

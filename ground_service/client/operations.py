@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from ground_service.access import model as access
     from ground_service.contacts.commanding import model as commanding
     from ground_service.contacts.links import model as links
-    from ground_service.displays import model as displays
     from ground_service.evaluation import model as evaluation
     from ground_service.evaluation.landmarks import model as landmarks
     from ground_service.evaluation.performance import model as performance
@@ -28,15 +27,14 @@ if TYPE_CHECKING:
     from ground_service.planning import request_model as request_model
     from ground_service.regression import model as regression
     from ground_service.worker import model as worker
-    from ground_service.worker.automation import model as automation
 else:
     import_lazily(
         globals(),
-        "access.model passes.alarms.model worker.automation.model contacts.commanding.model "
-        "displays.model missions.ephemerides.model evaluation.model exports.model ingest.model "
-        "jobs.model evaluation.landmarks.model contacts.links.model missions.model passes.model "
-        "evaluation.performance.model planning.model regression.model planning.request_model "
-        "missions.timekeeping.model worker.model ",
+        "access.model passes.alarms.model contacts.commanding.model missions.ephemerides.model "
+        "evaluation.model exports.model ingest.model jobs.model evaluation.landmarks.model "
+        "contacts.links.model missions.model passes.model evaluation.performance.model "
+        "planning.model regression.model planning.request_model missions.timekeeping.model "
+        "worker.model ",
     )
 
 
@@ -602,50 +600,6 @@ class Operations(Connection):
     @operation("POST /alarms/{alarm_id}/shelve", body=("until", "comment"))
     def shelve_alarm(self, alarm_id: int, until: str, *, comment: str = "") -> alarms.AlarmDetail:
         """Suppress an alarm until a time; a time in the past ends this."""
-
-    # displays
-
-    @operation("GET /displays", reads="displays.store.list_displays")
-    def list_displays(self) -> Listing[displays.DisplaySummary]:
-        """List the stored objects of the telemetry displays, the one that changed last first."""
-
-    @operation("GET /displays/{key}")
-    def get_display(self, key: str) -> displays.Display:
-        """Show a stored object of the telemetry displays."""
-
-    @operation("PUT /displays/{key}", body=("name", "type", "version", "document"))
-    def keep_display(
-        self, key: str, name: str, type: str, version: int, document: Mapping[str, Any]
-    ) -> displays.Display:
-        """Keep an object of the telemetry displays; it replaces the stated version only."""
-
-    @operation("DELETE /displays/{key}")
-    def delete_display(self, key: str) -> None:
-        """Delete a stored object of the telemetry displays."""
-
-    # automation
-
-    @operation("GET /automation/rules")
-    def list_automation_rules(self) -> list[automation.RuleInForce]:
-        """List the rules in force by spacecraft, and the default rules of spacecraft without a mission description."""
-
-    @operation("GET /automation/actions", reads="worker.automation.store.list_automation_actions")
-    def list_automation_actions(
-        self, *, state: automation.ActionState | None = None, pass_id: int | None = None
-    ) -> Listing[automation.AutomationAction]:
-        """List the actions of rules with their causes and results, newest first."""
-
-    @operation("POST /automation/actions/{action_id}/approve")
-    def approve_automation_action(self, action_id: int) -> automation.AutomationAction:
-        """Approve an action that waits for approval, and those after it in its rule; they are done then."""
-
-    @operation("POST /automation/actions/{action_id}/refuse")
-    def refuse_automation_action(self, action_id: int) -> automation.AutomationAction:
-        """Refuse an action that waits for approval, and those after it in its rule."""
-
-    @operation("POST /automation/actions/{action_id}/repeat")
-    def repeat_automation_action(self, action_id: int) -> automation.AutomationAction:
-        """Queue a failed action again for three attempts, and those of its rule that were skipped after it."""
 
     # regression
 

@@ -16,7 +16,9 @@ JOBS = repository.JOBS
 
 FINISHED = ("done", "failed")
 REPEAT_NS = tuple(minutes * 60_000_000_000 for minutes in (1, 4, 16, 64))
-"""Times from the failed attempts of an ingest to the next ones."""
+"""Times from the failed attempts of a job of the kinds `REPEATED` to the next ones."""
+
+REPEATED = ("ingest", "automation")
 
 
 def add_job(
@@ -130,8 +132,8 @@ def repeat_job(connection: Connection, job_id: str) -> None:
     move(connection, JOB, job_id, "queued", expected=("failed",), progress=0.0)
 
 
-def repeat_ingests(connection: Connection, now_utc_ns: int) -> None:
-    """Queue the failed ingests again whose next attempt is due: what was acknowledged is not given up."""
+def repeat_failed(connection: Connection, now_utc_ns: int) -> None:
+    """Queue the failed ingests and follow-up jobs again whose next attempt is due."""
     due = (
         and_(JOBS.c.attempts == k, JOBS.c.finished_utc_ns <= now_utc_ns - wait_ns)
         for k, wait_ns in enumerate(REPEAT_NS, 1)
@@ -139,7 +141,7 @@ def repeat_ingests(connection: Connection, now_utc_ns: int) -> None:
     move_all(
         connection,
         JOB,
-        (JOBS.c.kind == "ingest", JOBS.c.state == "failed", or_(*due)),
+        (JOBS.c.kind.in_(REPEATED), JOBS.c.state == "failed", or_(*due)),
         "queued",
         progress=0.0,
     )

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity, InstanceName
 from ground_service.http.times import UtcTime
-from ground_service.missions.rules import Automation
+from ground_service.missions.automation import Automation, Channel, ChannelName, without_rules
 from ground_service.missions.section import Array, Section
 from ground_service.toml import faults, read_table
 from lunar.boxes import Box, Region
@@ -659,6 +659,9 @@ class Mission(Section):
     requirements: Requirements = Requirements()
     experiment: Experiment = Experiment()
     automation: Automation = Automation()
+    notify: dict[ChannelName, Channel] = Field(default_factory=dict)
+    """Receivers of notifications by name."""
+
     approval: Approval = Approval()
     uploads: Uploads | None = None
     resources: SpacecraftResources = SpacecraftResources()
@@ -759,24 +762,25 @@ class MissionDetail(MissionRevision):
     text: str = Field(description="mission.toml as it was added")
 
 
-def parse_mission(text: str, source: str = "mission.toml") -> Mission:
-    """Return the mission description in `text`.
+def parse_mission(text: str, source: str = "mission.toml", *, stored: bool = False) -> Mission:
+    """Return the mission description in `text`; an earlier version may have `stored` it, with rules that are ignored.
 
     Raises
     ------
     InvalidInput
         The text is not TOML, or has an unknown key or an invalid value; the message states the first fault.
     """
-    result = read_document(text, source)
+    result = read_document(text, source, stored=stored)
     if isinstance(result, Mission):
         return result
     raise result[0]
 
 
-def read_document(text: str, source: str) -> Mission | list[InvalidInput]:
-    """Return the mission description in `text`, or all its faults."""
+def read_document(text: str, source: str, *, stored: bool = False) -> Mission | list[InvalidInput]:
+    """Return the mission description in `text` as `parse_mission` does, or all its faults."""
     try:
-        return Mission.model_validate(read_table(text, source, "TOML"))
+        table = read_table(text, source, "TOML")
+        return Mission.model_validate(without_rules(table, source) if stored else table)
     except InvalidInput as error:
         return [error]
     except ValidationError as error:

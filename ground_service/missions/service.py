@@ -154,8 +154,7 @@ def _reaching_out(mission: Mission, in_force: Mission | None) -> Iterator[tuple[
     found = Approval() if in_force is None else in_force.approval
     yield "which telecommands need a second person", _persons(mission.approval), _persons(found)
     yield "links", mission.links or (), () if in_force is None else in_force.links or ()
-    channels = {} if in_force is None else in_force.automation.channels or {}
-    yield "automation.channels", mission.automation.channels or {}, channels
+    yield "notify", mission.notify, {} if in_force is None else in_force.notify
     if mission.approval.windows == "automatic":
         yield "approval.windows", "automatic", found.windows
 
@@ -185,25 +184,21 @@ def mission_of_pass(connection: Connection, mission_id: int | None, manifest: Ma
 
 def without_tokens(found: MissionDetail) -> MissionDetail:
     """Return a revision whose webhooks show scheme and host only: the rest of an address may be a token or password."""
-    automation = found.document.automation
-    channels = (automation.channels if automation is not None else None) or {}
-    shown = {}
+    channels, shown = found.document.notify, {}
     for channel in channels.values():
         if channel.webhook is not None:
             parts = urlsplit(channel.webhook)
             shown[channel.webhook] = f"{parts.scheme}://{parts.hostname}/..."
-    if automation is None or not shown:
+    if not shown:
         return found
     text = found.text
     for address in sorted(shown, key=len, reverse=True):
         text = text.replace(address, shown[address])
-    stated = parse_mission(text).automation
-    if stated is None or any(one.webhook in shown for one in (stated.channels or {}).values()):
+    if any(one.webhook in shown for one in parse_mission(text, stored=True).notify.values()):
         text = ""  # an address is written with escapes
     public = {
         name: one.model_copy(update={"webhook": shown.get(one.webhook or "")})
         for name, one in channels.items()
     }
-    changed = automation.model_copy(update={"channels": public})
-    document = found.document.model_copy(update={"automation": changed})
+    document = found.document.model_copy(update={"notify": public})
     return found.model_copy(update={"document": document, "text": text})

@@ -10,6 +10,7 @@ from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf, Paging
+from ground_service.missions.automation import Channel
 from ground_service.missions.model import (
     Approval,
     HeldCatalogue,
@@ -19,7 +20,6 @@ from ground_service.missions.model import (
     MissionRevision,
     parse_mission,
 )
-from ground_service.missions.rules import Channel
 from ground_service.store import repository
 from ground_service.store.vehicles import ARCHIVE_ACTOR
 
@@ -150,9 +150,7 @@ def missions_in_force(connection: Connection, ccsds_id: int | None = None) -> di
 def channels_in_force(connection: Connection) -> list[tuple[int, str, Channel]]:
     """Return spacecraft, name and channel of notifications of all descriptions in force."""
     missions = missions_in_force(connection).items()
-    return [
-        (one, *found) for one, mission in missions for found in (mission.automation.channels or {}).items()
-    ]
+    return [(one, *found) for one, mission in missions for found in mission.notify.items()]
 
 
 def keys_in_force(connection: Connection, ccsds_id: int | None = None) -> dict[int, int]:
@@ -254,7 +252,7 @@ def _document(row: repository.Row) -> Mission:
 
 @lru_cache(maxsize=32)
 def _parsed(text: str, source: str) -> Mission:
-    return parse_mission(text, source)
+    return parse_mission(text, source, stored=True)
 
 
 def _detail(row: repository.Row) -> MissionDetail:

@@ -627,20 +627,6 @@ ALARM_POSITIONS = table(
 )
 """Last packet of a vehicle that has been examined for alarms."""
 
-DISPLAY_OBJECTS = table(
-    "display_objects",
-    key("key", String(64)),
-    *columns(Text, "name", "type"),
-    column("version", Integer),
-    column("document", Text),
-    column("octets", Integer),
-    column("created_by", String(64)),
-    column("created_utc_ns", BigInteger),
-    column("changed_by", String(64)),
-    column("changed_utc_ns", BigInteger),
-)
-"""Object of the telemetry displays as JSON; `version` counts its changes."""
-
 EVENT_POSITIONS = table(
     "event_positions",
     key("consumer", String(32)),
@@ -810,34 +796,6 @@ STANDING_REQUESTS = table(
     *columns(BigInteger, "created_utc_ns", "changed_utc_ns"),
 )
 """Standing request with its last plan; `plans` counts plans, so that one of several processes stores each."""
-
-AUTOMATION_ACTIONS = table(
-    "automation_actions",
-    key("id", Integer),
-    column("event_number", BigInteger),
-    column("trigger", String(32)),
-    column("rule", String(100)),
-    column("position", SmallInteger),
-    *columns(String(32), "action", "subject"),
-    optional("vehicle_id", Integer),
-    optional("pass_id", Integer, index=True),
-    optional("window_id", Integer),
-    optional("mission_id", ForeignKey("missions.id")),
-    column("text", Text),
-    column("state", String(16), index=True),
-    optional("result", JSON),
-    optional("error", Text),
-    column("attempts", SmallInteger),
-    optional("next_attempt_utc_ns", BigInteger),
-    optional("decided_by", String(64)),
-    *columns(BigInteger, "created_utc_ns", "changed_utc_ns"),
-    UniqueConstraint("event_number", "rule", "position", "subject"),
-)
-"""Action of an automation rule that an event caused; one for the same event, rule, place in it and subject.
-
-`subject` is the pass, vehicle or mission. `mission_id` is the revision in force; NULL without any.
-`attempts` have failed; `next_attempt_utc_ns`: it is queued again from this time on.
-"""
 
 LANDMARKS = table(
     "landmarks",

@@ -55,18 +55,6 @@ JOB = StateMachine(
     # A job whose process ended prematurely is still "running" and is started again.
     {"queued": ("running",), "running": ("running", "queued", "done", "failed"), "failed": ("queued",)},
 )
-AUTOMATION_ACTION = StateMachine(
-    "automation action",
-    repository.AUTOMATION_ACTIONS,
-    {
-        "waiting": ("queued", "refused", "skipped"),
-        "queued": ("done", "failed", "skipped"),
-        # A person lets a failed action and those that were skipped after it be done again.
-        "failed": ("queued",),
-        "skipped": ("queued",),
-    },
-)
-
 LANDMARK = StateMachine(
     "landmark",
     repository.LANDMARKS,

@@ -93,7 +93,6 @@ PAGES = (
     Page("/missions", "missions", "Missions", "Plan", "Missions"),
     Page("/missions/{revision}", "mission", "Mission", "Plan", "", "missions", forms=_LINKS),
     Page("/ephemerides", "ephemerides", "Reference ephemerides", "Plan", "Ephemerides"),
-    Page("/automation", "automation", "Automation", "Plan", "Automation", lists="/automation/actions"),
     Page("/passes", "passes", "Passes", "Passes", "Passes"),
     Page("/passes/{pass_id}", "pass", "Pass", "Passes", section="passes"),
     Page("/ingests", "ingests", "Received files", "Passes", "Received files"),

@@ -1,297 +1,319 @@
-"""Execution of the actions of automation rules.
+"""Fixed follow-up of events: passes are evaluated and reported, their archives kept, and receivers notified.
 
-A job runs all actions that one event has caused. An action that is done is not repeated; one that a killed process left
-is done again under the same identity, so that it has one result.
+A job does what follows one event, derived from the state of the database. A job that is repeated, or that a killed
+process left, does all of it again under the same identities, so that it has one result.
 """
 
 from __future__ import annotations
 
 import hashlib
-import logging
-from collections.abc import Callable, Mapping
-from itertools import groupby
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
-from ground_service.clock import utc_now_ns
-from ground_service.errors import (
-    EvaluationError,
-    GroundError,
-    InvalidInput,
-    StateConflict,
-    fault_of,
-    public_text,
-)
+from sqlalchemy import Connection
+
+from ground_service.errors import EvaluationError, GroundError, NotFound, fault_of, public_text
 from ground_service.evaluation.landmarks.service import update_landmarks
+from ground_service.evaluation.performance.service import due_report_of_vehicle
 from ground_service.evaluation.preparation import align_pass
-from ground_service.evaluation.service import make_report, pass_summary, reevaluate
-from ground_service.evaluation.store import newest_report
-from ground_service.events import AutomationChanged, LimitsBroken, publish
+from ground_service.evaluation.service import make_report, reevaluate
+from ground_service.evaluation.store import get_report, newest_report
+from ground_service.events import (
+    AlarmChanged,
+    ArchiveImported,
+    ContactEnded,
+    LimitsBroken,
+    PassEvaluated,
+    RegressionJudged,
+    WindowChanged,
+)
 from ground_service.ground import Ground
-from ground_service.jobs.service import add_job
-from ground_service.missions.rules import DEFAULT_RULES, Rule
-from ground_service.missions.timekeeping.recorrelation import recorrelate
-from ground_service.planning.progress import close_window, note_reason
-from ground_service.regression.jobs import prepared, regression_job
+from ground_service.missions import store as missions
+from ground_service.missions.automation import Automation, Channel
+from ground_service.planning import store as planning
+from ground_service.planning.model import WindowRecord
+from ground_service.planning.progress import HEARD_TICKS, close_window, note_reason, span_of
 from ground_service.regression.pass_archives import keep_pass
-from ground_service.worker.automation import store
-from ground_service.worker.automation.model import OPEN_STATES, AutomationAction
+from ground_service.store.events import LoggedEvent, read_events
+from ground_service.store.vehicles import get_vehicle
 from ground_service.worker.notifications import send
 from ground_service.worker.outgoing import NotDelivered
-from ground_service.worker.upkeep import broken_limits
-
-log = logging.getLogger(__name__)
+from lunar.timescales import format_utc
 
 
-ATTEMPTS = 3
-RETRY_NS = (0, 60_000_000_000)
-"""Time from a failed attempt to the next one: at once, then after a minute."""
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Part of the follow-up of an event; `window_id`: the window that states the reason if it fails."""
+
+    name: str
+    run: Callable[[Ground], dict[str, Any]]
+    window_id: int | None = None
 
 
-def run_actions(ground: Ground, event: int, *, notify: bool = False) -> dict[str, Any]:
-    """Run the actions of an event that are queued; return their numbers by state.
+@dataclass(frozen=True, slots=True)
+class Message:
+    """Notification of an event; `spacecraft_id` is None where it concerns all missions."""
 
-    Notifications wait for other people's computers. They are the work of a separate job, which runs this with `notify`.
+    trigger: str
+    text: str
+    spacecraft_id: int | None = None
+    pass_id: int | None = None
+    window_id: int | None = None
+
+
+def _window_of(connection: Connection, window_id: int) -> WindowRecord | None:
+    with suppress(NotFound):
+        return planning.get_record(connection, window_id)
+    return None
+
+
+def _settings(connection: Connection, vehicle: int) -> Automation:
+    """Return the settings in force of a vehicle; those of descriptions that came with archives have no effect."""
+    key = missions.in_force(connection, vehicle)
+    return Automation() if key is None else missions.get_mission(connection, key).automation
+
+
+def _after_window(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
+    event = WindowChanged.of(logged)
+    window = _window_of(connection, event.id)
+    if window is None or window.pass_id is None:
+        return
+    settings = _settings(connection, window.vehicle_id)
+    if settings.evaluate is False:
+        return
+    if event.state == "downlinked":
+        yield _report_of(window, window.pass_id, logged.number)
+    elif event.state == "processed":
+        yield _archive_of(window.pass_id)
+        yield _monthly_report_of(window.vehicle_id)
+        if settings.landmarks:
+            yield _landmarks_of(window.pass_id)
+
+
+def _after_contact(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
+    """Yield the reports of the windows before the end of a contact whose missing telemetry is no longer expected.
+
+    They have telemetry, and telemetry from after their end was received.
     """
-    due: list[AutomationAction] = []
-    with ground.alone(f"actions of event {event}"):
-        actions = ground.read(store.actions_of_event, event)
-        for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
-            due += _run_chain(ground, list(chain), notify)
-    for one in due:
-        ground.write(publish, AutomationChanged(id=one.id, event=event, action=one.action, state="sending"))
-    after = ground.read(store.actions_of_event, event)
-    counts: dict[str, int] = {}
-    for one in after:
-        counts[one.state] = counts.get(one.state, 0) + 1
-    return {"event": event, **counts}
+    event = ContactEnded.of(logged)
+    if event.vehicle_id is None or _settings(connection, event.vehicle_id).evaluate is False:
+        return
+    for window in planning.open_windows(connection, event.vehicle_id):
+        if window.pass_id is None or window.state != "executed" or window.stop.utc_ns > event.stop_utc_ns:
+            continue
+        after = span_of(connection, window).stop_ticks
+        if planning.has_reports_between(connection, event.vehicle_id, after, after + HEARD_TICKS):
+            yield _report_of(window, window.pass_id, logged.number, close=True)
 
 
-def _run_chain(ground: Ground, chain: list[AutomationAction], notify: bool) -> list[AutomationAction]:
-    """Run the actions of one rule on one subject in order, up to one that waits or is to be repeated later.
+def _after_archive(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
+    event = ArchiveImported.of(logged)
+    if _settings(connection, event.vehicle_id).evaluate is not False:
+        yield _archive_of(event.pass_id)
 
-    Actions after one that finally failed are skipped. Without `notify`, return the notification that is due.
+
+def _after_report(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
+    """Yield the archive again after late data."""
+    event = PassEvaluated.of(logged)
+    if event.event is not None and _settings(connection, event.vehicle_id).evaluate is not False:
+        yield _archive_of(event.pass_id)
+
+
+STEPS: Mapping[str, Callable[[Connection, LoggedEvent], Iterator[Step]]] = {
+    WindowChanged.event_kind: _after_window,
+    ContactEnded.event_kind: _after_contact,
+    ArchiveImported.event_kind: _after_archive,
+    PassEvaluated.event_kind: _after_report,
+}
+"""Follow-up by kind of event."""
+
+
+def steps_after(connection: Connection, event: LoggedEvent) -> Iterator[Step]:
+    """Yield the follow-up of an event; none for other kinds, such as those that rules of earlier versions named."""
+    if event.kind in STEPS:
+        yield from STEPS[event.kind](connection, event)
+
+
+def run_steps(ground: Ground, number: int) -> dict[str, Any]:
+    """Do what follows an event; return the results by name.
+
+    Raises
+    ------
+    EvaluationError
+        A part failed; the others were done.
     """
-    stopped = ""
-    for action in chain:
-        ground.check_stopping()
-        if action.state == "waiting" and not stopped:
-            return []
-        if action.state in ("failed", "refused", "skipped"):
-            stopped = action.action
-        if action.state not in OPEN_STATES:
-            continue
-        if stopped:
-            _end(ground, action, "skipped", error=f"{stopped} before it was not done")
-            continue
-        if action.action == "notify" and not notify:
-            return [action]
-        state = _run_attempts(ground, action)
-        if state == "queued":
-            return []
-        if state == "failed":
-            stopped = action.action
-    return []
-
-
-def _run_attempts(ground: Ground, action: AutomationAction) -> str:
-    """Run one action, again after a failure if it is due at once; return its state then."""
-    while action.next_attempt is None or action.next_attempt.utc_ns <= utc_now_ns():
-        ground.check_stopping()
-        error = _run_one(ground, action)
-        if error is None:
-            return "done"
-        attempts = action.attempts + 1
-        if action.action == "notify":  # each channel has had its attempts
-            _give_up(ground, action, error)
-            return "failed"
-        if attempts >= ATTEMPTS:
-            _give_up(ground, action, f"{error} (attempt {attempts} of {ATTEMPTS})")
-            return "failed"
-        now = utc_now_ns()
-        with ground.database.writing() as connection:
-            due = now + RETRY_NS[attempts - 1]
-            store.note_attempt(connection, action, error=error, now_utc_ns=now, next_utc_ns=due)
-            action = store.get_action(connection, action.id)
-        if action.state != "queued":  # another process has decided it meanwhile
-            return action.state
-    return "queued"
-
-
-def _run_one(ground: Ground, action: AutomationAction) -> str | None:
-    """Run one action and record its success; return None, or why it failed."""
-    with fault_of(f"automation action {action.id} ({action.action})") as faults:
-        _end(ground, action, "done", result=DOING[action.action](ground, action))
-    return faults[0] if faults else None
-
-
-def _give_up(ground: Ground, action: AutomationAction, error: str) -> None:
-    """Record that an action finally failed, and the reason at its window, which stays as it is."""
-    _end(ground, action, "failed", error=error)
-    if action.window_id is not None:
-        note_reason(ground, action.window_id, f"{action.action} failed: {error}")
-
-
-def repeat_due(ground: Ground) -> list[str]:
-    """Add the jobs of actions whose next attempt is due; return their ids."""
-    due = ground.read(store.events_to_repeat, utc_now_ns())
-    if not due:
-        return []
-    with ground.database.writing() as connection:
-        return [
-            add_job(
-                connection,
-                "automation",
-                {"event": event},
-                job_id=hashlib.blake2b(name, digest_size=16).hexdigest(),
-            )
-            for event, name in ((event, f"repeat {event} {attempts}".encode()) for event, attempts in due)
-        ]
-
-
-def has_repetitions(ground: Ground) -> bool:
-    """Return whether failed actions are to be done again, now or later."""
+    done: dict[str, Any] = {"event": number}
+    failed = []
     with ground.database.reading() as connection:
-        return bool(store.events_to_repeat(connection, utc_now_ns() + sum(RETRY_NS)))
+        event = _event(connection, number)
+        steps = list(steps_after(connection, event))
+    for step in steps:
+        ground.check_stopping()
+        with fault_of(f"{step.name}, event {number}") as faults:
+            done[step.name] = step.run(ground)
+        failed += [f"{step.name}: {fault}" for fault in faults]
+        if faults and step.window_id is not None:
+            note_reason(ground, step.window_id, f"{step.name} failed: {faults[0]}")
+    if failed:
+        raise EvaluationError("; ".join(failed))
+    return done
 
 
-def _end(ground: Ground, action: AutomationAction, state: str, **values: Any) -> None:
-    """Record the end of an action, unless another process has recorded it."""
-    try:
-        ground.write(store.change_state, action, state, now_utc_ns=utc_now_ns(), **values)
-    except StateConflict as error:
-        log.warning("%s", error)
+def _event(connection: Connection, number: int) -> LoggedEvent:
+    for event in read_events(connection, number - 1, 1):
+        if event.number == number:
+            return event
+    raise NotFound("event", str(number))
 
 
-def _rule(ground: Ground, action: AutomationAction) -> Rule:
-    """Return the rule of an action in the revision that caused it."""
-    rules = ground.read(store.rules_of_revision, action.mission_id)
-    for rule in (*rules, *DEFAULT_RULES):
-        if rule.name == action.rule:
-            return rule
-    raise InvalidInput("rule", "", "a rule of the mission description", action.rule)
+def _identity(text: str) -> str:
+    """Return the id of what an event makes: the same event again makes the same."""
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def _pass_of(action: AutomationAction) -> int:
-    if action.pass_id is None:
-        raise EvaluationError(f"{action.action}: the event concerns no pass")
-    return action.pass_id
+def _report_of(window: WindowRecord, pass_id: int, number: int, *, close: bool = False) -> Step:
+    """Return the report of a pass: the first one, or a new one if anything in it differs from the last.
+
+    `close`: do not wait for missing packets of the window.
+    """
+    identity = _identity(f"report {number} {pass_id}")
+
+    def run(ground: Ground) -> dict[str, Any]:
+        done = {"pass_id": pass_id, "inputs": align_pass(ground, pass_id)}
+        previous = ground.read(newest_report, pass_id, other_than=identity)
+        if previous is None:
+            done["report_id"] = make_report(ground, pass_id, report_id=identity, pdf=True).report_id
+        else:
+            again = reevaluate(ground, pass_id, report_id=identity, event=number)
+            done["report_id"] = previous.id if again is None else again.report_id
+        if close:
+            done["window"] = close_window(ground, window.id)
+        return done
+
+    return Step(f"report of pass {pass_id}", run, window.id)
 
 
-def _identity(action: AutomationAction) -> str:
-    """Return the id of what an action makes: the same action again makes the same."""
-    return hashlib.blake2b(f"automation {action.id}".encode(), digest_size=16).hexdigest()
+def _archive_of(pass_id: int) -> Step:
+    def run(ground: Ground) -> dict[str, Any]:
+        kept = keep_pass(ground, pass_id)
+        return {"archive": kept.digest, "frames": kept.frames, "state": kept.state, "reason": kept.reason}
+
+    return Step(f"archive of pass {pass_id}", run)
 
 
-def _correlate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    if action.vehicle_id is None:
-        raise EvaluationError("correlate: the event concerns no spacecraft")
-    return {"changed": recorrelate(ground, action.vehicle_id)}
+def _monthly_report_of(vehicle: int) -> Step:
+    """Return the report of the last complete month; late data in that month give a new one."""
+
+    def run(ground: Ground) -> dict[str, Any]:
+        made = due_report_of_vehicle(ground, vehicle)
+        return {} if made is None else {"report": made.id, "month": made.month, "passes": made.passes}
+
+    return Step("monthly report", run)
 
 
-def _evaluate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    found = pass_summary(ground, _pass_of(action))
-    kept = ("frames", "packets", "packets_lost", "navigation", "verdict", "verdict_level", "evidence_level")
-    return {name: found[name] for name in kept} | {"recall": found["detector"]["recall"]}
-
-
-def _report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    """Make the first report of a pass, or a new one if anything in it differs from the last."""
-    pass_id, identity = _pass_of(action), _identity(action)
-    previous = ground.read(newest_report, pass_id, other_than=identity)
-    if previous is None:
-        made = make_report(ground, pass_id, report_id=identity, pdf=True)
-        return {"report_id": made.report_id, "verdict": made.summary["verdict"]}
-    again = reevaluate(ground, pass_id, report_id=identity, event=action.event)
-    if again is None:
-        return {"report_id": previous.id, "unchanged": True}
-    return {"report_id": again.report_id, "verdict": again.summary["verdict"], "previous": previous.id}
-
-
-def _mark_processed(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    if action.window_id is None:
-        raise EvaluationError("mark_processed: the pass belongs to no window")
-    return {"window_id": action.window_id, "state": close_window(ground, action.window_id)}
-
-
-def _keep_archive(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    kept = keep_pass(ground, _pass_of(action))
-    return {"archive": kept.digest, "frames": kept.frames, "state": kept.state, "reason": kept.reason}
-
-
-def _find_landmarks(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    return update_landmarks(ground, _pass_of(action)).model_dump(mode="json")
-
-
-def _run_regression(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    rule = _rule(ground, action)
-    arguments = prepared(ground, rule.candidate or "current", rule.baseline or "current", ())
-    return regression_job(ground, arguments, _identity(action))
-
-
-def _compute_trends(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    """Compute the trends of a spacecraft; broken limits alarm unless the last such action found the same."""
-    if action.vehicle_id is None:
-        raise EvaluationError("compute_trends: the event concerns no spacecraft")
-    broken = broken_limits(ground, action.vehicle_id)
-    with ground.database.writing() as connection:
-        last = store.last_result(connection, action)
-        if broken and (last is None or last.get("limits_broken") != broken):
-            publish(connection, LimitsBroken(broken=broken))
-    return {"limits_broken": broken}
-
-
-def _monthly_report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    """Make the report of the last complete month; late data in that month give a new one."""
-    from ground_service.evaluation.performance.service import due_report_of_vehicle
-
-    if action.vehicle_id is None:
-        raise EvaluationError("monthly_report: the event concerns no spacecraft")
-    made = due_report_of_vehicle(ground, action.vehicle_id)
-    return (
-        {"report": None} if made is None else {"report": made.id, "month": made.month, "passes": made.passes}
+def _landmarks_of(pass_id: int) -> Step:
+    return Step(
+        f"landmarks of pass {pass_id}",
+        lambda ground: update_landmarks(ground, pass_id).model_dump(mode="json"),
     )
 
 
-def _notify(ground: Ground, action: AutomationAction) -> dict[str, Any]:
-    """Send the event over the channels of the rule; each gets it, also if another one fails."""
-    rule = _rule(ground, action)
-    channels = ground.read(store.channels_of_revision, action.mission_id)
-    content = {
-        name: value
-        for name, value in action.model_dump(mode="json").items()
-        if name in ("event", "trigger", "rule", "text", "subject", "pass_id", "window_id", "created")
-    }
-    faults = {}
-    for name in rule.notify or ():
-        ground.check_stopping()
-        try:
-            identity = f"{_identity(action)}.{name}"
-            send(
-                ground.home,
-                channels[name],
-                identity,
-                f"LINNA: {action.text}",
-                content,
-                networks=ground.networks,
-            )
-        except GroundError as error:
-            faults[name] = public_text(error)
-    if faults:
-        raise NotDelivered("; ".join(f"{name}: {fault}" for name, fault in faults.items()))
-    return dict.fromkeys(rule.notify or (), "delivered")
+def _of_failed_window(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
+    event = WindowChanged.of(logged)
+    window = _window_of(connection, event.id) if event.state == "failed" else None
+    if window is not None:
+        text = f"window {window.id} ({window.name}) failed: {window.reason}"
+        spacecraft = _spacecraft(connection, window.vehicle_id)
+        yield Message("window failed", text, spacecraft, window.pass_id, window.id)
 
 
-DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
-    "correlate": _correlate,
-    "align": lambda ground, action: align_pass(ground, _pass_of(action)),
-    "evaluate": _evaluate,
-    "report": _report,
-    "mark_processed": _mark_processed,
-    "keep_archive": _keep_archive,
-    "find_landmarks": _find_landmarks,
-    "run_regression": _run_regression,
-    "compute_trends": _compute_trends,
-    "monthly_report": _monthly_report,
-    "notify": _notify,
+def _of_report(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
+    event = PassEvaluated.of(logged)
+    summary = get_report(connection, event.report_id).summary
+    text = f"report of pass {event.pass_id}: {summary.get('verdict') or 'no verdict'}"
+    yield Message("report done", text, _spacecraft(connection, event.vehicle_id), event.pass_id)
+
+
+def _of_alarm(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
+    event = AlarmChanged.of(logged)
+    if event.state == "raised":
+        spacecraft = _spacecraft(connection, event.vehicle_id)
+        yield Message("alarm", f"{event.name} ({event.severity})", spacecraft)
+
+
+def _of_limits(_connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
+    broken: dict[int, list[str]] = {}
+    for one in LimitsBroken.of(logged).broken:
+        broken.setdefault(int(one["spacecraft_id"]), []).append(f"{one['parameter']} {one['limit_state']}")
+    for spacecraft, texts in broken.items():
+        yield Message("alarm", "; ".join(texts), spacecraft)
+
+
+def _of_regression(_connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
+    event = RegressionJudged.of(logged)
+    yield Message("gate done", f"regression {event.id}: {event.verdict}")
+
+
+def _spacecraft(connection: Connection, vehicle: int) -> int:
+    return get_vehicle(connection, vehicle).ccsds_id
+
+
+MESSAGES: Mapping[str, Callable[[Connection, LoggedEvent], Iterator[Message]]] = {
+    WindowChanged.event_kind: _of_failed_window,
+    PassEvaluated.event_kind: _of_report,
+    AlarmChanged.event_kind: _of_alarm,
+    LimitsBroken.event_kind: _of_limits,
+    RegressionJudged.event_kind: _of_regression,
 }
-"""Functions of the actions; each may be repeated without harm."""
+"""Notifications by kind of event."""
+
+
+def messages_after(connection: Connection, event: LoggedEvent) -> Iterator[tuple[Message, int, str, Channel]]:
+    """Yield the notifications of an event with the spacecraft, name and channel of each receiver in force."""
+    channels = missions.channels_in_force(connection) if event.kind in MESSAGES else []
+    for message in MESSAGES[event.kind](connection, event) if channels else ():
+        for spacecraft, name, channel in channels:
+            if message.spacecraft_id in (None, spacecraft):
+                yield message, spacecraft, name, channel
+
+
+def send_messages(ground: Ground, number: int) -> dict[str, Any]:
+    """Send the notifications of an event; return the receivers. Each gets it, also if another one fails.
+
+    Raises
+    ------
+    NotDelivered
+        A receiver did not get it.
+    """
+    with ground.database.reading() as connection:
+        event = _event(connection, number)
+        messages = list(messages_after(connection, event))
+    done: dict[str, Any] = {"event": number}
+    failed = []
+    for message, spacecraft, name, channel in messages:
+        ground.check_stopping()
+        identity = f"{_identity(f'notification {number} {spacecraft}')}.{name}"
+        subject, content = f"LINNA: {message.text}", _content(message, event, spacecraft)
+        receiver = f"{name} of spacecraft {spacecraft}"
+        try:
+            send(ground.home, channel, identity, subject, content, networks=ground.networks)
+            done[receiver] = "delivered"
+        except GroundError as error:
+            failed.append(f"{receiver}: {public_text(error)}")
+    if failed:
+        raise NotDelivered("; ".join(failed))
+    return done
+
+
+def _content(message: Message, event: LoggedEvent, spacecraft: int) -> dict[str, Any]:
+    return {
+        "event": event.number,
+        "created": format_utc(event.utc_ns),
+        "trigger": message.trigger,
+        "text": message.text,
+        "spacecraft_id": spacecraft,
+        "pass_id": message.pass_id,
+        "window_id": message.window_id,
+    }

@@ -20,7 +20,6 @@ from sqlalchemy import Connection
 
 from ground_service.errors import PASSING, NotFound, fault_of
 from ground_service.events import (
-    AutomationChanged,
     CommandsSent,
     ContactEnded,
     ContactMissed,
@@ -49,7 +48,7 @@ from ground_service.planning.standing import needs_plan, planned_with
 from ground_service.planning.store import get_record
 from ground_service.store import events
 from ground_service.store.events import LoggedEvent
-from ground_service.worker.automation.service import OCCURRENCES, has_actions, record_actions
+from ground_service.worker.actions import MESSAGES, STEPS, messages_after, steps_after
 from ground_service.worker.jobs import run_job
 
 log = logging.getLogger(__name__)
@@ -109,14 +108,6 @@ def _after_mission(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
         yield "plan", 0
 
 
-def _after_decision(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    event = AutomationChanged.of(logged)
-    if event.state in ("queued", "refused"):
-        yield "act", event.event
-    elif event.state == "sending":
-        yield "notify", event.event
-
-
 def _after_window(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = WindowChanged.of(logged)
     if event.state == "failed":
@@ -132,7 +123,6 @@ FOLLOWING: Mapping[str, Following] = {
     CommandsSent.event_kind: _of_vehicle("advance windows"),
     PassEvaluated.event_kind: _of_vehicle("advance windows"),
     MissionAdded.event_kind: _after_mission,
-    AutomationChanged.event_kind: _after_decision,
     WindowChanged.event_kind: _after_window,
     ContactEnded.event_kind: _of_vehicle("plan"),
     ContactMissed.event_kind: _of_vehicle("plan"),
@@ -140,16 +130,19 @@ FOLLOWING: Mapping[str, Following] = {
 }
 """The work that keeps derived data up to date after an event, by its kind."""
 
-KINDS = frozenset({*FOLLOWING, *OCCURRENCES})
-"""Kinds of events that are read: those with such work, and those that rules react to."""
+KINDS = frozenset({*FOLLOWING, *STEPS, *MESSAGES})
+"""Kinds of events that are read: those with such work, and those with jobs or notifications."""
 
 
 def _work_of(ground: Ground, event: LoggedEvent) -> Iterator[Work]:
-    """Yield the work that follows an event; rules act after derived data are up to date."""
+    """Yield the work that follows an event; passes are evaluated after derived data are up to date."""
     if event.kind in FOLLOWING:
         yield from FOLLOWING[event.kind](ground, event)
-    if event.kind in OCCURRENCES and has_actions(ground, event):
-        yield "match rules", event.number
+    with ground.database.reading() as connection:
+        if any(True for _ in steps_after(connection, event)):
+            yield "act", event.number
+        if any(True for _ in messages_after(connection, event)):
+            yield "notify", event.number
 
 
 def _recorrelate(ground: Ground, vehicle: int, _event: int) -> None:
@@ -181,14 +174,8 @@ def _decode(ground: Ground, vehicle: int, event: int) -> str:
     )
 
 
-def _match_rules(ground: Ground, number: int, _event: int) -> None:
-    """Record the actions that rules of mission descriptions take on an event."""
-    [event] = ground.read(events.read_events, number - 1, 1)
-    record_actions(ground, event)
-
-
 def _add_job_of_event(kind: str) -> Callable[[Ground, int, int], str]:
-    """Return a function that adds the job of event `number` because of another event, which it caused."""
+    """Return a function that adds a job of an event."""
 
     def add(ground: Ground, number: int, event: int) -> str:
         return ground.write(add_job, kind, {"event": number}, job_id=_job_id(kind, number, event))
@@ -211,7 +198,6 @@ DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "advance windows": _advance,
     "re-evaluate": _reevaluate,
     "decode": _decode,
-    "match rules": _match_rules,
     "act": _add_job_of_event("automation"),
     "notify": _add_job_of_event("notification"),
     "plan": _plan,

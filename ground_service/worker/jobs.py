@@ -10,7 +10,6 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import partial
 from typing import Any
 
 from ground_service.clock import utc_now_ns
@@ -34,7 +33,7 @@ from ground_service.passes.archive_zip import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
 from ground_service.tracing import span
-from ground_service.worker.actions import run_actions
+from ground_service.worker.actions import run_steps, send_messages
 from ground_service.worker.upkeep import nightly
 from kernels.memory import give_back
 from lunar.errors import LunarError
@@ -85,12 +84,6 @@ def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dic
     return {"rows": catch_up(ground, vehicle) + apply_definition(ground, vehicle)}
 
 
-def _automation(
-    ground: Ground, arguments: Mapping[str, Any], _job_id: str, notify: bool = False
-) -> dict[str, Any]:
-    return run_actions(ground, int(arguments["event"]), notify=notify)
-
-
 WORK: dict[str, Work] = {
     "report": _report,
     "ingest": _ingest,
@@ -103,8 +96,8 @@ WORK: dict[str, Work] = {
     "plan": _plan,
     "redecode": _redecode,
     "re-evaluation": _reevaluate,
-    "automation": _automation,
-    "notification": partial(_automation, notify=True),
+    "automation": lambda ground, arguments, _job_id: run_steps(ground, int(arguments["event"])),
+    "notification": lambda ground, arguments, _job_id: send_messages(ground, int(arguments["event"])),
 }
 """Functions of the jobs by kind (`jobs.KINDS`). Each may be run twice with the same arguments and job without harm."""
 

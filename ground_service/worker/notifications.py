@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.errors import InvalidInput, storage_error
-from ground_service.missions.rules import Channel
+from ground_service.missions.automation import Channel
 from ground_service.worker.outgoing import DEADLINE_S, Network, NotDelivered, Unreachable, post, send_mail
 
 ATTEMPTS = 3

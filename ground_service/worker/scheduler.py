@@ -19,11 +19,10 @@ from ground_service.contacts.links.supervisor import process_name
 from ground_service.errors import GroundError, fault_of
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.jobs.store import repeat_ingests
+from ground_service.jobs.store import repeat_failed
 from ground_service.planning.standing import needs_plan
 from ground_service.regression.jobs import nightly_placebo
 from ground_service.store import leases
-from ground_service.worker.actions import repeat_due
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
 from ground_service.worker.watch import Watch
 from kernels.memory import give_back
@@ -111,10 +110,9 @@ class Scheduler:
             return False
         if self._since_utc_ns is None:
             log.info("this process does the recurring work", extra={"owner": self.owner})
-        self._do("failed ingests", self._repeat_ingests)
+        self._do("failed jobs", self._repeat_failed)
         self._do("unfinished jobs", self._dispatcher.resume)
         self._do("events of other processes", self._drain)
-        self._do("failed actions", self._repeat_actions)
         self._do("overdue telecommands", self._note_timeouts)
         if time.monotonic() >= self._watch_s:
             self._watch_s = time.monotonic() + WATCH_S
@@ -128,12 +126,8 @@ class Scheduler:
         with fault_of(f"recurring work ({name})", passing=()):
             work()
 
-    def _repeat_ingests(self) -> None:
-        self._ground.write(repeat_ingests, utc_now_ns())
-
-    def _repeat_actions(self) -> None:
-        for job_id in repeat_due(self._ground):
-            self._dispatcher.start(job_id)
+    def _repeat_failed(self) -> None:
+        self._ground.write(repeat_failed, utc_now_ns())
 
     def _note_timeouts(self) -> None:
         until = utc_now_ns()

@@ -23,7 +23,7 @@ from ground_service.evaluation.performance.service import make_due_reports
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.jobs.store import delete_finished
-from ground_service.missions.rules import Channel
+from ground_service.missions.automation import Channel
 from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends
 from ground_service.regression.archives import let_go, remove_unfinished

@@ -29,9 +29,7 @@ from ground_service.planning.model import Window
 from ground_service.store.events import position_of, read_events
 from ground_service.store.telemetry import packet_headers
 from ground_service.store.vehicles import all_vehicles
-from ground_service.worker.actions import has_repetitions, repeat_due
 from ground_service.worker.follow_up import CONSUMER, KINDS
-from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
 
 Answer = TypeVar("Answer")
@@ -105,13 +103,9 @@ class MissionGround:
     def wait_settled(self) -> None:
         """Wait until contacts that were silent for too long have ended, and the work that follows is done."""
         self._wait(
-            lambda: not links.silent_contacts(self.ground) and self._is_idle() and not self.repeat_actions(),
+            lambda: not links.silent_contacts(self.ground) and self._is_idle(),
             "contacts ended",
         )
-
-    def repeat_actions(self) -> bool:
-        """Return whether failed actions are to be repeated."""
-        return has_repetitions(self.ground)
 
     def _spooled_octets(self) -> int:
         return sum(spooled_octets(one) for one in (self.ground.home / INCOMING).glob("link-*"))
@@ -197,12 +191,6 @@ class EmbeddedGround(MissionGround):
         opened.links = LinkSupervisor(ground)
         opened.links.start()
         return opened
-
-    def repeat_actions(self) -> bool:
-        """Repeat the failed actions that are due; return whether any are to be repeated later."""
-        for job_id in repeat_due(self.ground):
-            run_job(self.ground, job_id)
-        return has_repetitions(self.ground)
 
     def close(self, *, is_finished: bool = False) -> None:
         """Stop the links with received octets ingested, and close the archive."""

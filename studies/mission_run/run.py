@@ -310,7 +310,6 @@ class MissionRun:
                 ground.wait_settled()
                 self._watch(ground, message)
                 return
-            ground.repeat_actions()
             if message["state"] == "started":
                 self._deliver_reference(ground, dynamics, parse_utc(message["utc"]))
             else:

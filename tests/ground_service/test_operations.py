@@ -29,7 +29,7 @@ SUMMARY_VERBS = {
     "Suppress", "Take", "Withdraw",
 }  # fmt: skip
 TAGS = {
-    "access", "alarms", "automation", "displays", "ephemerides", "exports", "jobs", "landmarks", "links", "missions",
+    "access", "alarms", "ephemerides", "exports", "jobs", "landmarks", "links", "missions",
     "passes", "planning", "regression", "reports", "requests", "status", "telecommands", "telemetry", "time",
 }  # fmt: skip
 

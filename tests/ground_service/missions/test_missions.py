@@ -345,14 +345,9 @@ def test_viewers_see_neither_passwords_nor_tokens_of_webhooks(guarded: Any) -> N
 name = "m"
 [spacecraft]
 id = 76
-[[automation.rules]]
-name = "gate"
-on = "gate done"
-do = ["notify"]
-notify = ["hook", "escaped"]
-[automation.channels.hook]
+[notify.hook]
 webhook = "{secret}"
-[automation.channels.escaped]
+[notify.escaped]
 webhook = "https://hooks.example/\\u0054WO"
 '''
     client, heads = guarded
@@ -362,9 +357,9 @@ webhook = "https://hooks.example/\\u0054WO"
         return client.get(f"/api/v1/missions/{revision}", headers=heads[role]).json()
 
     assert shown("operator")["text"] == text
-    assert shown("operator")["document"]["automation"]["channels"]["hook"]["webhook"] == secret
+    assert shown("operator")["document"]["notify"]["hook"]["webhook"] == secret
     found = shown("viewer")
-    channels = found["document"]["automation"]["channels"]
+    channels = found["document"]["notify"]
     assert {one["webhook"] for one in channels.values()} == {"https://hooks.example/..."}
     assert not any(word in str(found) for word in ("p4ss", "T0KEN", "TWO", "u0054"))
     assert found["revision"] == revision

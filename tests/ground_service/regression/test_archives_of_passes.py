@@ -21,6 +21,8 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.times import UtcTime
 from ground_service.ingest.service import ingest_file
+from ground_service.jobs.model import JobFilter
+from ground_service.jobs.store import list_jobs
 from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store
@@ -40,8 +42,6 @@ from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import ArchiveRecord, Comparison, KeptArchive, KeptReplay
 from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_pass, keep_pass
 from ground_service.regression.service import find_replay, run_regression
-from ground_service.worker.automation.model import ActionFilter
-from ground_service.worker.automation.store import list_automation_actions
 from linna.commands import regress
 from lunar.datafolder import find_data
 from tests.ground_service.conftest import (
@@ -90,19 +90,17 @@ def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: SyntheticP
             regress._kept(service, ["99"])
 
 
-def test_an_imported_pass_is_kept_by_a_default_rule(either: Ground, flown: FlyablePass) -> None:
+def test_an_imported_pass_is_kept_without_a_request(either: Ground, flown: FlyablePass) -> None:
     pass_id = import_archive(either, flown.folder)
     _, digest = read_manifest(flown.folder)
     [kept] = kept_archives(either)
     assert (kept.digest, kept.pass_id, kept.state, kept.reason) == (digest, pass_id, "complete", "")
     assert (kept.frames, kept.frames_stored) == (4, 4)
-    [action] = either.read(list_automation_actions, ActionFilter()).items
-    assert (action.rule, action.action, action.state) == (
-        "regression archive of an imported pass",
-        "keep_archive",
-        "done",
-    )
-    assert action.result == {"archive": digest, "frames": 4, "state": "complete", "reason": ""}
+    [job] = either.read(list_jobs, JobFilter(kind="automation")).items
+    assert job.result is not None
+    assert job.result["archive of pass 1"] == {
+        "archive": digest, "frames": 4, "state": "complete", "reason": "",
+    }  # fmt: skip
     assert keep_pass(either, pass_id).digest == digest
     assert len(kept_archives(either)) == 1
     given = Comparison(candidate="current", passes=[pass_id])

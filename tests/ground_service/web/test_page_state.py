@@ -137,14 +137,9 @@ def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
     expect(page.locator("#map-legend").get_by_label("spherical")).not_to_be_checked()
 
 
-def test_the_automation_page_lists_the_rules(page):
-    settled(page, "/automation")
-    expect(page.locator("#rules tbody tr").first).to_be_visible()
-
-
 def test_an_archive_without_frames_is_listed_with_its_reason_and_not_chosen(page):
     kept = "/api/v1/regression-archives"
-    # The rules keep the archive of the imported pass, which has no images, some time after the start.
+    # The service keeps the archive of the imported pass, which has no images, some time after the start.
     wait_for(
         lambda: 1 in [one["pass_id"] for one in page.request.get(kept).json()], "the archive is not kept"
     )
@@ -160,7 +155,7 @@ def test_passes_without_a_kept_archive_are_listed_with_what_to_do(
 ):
     home = tmp_path / "home"
     with open_ground(home) as ground:
-        text = 'name = "manual"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n[automation]\nrules = []\n'
+        text = 'name = "manual"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n[automation]\nevaluate = false\n'
         add_mission(ground, text.encode(), actor="ann")
         import_archive(ground, synthetic_pass.folder)
     with serve(home, console.port) as running:

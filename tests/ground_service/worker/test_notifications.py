@@ -16,29 +16,39 @@ from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_network
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from ground_service.access.audit_log import audit_head
 from ground_service.errors import InvalidInput
-from ground_service.events import RegressionJudged, publish
+from ground_service.events import (
+    AlarmChanged,
+    Event,
+    LimitsBroken,
+    PassEvaluated,
+    RegressionJudged,
+    WindowChanged,
+    publish,
+)
 from ground_service.ground import Ground, open_ground
-from ground_service.jobs.model import JobFilter
+from ground_service.jobs.model import Job, JobFilter
 from ground_service.jobs.store import get_job, list_jobs
-from ground_service.missions.rules import Channel
+from ground_service.missions.automation import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
 from ground_service.store.audit import Head
-from ground_service.worker import outgoing
-from ground_service.worker.automation.model import ActionFilter
-from ground_service.worker.automation.store import list_automation_actions
+from ground_service.store.models import METADATA
+from ground_service.worker import actions, outgoing
+from ground_service.worker.actions import send_messages
 from ground_service.worker.dispatch import ThreadDispatcher
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.notifications import ATTEMPTS, signature
 from ground_service.worker.notifications import send as send_to
 from ground_service.worker.outgoing import NotDelivered, permitted_address
 from ground_service.worker.upkeep import kept_heads, nightly
+from tests.ground_service.access.test_missions_of_callers import row_of
 from tests.ground_service.conftest import wait_for
 
 HERE = (ip_network("127.0.0.1"),)
@@ -335,15 +345,9 @@ def add_channels(ground: Ground, webhook: Webhook, mailbox: Mailbox) -> None:
 name = "m"
 [spacecraft]
 id = 76
-[[automation.rules]]
-name = "gate failed"
-on = "gate done"
-when = {{ verdict = ["fail"] }}
-do = ["notify"]
-notify = ["hook", "people"]
-[automation.channels.hook]
+[notify.hook]
 webhook = "{webhook.url}"
-[automation.channels.people]
+[notify.people]
 email = ["a@b.example"]
 smtp = "{mailbox.address}"
 """
@@ -370,24 +374,78 @@ def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
         nightly(local, {"audit_heads": "channel:none"})
 
 
-def test_a_rule_notifies_its_channels(webhook: Webhook, mailbox: Mailbox, local: Ground) -> None:
+def notifications(ground: Ground) -> list[Job]:
+    """Jobs of notifications, newest first."""
+    return list(ground.read(list_jobs, JobFilter(kind="notification")).items)
+
+
+def test_every_receiver_is_notified_also_if_another_one_fails(
+    webhook: Webhook, mailbox: Mailbox, local: Ground
+) -> None:
     follow_in_process(local)
     add_channels(local, webhook, mailbox)
-    with local.database.writing() as connection:
-        publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
-    [action] = local.read(list_automation_actions, ActionFilter()).items
-    assert (action.state, action.result) == ("done", {"hook": "delivered", "people": "delivered"})
-    [(_, body)] = webhook.received
+    local.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
+    [sent] = notifications(local)
+    number = sent.arguments["event"]
+    receivers = {"hook of spacecraft 76": "delivered", "people of spacecraft 76": "delivered"}
+    assert (sent.state, sent.result) == ("done", {"event": number, **receivers})
+    [(headers, body)] = webhook.received
     document = json.loads(body)
-    assert document["rule"] == "gate failed" and document["event"] == action.event
-    assert document["text"] == f"regression {'1' * 32}: fail" and len(mailbox.received) == 1
-    # A channel that fails does not keep others from the message.
+    assert document.pop("created").startswith("20")
+    assert document == {
+        "event": number,
+        "trigger": "gate done",
+        "text": f"regression {'1' * 32}: fail",
+        "spacecraft_id": 76,
+        "pass_id": None,
+        "window_id": None,
+    }
+    assert len(mailbox.received) == 1
+    send_messages(local, number)
+    assert webhook.received[1][0]["Idempotency-Key"] == headers["Idempotency-Key"]
     webhook.statuses = [404]
+    local.write(publish, RegressionJudged(id="2" * 32, verdict="fail"))
+    failed = notifications(local)[0]
+    assert failed.state == "failed" and len(mailbox.received) == 3
+    assert (failed.error or "").startswith("hook of spacecraft 76: the webhook refuses the message")
+
+
+def broken(spacecraft: int) -> dict[str, Any]:
+    return {"spacecraft_id": spacecraft, "instance": "flight", "parameter": "voltage", "limit_state": "low"}
+
+
+@pytest.mark.parametrize(
+    ("event", "texts"),
+    [
+        (LimitsBroken(broken=[broken(76), broken(76), broken(77)]), ["voltage low; voltage low"]),
+        (LimitsBroken(broken=[broken(77)]), []),
+        (AlarmChanged(id=1, vehicle_id=1, name="voltage", severity="alarm", state="raised"), ["voltage (alarm)"]),
+        (AlarmChanged(id=1, vehicle_id=1, name="voltage", severity="alarm", state="cleared"), []),
+        (AlarmChanged(id=1, vehicle_id=2, name="voltage", severity="alarm", state="raised"), []),
+        (PassEvaluated(report_id="r", pass_id=1, vehicle_id=1), ["report of pass 1: requirements met"]),
+        (WindowChanged(id=1, state="failed"), ["window 1 (mare) failed: too late"]),
+        (WindowChanged(id=1, state="executed"), []),
+        (WindowChanged(id=9, state="failed"), []),
+    ],
+)  # fmt: skip
+def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
+    webhook: Webhook, local: Ground, monkeypatch: pytest.MonkeyPatch, event: Event, texts: list[str]
+) -> None:
+    follow_in_process(local)
+    hook = f'name = "m"\n[spacecraft]\nid = 76\n[notify.hook]\nwebhook = "{webhook.url}"\n'
+    add_mission(local, hook.encode())
     with local.database.writing() as connection:
-        publish(connection, RegressionJudged(id="2" * 32, verdict="fail"))
-    action = max(local.read(list_automation_actions, ActionFilter()).items, key=lambda one: one.id)
-    assert action.state == "failed" and "hook: the webhook refuses the message" in (action.error or "")
-    assert len(mailbox.received) == 2
+        for key, spacecraft in ((1, 76), (2, 77)):
+            row_of(connection, METADATA.tables["vehicles"], id=key, ccsds_id=spacecraft, instance="flight")
+        row_of(connection, METADATA.tables["passes"], id=1, vehicle_id=1)
+        row_of(connection, METADATA.tables["files"], sha256="0" * 64)
+        files = {"html_sha256": "0" * 64, "json_sha256": "0" * 64}
+        summary = {"verdict": "requirements met"}
+        row_of(connection, METADATA.tables["reports"], id="r", pass_id=1, summary=summary, **files)
+    window = SimpleNamespace(id=1, name="mare", reason="too late", vehicle_id=1, pass_id=None)
+    monkeypatch.setattr(actions, "_window_of", lambda _, key: window if key == 1 else None)
+    local.write(publish, event)
+    assert [json.loads(body)["text"] for _, body in webhook.received] == texts
 
 
 def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
@@ -408,9 +466,8 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
     server = ThreadingHTTPServer(("127.0.0.1", 0), Slow)
     threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
     try:
-        rule = '[[automation.rules]]\nname = "gate"\non = "gate done"\ndo = ["notify"]\nnotify = ["hook"]\n'
-        hook = f'[automation.channels.hook]\nwebhook = "http://127.0.0.1:{server.server_port}/"\n'
-        add_mission(local, f'name = "m"\n[spacecraft]\nid = 76\n{rule}{hook}'.encode())
+        hook = f'[notify.hook]\nwebhook = "http://127.0.0.1:{server.server_port}/"\n'
+        add_mission(local, f'name = "m"\n[spacecraft]\nid = 76\n{hook}'.encode())
         with local.database.writing() as connection:
             publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
 
@@ -423,8 +480,8 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
         assert kinds("running") == ["notification"]
         held.set()
         wait_for(lambda: kinds("running") == [], "the end of the notification")
-        [action] = local.read(list_automation_actions, ActionFilter()).items
-        assert (action.state, action.result) == ("done", {"hook": "delivered"})
+        [sent] = notifications(local)
+        assert (sent.state, sent.result) == ("done", {"event": 2, "hook of spacecraft 76": "delivered"})
     finally:
         held.set()
         dispatcher.close()

@@ -158,7 +158,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
             leases.remove(connection, f"{presence.PREFIX}worker late:1")
 
         # 5. A channel leads to an address that is not permitted.
-        text = 'name = "m"\n[spacecraft]\nid = 76\n[automation.channels.people]\nemail = ["a@b.example"]\n'
+        text = 'name = "m"\n[spacecraft]\nid = 76\n[notify.people]\nemail = ["a@b.example"]\n'
         add_mission(opened, text.encode())
         assert (
             "channel people of spacecraft 76: localhost: expected a public address"

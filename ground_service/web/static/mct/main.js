@@ -1,4 +1,4 @@
-// Open MCT with the telemetry, alarms, events, plans and stored layouts of this service.
+// Open MCT with the telemetry, alarms, events and plans of this service; own layouts are kept in the browser.
 import { get } from "../api.js";
 import { installClocks } from "./clocks.js";
 import { addressOf, allSpacecraft, installDictionary } from "./dictionary.js";
@@ -8,7 +8,6 @@ import { onState, startFeed } from "./feed.js";
 import { installImagery } from "./imagery.js";
 import { installLayouts, SHIFT } from "./layouts.js";
 import { installPlan } from "./plan.js";
-import { installStored } from "./stored.js";
 import { installTelemetry } from "./telemetry.js";
 
 const MINUTE_MS = 60_000;
@@ -67,6 +66,9 @@ function correctOpacity() {
   };
 }
 
+// Labels of marked ranges of plots.
+const TAGS = { anomaly: ["Anomaly", "#b3261e"], gap: ["Data gap", "#5f6368"], manoeuvre: ["Manoeuvre", "#7b4ba8"], check: ["To check", "#a15c00"], observation: ["Observation", "#1a73a8"], reference: ["Reference", "#2e7d32"] };
+
 async function start() {
   const session = await get("session");
   const spacecraft = (await allSpacecraft())[0];
@@ -75,6 +77,8 @@ async function start() {
   openmct.install(matchMedia("(prefers-color-scheme: light)").matches ? plugins.Snow() : plugins.Espresso());
   openmct.install(plugins.DisplayLayout({ showAsView: [] }));
   openmct.install(plugins.Notebook());
+  openmct.install(plugins.LocalStorage());
+  openmct.install(plugins.MyItems("My layouts"));
   installUser(session);
   installDictionary(openmct);
   installTelemetry(openmct);
@@ -83,7 +87,7 @@ async function start() {
   installEvents(openmct);
   installImagery(openmct);
   installFaults(openmct, session);
-  installStored(openmct, session);
+  for (const [key, [label, backgroundColor]] of Object.entries(TAGS)) openmct.annotation.defineTag(key, { label, backgroundColor, foregroundColor: "#ffffff" });
   startFeed();
   const last = await installClocks(openmct, spacecraft, session);
   // The time system is needed before the conductor.

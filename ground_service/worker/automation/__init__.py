@@ -1,1 +1,0 @@
-"""Automation: rules of mission descriptions that act on events, with a record of each action and its cause."""
