@@ -368,7 +368,6 @@ def configuration_page() -> str:
 def scenario_page() -> str:
     """Return every key of a scenario with its type and default, from the classes that read it."""
     from payload_emulator.session.scenario import Scenario
-    from payload_emulator.sim.instruments import simulated_instruments
 
     lines = [
         "# Scenario keys",
@@ -382,8 +381,6 @@ def scenario_page() -> str:
         kind = section.default_factory
         if dataclasses.is_dataclass(kind):
             lines += _keys(f"`[{section.name}]`", kind, inspect.getdoc(kind) or "")
-    for name, instrument in simulated_instruments().items():
-        lines += _keys(f"`[{name}]`", instrument.settings, inspect.getdoc(instrument.settings) or "")
     return "\n".join(lines) + "\n"
 
 

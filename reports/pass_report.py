@@ -14,7 +14,6 @@ from reports.figures.theme import series_styles
 from reports.sections.accounting import frames_and_packets
 from reports.sections.common import PassView
 from reports.sections.detection import detector_section, galleries
-from reports.sections.instruments import instruments
 from reports.sections.matching import matching
 from reports.sections.navigation import altitude, consistency_section, dependence, drift, errors
 from reports.sections.opening import about, provenance_and_data
@@ -48,7 +47,6 @@ def pass_document(report: PassReport) -> Document:
         detector_section,
         galleries,
         payload_map,
-        instruments,
         ground_track,
         housekeeping_and_events,
         ledger,

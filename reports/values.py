@@ -376,55 +376,6 @@ class CraterMap:
     source: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ResidualStatistics:
-    """Measurement minus prediction of the samples that an estimator used.
-
-    ``normalised_square`` is the mean of the squares of residual over predicted sigma, 1 for a consistent estimator. NaN
-    without samples.
-    """
-
-    label: str
-    unit: str
-    samples: int
-    mean: float
-    rms: float
-    p95_absolute: float
-    normalised_square: float
-
-
-@dataclass(frozen=True, slots=True)
-class QuantityStatistics:
-    """Values of a quantity that an instrument measured; NaN without samples."""
-
-    label: str
-    unit: str
-    samples: int
-    minimum: float
-    mean: float
-    maximum: float
-
-
-@dataclass(frozen=True, slots=True)
-class InstrumentReport:
-    """Use of an optional instrument on board.
-
-    ``used``, ``gated`` (refused by the gate), ``no_data`` (no value from the instrument) and ``no_model`` (value that
-    the estimator could not predict) add up to ``samples``.
-    """
-
-    name: str
-    title: str
-    frames: int
-    samples: int
-    used: int
-    gated: int
-    no_data: int
-    no_model: int
-    residuals: tuple[ResidualStatistics, ...] = ()
-    quantities: tuple[QuantityStatistics, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PayloadMap:
     """Crater map made by the payload, compared with the ground's catalogue.
@@ -557,7 +508,6 @@ class PassReport(ReportCommon):
     craters: CraterMap | None = None
     terrain: TerrainMap | None = None
     payload_map: PayloadMap | None = None
-    instruments: tuple[InstrumentReport, ...] = ()
     housekeeping: tuple[HousekeepingParameter, ...] = ()
     events: tuple[PassEvent, ...] = ()
     truth_ledger: tuple[AnchorRead, ...] = ()

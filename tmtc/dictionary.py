@@ -1,7 +1,7 @@
 """The packet dictionary of the payload.
 
-Everything that crosses the link is defined here and, for optional instruments, in `tmtc.instruments`; the ICD and the
-XTCE export are generated from it. A new version only adds packets, so that it decodes the telemetry of older payloads.
+Everything that crosses the link is defined here; the ICD and the XTCE export are generated from it. A new version only
+adds packets, so that it decodes the telemetry of older payloads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from tmtc.codes import (
 )
 from tmtc.fields import Field
 from tmtc.housekeeping import HOUSEKEEPING_FIELDS
-from tmtc.instruments import instrument_telemetry
 from tmtc.packets import TYPE_TELECOMMAND
 from tmtc.schema import Dictionary, Group, PacketDefinition
 
@@ -459,15 +458,14 @@ _IMAGE_REPORT = PacketDefinition(
         Field("image_crc", "u32", "CRC-32 of the pixels, row by row"),
         Field(
             "inputs_crc", "u32",
-            "CRC-32 of the attitude message and the samples of instruments, binary64, most significant "
-            "octet first",
+            "CRC-32 of the attitude message, binary64, most significant octet first",
         ),
     ),
 )  # fmt: skip
 
 
 DICTIONARY = Dictionary(
-    version=max(7, *(one.since for one in instrument_telemetry())),
+    version=7,
     telemetry=(
         _HOUSEKEEPING,
         *_FRAME_PACKETS,
@@ -475,7 +473,6 @@ DICTIONARY = Dictionary(
         *_FILTER_PACKETS,
         *_MACHINE_PACKETS,
         _FILTER_ESTIMATE,
-        *(one.packet for one in instrument_telemetry()),
         _IMAGE_REPORT,
     ),
     telecommands=_TELECOMMANDS,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -75,7 +75,6 @@ from reports.values import (
     GalleryFrame,
     HeadlineFigure,
     HousekeepingParameter,
-    InstrumentReport,
     NavigationSeries,
     NavigationStatistics,
     PacketAccounting,
@@ -151,7 +150,6 @@ class PassInputs:
     filter_states: FilterStates | None = None
     identifications: IdentificationSamples | None = None
     landmarks: MappedCraters | None = None
-    instruments: tuple[InstrumentReport, ...] = ()
     sun_known: bool = False
     burns: tuple[CommandedBurn, ...] = ()
     onboard_orientation: Orientation | None = None
@@ -233,9 +231,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         experiment_level=experiment_level,
         requirements=table,
         **_named(inputs, "generated_for", "created_utc", "evidence_level", "data_sources", "packets"),
-        **_named(
-            inputs, "instruments", "housekeeping", "events", "configuration", "comparison", "scenario_text"
-        ),
+        **_named(inputs, "housekeeping", "events", "configuration", "comparison", "scenario_text"),
         headline=_headline(inputs, navigation, detector),
         provenance=provenance,
         span=TimeSpan(inputs.start_utc_ns, inputs.stop_utc_ns, "pass"),
@@ -311,7 +307,6 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         "navigation": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "estimate"},
         "smoothed": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == SMOOTHED},
         "baselines": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "baseline"},
-        "instruments": {one.name: asdict(one) for one in report.instruments},
         "verdict": report.verdict,
         "verdict_level": report.verdict_level,
         "experiment": report.experiment,

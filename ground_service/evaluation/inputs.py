@@ -17,7 +17,6 @@ from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.detection.fixes import IdentificationSamples
 from ground_service.evaluation.detection.landmarks import MappedCraters, mapped_craters
 from ground_service.evaluation.detection.viewing import Viewing
-from ground_service.evaluation.instruments import instrument_reports
 from ground_service.evaluation.model import changed_figures
 from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
 from ground_service.evaluation.navigation.baselines import StartState
@@ -55,9 +54,8 @@ from lunar.datafolder import DataFolder
 from lunar.frames import Orientation
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import format_utc, parse_utc
-from reports.values import HousekeepingParameter, InstrumentReport, SettingsComparison
+from reports.values import HousekeepingParameter, SettingsComparison
 from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
-from tmtc.instruments import APID_INSTRUMENTS
 from tmtc.stream import cut_packets
 
 _UNITS = {"degC": "°C", "1/1000": "‰", "": "packets"}
@@ -139,7 +137,6 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             filter_states=filter_states(connection, span),
             identifications=identification_samples(connection, span),
             landmarks=landmark_reports(connection, span),
-            instruments=reported_instruments(connection, span),
             sun_known=manifest.get("light", "real") == "real"
             and mission.observation.needs_daylight is not False,
             burns=burns_of(manifest),
@@ -254,12 +251,6 @@ def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
     octets = sample_store.packet_octets(connection, span, APID_DETECTIONS)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
     return mapped_craters(tables.get("landmarks"))
-
-
-def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
-    """Return the statistics of the optional instruments of the payload, out of the packets."""
-    octets = sample_store.packet_octets(connection, span, APID_INSTRUMENTS)
-    return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets)))
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:

@@ -155,32 +155,6 @@ class RequirementFigures(Entity):
     question: str = Field(default="operations", description="operations or experiment")
 
 
-class ResidualFigures(Entity):
-    """Residuals of a measurement of an instrument; null: not known."""
-
-    label: str
-    unit: str
-    samples: int
-    mean: float | None
-    rms: float | None
-    p95_absolute: float | None
-    normalised_square: float | None
-
-
-class InstrumentFigures(Entity):
-    """Use of an optional instrument on board; the last four counts add up to the samples."""
-
-    name: str
-    title: str
-    frames: int
-    samples: int
-    used: int
-    gated: int = Field(description="Refused by the gate")
-    no_data: int = Field(description="No value from the instrument")
-    no_model: int = Field(description="Value that the estimator could not predict")
-    residuals: list[ResidualFigures]
-
-
 class PassConditions(Entity):
     """Conditions of a pass for trends; null and empty texts: not known."""
 
@@ -191,7 +165,9 @@ class PassConditions(Entity):
 
 
 class PassFigures(Entity):
-    """Figures of an evaluated pass; null: not known."""
+    """Figures of an evaluated pass; null: not known. Figures that only older versions computed are left out."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
     pass_id: int
     frames: int | None
@@ -210,7 +186,6 @@ class PassFigures(Entity):
     experiment_level: str = ""
     requirements: list[RequirementFigures]
     error_budget: dict[str, ErrorBudget]
-    instruments: dict[str, InstrumentFigures] = Field(default_factory=dict)
     evidence_level: str
     data: list[str] = Field(description="Data sources")
     conditions: PassConditions | None = Field(default=None, description="null: report of an older version")

@@ -26,7 +26,6 @@ from lunar.timescales import format_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.export import Record, format_records, packet_records
 from tmtc.fields import Field
-from tmtc.instruments import instrument_telemetry
 from tmtc.schema import PacketDefinition
 from tmtc.stream import cut_packets, whole_packets
 from tmtc.xtce.records import format_xtce_records, xtce_records
@@ -38,14 +37,8 @@ PACKET_FIELDS = {
     for one in STRUCTURES.values()
     for field in one.fields[1:]
     if one.name != OWN_PACKET and field.size == 1
-} | {
-    f"{one.name}.{field.name}": (one.packet, field)
-    for one in instrument_telemetry()
-    for field in one.sample_fields
-    if field.size == 1
 }
-"""Packet and field of the parameters that are read from stored packets: of further housekeeping structures, and of
-optional instruments."""
+"""Packet and field of the parameters that are read from stored packets: of further housekeeping structures."""
 
 STATE_PACKET = "navigation_state"
 STATE_PARAMETERS = {
@@ -109,7 +102,7 @@ def declared_samples(version: int, container: int, places: Mapping[str, int]) ->
 
 
 def packet_samples(packet: PacketDefinition, field: str, version: int) -> SampleSource:
-    """Return the values of one field of a packet, or of its items, read from the stored packets, without roll-ups."""
+    """Return the values of one field of a packet, read from the stored packets, without roll-ups."""
 
     def read(connection: Connection, span: PassSpan, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         ticks, values = sample_store.packet_values(connection, span, packet, field)
@@ -160,7 +153,7 @@ def state_unit(value: str) -> str:
 
 
 def own_parameters() -> tuple[ParameterInfo, ...]:
-    """Return the parameters of our housekeeping, of the on-board estimators and of the optional instruments."""
+    """Return the parameters of our housekeeping and of the on-board estimators."""
     fields = DICTIONARY.packet(OWN_PACKET).fields
     return (
         *(_own_info(field.name, OWN_PACKET, field) for field in fields if field.name in PARAMETERS),

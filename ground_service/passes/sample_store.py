@@ -20,7 +20,6 @@ from ground_service.store.models import TELECOMMANDS
 from lunar.arrays import IntArray
 from lunar.timescales import format_utc
 from reports.values import PassEvent
-from tmtc.cuc import onboard_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.event_texts import event_text, request_text
 from tmtc.schema import PacketDefinition
@@ -49,15 +48,13 @@ def packet_octets(connection: Connection, span: PassSpan, apid: int) -> bytes:
 def packet_values(
     connection: Connection, span: PassSpan, packet: PacketDefinition, field: str
 ) -> tuple[IntArray, NDArray[Any]]:
-    """Return ticks and values (n,) of a field of stored packets, or of their items, in order of time."""
+    """Return ticks and values (n,) of a field of stored packets, in order of time."""
     octets = packet_octets(connection, span, packet.apid)
     table = DICTIONARY.unpack_many(octets, cut_packets(octets)).get(packet.name)
     if table is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
-    ticks = table.ticks if packet.group is None else onboard_ticks(table.items["sample_ticks"])
-    values = (table.columns if packet.group is None else table.items)[field]
-    order = np.argsort(ticks, kind="stable")
-    return ticks[order], values[order]
+    order = np.argsort(table.ticks, kind="stable")
+    return table.ticks[order], table.columns[field][order]
 
 
 def detection_samples(connection: Connection, span: PassSpan) -> DetectionSamples:

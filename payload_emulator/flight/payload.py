@@ -19,7 +19,6 @@ from payload_emulator.flight.onboard.commanding import Command, Refusal, failure
 from payload_emulator.flight.onboard.fdir import Monitors, Reaction
 from payload_emulator.flight.onboard.housekeeping import StageTimer
 from payload_emulator.flight.onboard.housekeeping_packets import send_large_data, send_structure
-from payload_emulator.flight.onboard.instrument_suite import NO_SAMPLES, Samples
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation, ProtectedMemory
 from payload_emulator.flight.onboard.modes import PayloadMode
@@ -135,7 +134,6 @@ class Payload:
         attitude: FloatArray,
         clock_ticks: int,
         telecommand_octets: bytes,
-        instruments: Samples = NO_SAMPLES,
     ) -> list[bytes]:
         """Return the space packets that go down after one frame, or one turn without a frame.
 
@@ -150,9 +148,6 @@ class Payload:
             On-board time of the image, units of 2^-16 s.
         telecommand_octets
             Telecommand packets that arrived since the frame before, one after another.
-        instruments
-            Samples since the frame before by the name of the instrument, shape (n, k) with the columns that its module
-            in `flight.instruments` declares.
         """
         machine = self._machine
         machine.timer.enter(Stage.commands)
@@ -163,7 +158,7 @@ class Payload:
         for item in parse_commands(telecommand_octets):
             self._receive(item)
         self._release_activities()
-        self._look(image, np.asarray(attitude, dtype=np.float64).reshape(-1), instruments)
+        self._look(image, np.asarray(attitude, dtype=np.float64).reshape(-1))
         machine.timer.enter(Stage.monitoring)
         self._monitor()
         machine.timer.enter(Stage.telemetry)
@@ -393,7 +388,7 @@ class Payload:
 
     # Frames
 
-    def _look(self, image: NDArray[Any] | None, attitude: FloatArray, instruments: Samples) -> None:
+    def _look(self, image: NDArray[Any] | None, attitude: FloatArray) -> None:
         """Work on a frame, if it is time for one; end the observation when its time is over."""
         machine = self._machine
         ticks, window = machine.telemetry.ticks, machine.observation
@@ -420,11 +415,10 @@ class Payload:
             parameters["detector_score_floor"],
             parameters["detector_timeout_s"],
             machine.monitors.in_streak,
-            instruments,
         )
         if parameters["image_reports"]:
             frame = {"frame_number": frame_number, "image_ticks": ticks}
-            machine.telemetry.send("image_report", {**frame, **image_report(image, attitude, instruments)})
+            machine.telemetry.send("image_report", {**frame, **image_report(image, attitude)})
         machine.timer.detector_max_ms = max(machine.timer.detector_max_ms, observer.detector_ms)
         interval = int(parameters["thumbnail_interval"])
         if machine.thumbnail_wanted or (interval and frame_number % interval == 0):

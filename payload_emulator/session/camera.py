@@ -15,8 +15,7 @@ from lunar.frames import spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import TerrainError
-from payload_emulator.session.instruments import InstrumentBench
-from payload_emulator.session.world import NO_SAMPLES, Samples, World, clock_ticks
+from payload_emulator.session.world import World, clock_ticks
 from payload_emulator.sim.orbit.truth import attitude_message, perturbed
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.photometry import Photometry
@@ -40,8 +39,6 @@ class Exposure:
     ----------
     camera_from_mcmf
         True attitude, shape (3, 3).
-    instruments
-        Samples since the frame before.
     fault
         Why the camera gives no image of ground that cannot be rendered; empty without such a fault.
     """
@@ -51,7 +48,6 @@ class Exposure:
     attitude: FloatArray
     clock_ticks: int
     camera_from_mcmf: FloatArray
-    instruments: Samples = field(default_factory=dict)
     fault: str = ""
 
 
@@ -78,18 +74,16 @@ class _Scene:
 class Camera:
     """Takes the frames of a spacecraft in order of time.
 
-    One thread renders and samples the instruments, because a terrain serves one thread; a second lets the sensor take
-    the picture of what the first has rendered. Ground that cannot be rendered gives no image.
+    One thread renders, because a terrain serves one thread; a second lets the sensor take the picture of what the first
+    has rendered. Ground that cannot be rendered gives no image.
 
     Attributes
     ----------
-    bench
-        Instruments, and the world of the frames.
     beside
         Called in the thread of the terrain with world, time and true attitude of each frame; `shown` is its result.
     """
 
-    bench: InstrumentBench
+    world: World
     beside: Callable[[World, int, FloatArray], Any] | None = None
     shown: Any = None
     _renderer: ThreadPoolExecutor = field(init=False)
@@ -97,24 +91,23 @@ class Camera:
     _ahead: tuple[int, Future[Exposure]] | None = None
 
     def __post_init__(self) -> None:
-        self.bench.world.terrain.release_thread()
+        self.world.terrain.release_thread()
         self._renderer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
         self._sensor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sensor")
 
     def take(self, utc_ns: int, next_utc_ns: int | None = None) -> Exposure:
         """Return the frame of a time, and begin to render the one that probably follows."""
-        world = self.bench.world
         if self._ahead is None or self._ahead[0] != utc_ns:
             self._prepare(utc_ns)
         assert self._ahead is not None
         try:
             exposure = self._ahead[1].result()
         except TerrainError as error:
-            exposure = replace(expose(world, utc_ns, NO_PICTURE), fault=str(error))
+            exposure = replace(expose(self.world, utc_ns, NO_PICTURE), fault=str(error))
         self.shown = None
-        if self.beside is not None or world.scenario.instruments:
-            sampled = self._renderer.submit(self._sample, utc_ns, exposure.camera_from_mcmf)
-            exposure = replace(exposure, instruments=sampled.result())
+        if self.beside is not None:
+            shown = self._renderer.submit(self.beside, self.world, utc_ns, exposure.camera_from_mcmf)
+            self.shown = shown.result()
         self._ahead = None
         if next_utc_ns is not None:
             self._prepare(next_utc_ns)
@@ -124,19 +117,14 @@ class Camera:
         """End the threads, after which another one may ask the terrain for ground."""
         self._renderer.shutdown(cancel_futures=True)
         self._sensor.shutdown(cancel_futures=True)
-        self.bench.world.terrain.release_thread()
+        self.world.terrain.release_thread()
 
     def _prepare(self, utc_ns: int) -> None:
         if self._ahead is not None:
             self._ahead[1].cancel()
-        world = self.bench.world
+        world = self.world
         scene = self._renderer.submit(_scene, world, utc_ns)
         self._ahead = utc_ns, self._sensor.submit(lambda: _exposed(world, scene.result()))
-
-    def _sample(self, utc_ns: int, camera_from_mcmf: FloatArray) -> Samples:
-        if self.beside is not None:
-            self.shown = self.beside(self.bench.world, utc_ns, camera_from_mcmf)
-        return self.bench.sample(utc_ns, camera_from_mcmf)
 
 
 def expose(world: World, utc_ns: int, picture: Picture | None = None) -> Exposure:
@@ -187,10 +175,8 @@ def _exposed(world: World, scene: _Scene) -> Exposure:
     known = perturbed(scene.camera_from_icrf, bias + noise)
     sun_in_camera = known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf
     message = attitude_message(known, sun_in_camera)
-    if scenario.instruments_give_attitude:
-        message[:4] = np.nan
     ticks = clock_ticks(world, scene.utc_ns)
-    return Exposure(scene.utc_ns, image, message, ticks, scene.camera_from_mcmf, NO_SAMPLES)
+    return Exposure(scene.utc_ns, image, message, ticks, scene.camera_from_mcmf)
 
 
 def _seen(

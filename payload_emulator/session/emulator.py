@@ -26,7 +26,6 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.session.external import ExternalFrames
-from payload_emulator.session.instruments import onboard_attitudes
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.mission import MISSION_FILE, mission_text, save_attitudes
 from payload_emulator.session.recording import (
@@ -193,7 +192,7 @@ def _emulate_into(
     save_record(folder, inputs, loaded.parameters, loaded.tables)
     save_frame_times(folder, world.frame_utc_ns)
     packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
-    save_attitudes(folder, inputs, onboard_attitudes(packets))
+    save_attitudes(folder, inputs)
     (folder / MISSION_FILE).write_text(mission_text(world, data), encoding="utf-8")
     save_oem(sample_truth(world.truth, world.frame_utc_ns), folder / "truth.oem")
     save_oem(reference, folder / "reference.oem")

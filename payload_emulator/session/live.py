@@ -89,7 +89,7 @@ _EXACT = (
     "_uplinked", "_last_heard_ns", "_last_image_ns", "_waiting", "_sent_up", "_operator", "_discontinuous",
     "_console_count",
 )  # fmt: skip
-"""Fields of a session that make up its exact state outside of observations, with the flight and the instruments."""
+"""Fields of a session that make up its exact state outside of observations, with the flight."""
 
 
 @dataclass(slots=True)
@@ -708,7 +708,6 @@ class LiveSession:
             return False
         values = {name: getattr(self, name) for name in _EXACT}
         values |= {"truth": self.world.truth, "burns": self.world.burns}
-        values["instruments"] = self.spacecraft.camera.bench.state
         save_state(self.state_file, self.world.scenario.name, values, self._known_objects())
         return True
 
@@ -718,11 +717,9 @@ class LiveSession:
         if values is None:
             return
         world = replace(self.world, truth=values.pop("truth"), burns=values.pop("burns"))
-        instruments = values.pop("instruments")
         for name, value in values.items():
             setattr(self, name, value)
         self._enter(world)
-        self.spacecraft.camera.bench.state = instruments
         self._is_continued = True
 
     def _known_objects(self) -> dict[str, object]:

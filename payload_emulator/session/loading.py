@@ -34,7 +34,6 @@ from payload_emulator.flight.ports import Board
 from payload_emulator.flight.vision.detections import Detector
 from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
 from payload_emulator.session.distortion import displaced
-from payload_emulator.session.instruments import flight_parameters
 from payload_emulator.session.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.sim.orbit.disturbances import TrueBurn
@@ -196,7 +195,6 @@ def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder, is_launc
             image_reports=is_launched,
             time_reports=is_launched,
             scrub_interval_s=_SCRUB_S if is_launched else FlightParameters().scrub_interval_s,
-            instruments=flight_parameters(scenario),
         ),
     )
     # Flight is given what the parameter file of the archive says, so that a replay is given the same.

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import IntArray
 from lunar.boxes import Region, share_outside
 from lunar.constants import MOON_RADIUS_M
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
@@ -325,21 +325,11 @@ def _uploaded_tables(scenario: Scenario) -> list[str]:
     return [*anchored, *odometry, *(["initial_state"] if anchored else [])]
 
 
-def save_attitudes(
-    folder: Path, inputs: Iterable[StepInput], from_instruments: Mapping[int, FloatArray]
-) -> None:
-    """Write the attitude of every frame, as attitude control or an instrument gave it, into an archive.
-
-    Parameters
-    ----------
-    from_instruments
-        Quaternions q_wxyz (4,) by on-board time of the frame, for frames without attitude from attitude control.
-    """
+def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
+    """Write the attitude of every frame, as attitude control gave it, into an archive."""
     rows = []
     for item in inputs:
         q_wxyz = item.attitude[:4]
-        if not np.isfinite(q_wxyz).all():
-            q_wxyz = from_instruments.get(item.clock_ticks, q_wxyz)
         if item.number >= 0 and np.isfinite(q_wxyz).all():
             rows.append(f"{item.clock_ticks},{','.join(repr(float(value)) for value in q_wxyz)}\n")
     (folder / ATTITUDE_FILE).write_text(f"{ATTITUDE_HEADER}\n{''.join(rows)}", encoding="utf-8")

@@ -10,14 +10,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
 from payload_emulator.errors import ParameterError
-from payload_emulator.flight.instruments import flight_instruments
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.flight.vision.detector import DetectorParameters
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
@@ -91,10 +89,7 @@ def _section(value: Any, path: str) -> list[str]:
     lines, sections = [], []
     for item in dataclasses.fields(value):
         inner, name = getattr(value, item.name), f"{path}.{item.name}" if path else item.name
-        if isinstance(inner, Mapping):
-            for key, one in inner.items():
-                sections += _section(one, f"{name}.{key}") or ["", f"[{name}.{key}]"]
-        elif dataclasses.is_dataclass(inner):
+        if dataclasses.is_dataclass(inner):
             sections += _section(inner, name)
         elif inner is not None:
             lines.append(f"{item.name} = {toml_text(_plain(inner))}")
@@ -114,38 +109,12 @@ def _read(
 ) -> BuildParameters:
     """Return parameters with the values of a table."""
     try:
-        return _changed(flown, table if dropped is None else _known(flown, table, "", dropped), dropped)
+        kept = table if dropped is None else _known(flown, table, "", dropped)
+        changed = read_table(BuildParameters, kept, present=flown, bounds=_bounds)
+        _refuse_crossed(changed, kept, "")
     except TableFault as fault:
         expected = f"{fault.nearest} (nearest known key)" if fault.nearest else fault.expected
         raise ParameterError(source, fault.place, expected, fault.found) from None
-
-
-def _changed(flown: BuildParameters, table: dict[str, Any], dropped: list[str] | None) -> BuildParameters:
-    changed = read_table(BuildParameters, table, present=flown, bounds=_bounds)
-    _refuse_crossed(changed, table, "")
-    if changed.flight.instruments is flown.flight.instruments:
-        return changed
-    instruments = _instruments(flown.flight.instruments, changed.flight.instruments, dropped)
-    return dataclasses.replace(changed, flight=dataclasses.replace(changed.flight, instruments=instruments))
-
-
-def _instruments(
-    present: Mapping[str, Any], table: Mapping[str, Any], dropped: list[str] | None
-) -> dict[str, Any]:
-    """Return the parameters of installed instruments with those that `table` names changed or added."""
-    known, changed = flight_instruments(), dict(present)
-    for name, given in table.items():
-        place = f"flight.instruments.{name}"
-        if name in known:
-            before = changed.get(name, known[name].parameters())
-            kept = given if dropped is None else _known(before, given, place, dropped)
-            changed[name] = read_table(known[name].parameters, kept, place, present=before, bounds=_bounds)
-            _refuse_crossed(changed[name], kept, place)
-        elif dropped is not None:
-            dropped.append(place)
-        else:
-            expected = f"one of {', '.join(known)}" if known else "no section: this build has no instruments"
-            raise TableFault(place, expected, "an unknown instrument")
     return changed
 
 

@@ -3,7 +3,7 @@
 The record of what a payload was given exists only where it was simulated. The ground has telemetry and telecommands of
 a pass; where the mission description declares the simulated world, the flight is propagated again and each image is
 taken again at the time that telemetry states. Nothing is used unless telemetry confirms it: image reports state CRC-32
-of the pixels and of attitude and instrument samples, housekeeping the hashes of model, parameters and catalogue.
+of the pixels and of the attitude, housekeeping the hashes of model, parameters and catalogue.
 
 Housekeeping values of the board (temperatures, processor time) are not known and are not made again.
 """
@@ -28,7 +28,6 @@ from payload_emulator.flight.ports import UNLIMITED, ResetCause
 from payload_emulator.flight.telemetry.products import image_report
 from payload_emulator.session.camera import Exposure, expose
 from payload_emulator.session.emulator import Progress, file_entries
-from payload_emulator.session.instruments import InstrumentBench, onboard_attitudes
 from payload_emulator.session.loading import LoadedPayload, launch_payload
 from payload_emulator.session.mission import save_attitudes
 from payload_emulator.session.recording import (
@@ -118,7 +117,7 @@ def reconstruct(
     inputs = with_telecommands(steps, telecommands)
     save_record(out, inputs, loaded.parameters, loaded.tables)
     save_frame_times(out, np.array(times, dtype=np.int64))
-    save_attitudes(out, inputs, onboard_attitudes(received.cut.packets(received.buffer)))
+    save_attitudes(out, inputs)
     manifest |= _described(world, loaded, scenario)
     manifest["files"] = file_entries(out)
     (out / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
@@ -162,19 +161,18 @@ def with_telecommands(steps: Mapping[int, StepInput], telecommands: bytes) -> li
 
 def _exposures(world: World, reports: Sequence[ImageReport]) -> Iterator[tuple[ImageReport, Exposure]]:
     """Yield the exposure of each report; where the clock has jumped, at the time that telemetry confirms."""
-    bench, faults = InstrumentBench(world), map(parse_fault, world.scenario.faults.events)
+    faults = map(parse_fault, world.scenario.faults.events)
     jumps_s = [one.size for one in sorted(faults, key=lambda one: one.at_s) if one.kind == "clock_jump"]
     errors_s = list(accumulate(jumps_s, initial=0.0))
     for report in reports:
         for error_s in tuple(errors_s):
             ticks = report.ticks - round(error_s * TICKS_PER_SECOND)
             exposure = expose(world, frame_utc_ns(world, ticks))
-            found = image_report(exposure.image, np.zeros(0), {})
+            found = image_report(exposure.image, np.zeros(0))
             if found["image_crc"] == report.values["image_crc"]:
                 break
             errors_s = errors_s[1:] or errors_s
-        samples = bench.sample(exposure.utc_ns, exposure.camera_from_mcmf)
-        yield report, replace(exposure, instruments=samples)
+        yield report, exposure
 
 
 def _step(ticks: int) -> StepInput:
@@ -189,13 +187,12 @@ def _frame_step(number: int, ticks: int, exposure: Exposure) -> StepInput:
         attitude=np.asarray(exposure.attitude, np.float64),
         image_shape=exposure.image.shape,
         image_sha256=pixel_hash(exposure.image),
-        instruments=exposure.instruments,
     )
 
 
 def _check_image(archive: Path, number: int, report: ImageReport, exposure: Exposure) -> None:
     """Refuse an image or inputs that are not those that telemetry reports."""
-    found = image_report(exposure.image, np.asarray(exposure.attitude), exposure.instruments)
+    found = image_report(exposure.image, np.asarray(exposure.attitude))
     for name, expected in report.values.items():
         if found[name] != expected:
             form = "08X" if name.endswith("crc") else "d"

@@ -1,9 +1,9 @@
 """What a payload was given during a pass, kept so that another build can be given the same.
 
 In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per step: on-board time, message of the ADCS,
-telecommands, hash of the image, what the board said, samples of instruments), `parameters.toml`, `tables/*.bin` as
-uploaded, and `dictionary.json` (the packet definitions the downlink was made with); images lie in `frames/`. Nothing of
-the truth is here.
+telecommands, hash of the image, what the board said), `parameters.toml`, `tables/*.bin` as uploaded, and
+`dictionary.json` (the packet definitions the downlink was made with); images lie in `frames/`. Nothing of the truth is
+here.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import base64
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,8 +55,6 @@ class StepInput:
     image_shape, image_sha256
         Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
         none.
-    instruments
-        Samples since the frame before, (n, k) by name of the instrument.
     """
 
     number: int
@@ -69,7 +67,6 @@ class StepInput:
     sensors: FloatArray
     uptime_ticks: int
     downlink_octets: int
-    instruments: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +98,6 @@ def step_input(number: int, given: Given) -> StepInput:
         np.asarray(given.sensors, np.float64),
         given.uptime_ticks,
         given.downlink_octets,
-        given.instruments,
     )
 
 
@@ -237,7 +233,7 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _line(item: StepInput) -> str:
-    row: dict[str, Any] = {
+    row = {
         "frame": item.number,
         "ticks": item.clock_ticks,
         "attitude": _numbers(item.attitude),
@@ -250,10 +246,6 @@ def _line(item: StepInput) -> str:
         "uptime_ticks": item.uptime_ticks,
         "downlink_octets": item.downlink_octets,
     }
-    if item.instruments:
-        row["instruments"] = {
-            name: [_numbers(sample) for sample in rows] for name, rows in item.instruments.items()
-        }
     return json.dumps(row) + "\n"
 
 
@@ -268,6 +260,12 @@ def _array(values: list[float | None]) -> FloatArray:
 def _parse(line: str, path: Path, index: int) -> StepInput:
     try:
         row = json.loads(line)
+        if "instruments" in row:
+            raise RecordError(
+                f"{path}, line {index + 1}: expected the inputs of a camera, found samples of "
+                f"{', '.join(row['instruments'])}: other instruments were withdrawn; the version that recorded "
+                "this pass can replay it"
+            )
         return StepInput(
             int(row["frame"]),
             int(row["ticks"]),
@@ -279,10 +277,6 @@ def _parse(line: str, path: Path, index: int) -> StepInput:
             _array(row["sensors"]),
             int(row["uptime_ticks"]),
             int(row["downlink_octets"]),
-            {
-                name: np.stack([_array(one) for one in rows]) if rows else np.zeros((0, 0))
-                for name, rows in row.get("instruments", {}).items()
-            },
         )
     except (ValueError, KeyError, TypeError) as error:
         raise RecordError(

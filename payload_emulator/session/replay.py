@@ -246,7 +246,7 @@ def replay(
         detector.image_ticks = item.clock_ticks
         began = cpu_clock()
         taken = None if item.number < 0 else image
-        packets += payload.step(taken, item.attitude, item.clock_ticks, item.telecommands, item.instruments)
+        packets += payload.step(taken, item.attitude, item.clock_ticks, item.telecommands)
         step_s = cpu_clock() - began
         if item.number < 0:
             continue

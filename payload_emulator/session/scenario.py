@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -16,15 +16,16 @@ from typing import Any, Literal, Protocol
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.typed_toml import Record, TableFault, read_table, toml_text
+from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
 from payload_emulator.sim.board.contact_plan import parse_clock_error, parse_outage
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
-from payload_emulator.sim.instruments import simulated_instruments
 from payload_emulator.sim.render.sensor import SensorModel
 
 SPACECRAFT_ID = 76
 """Spacecraft of a scenario that states none."""
+
+_WITHDRAWN = {"altimeter", "star_tracker"}
 
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -342,13 +343,6 @@ class Scenario:
     faults: FaultsSection = field(default_factory=FaultsSection)
     reference: ReferenceSection = field(default_factory=ReferenceSection)
     requirements: RequirementsSection = field(default_factory=RequirementsSection)
-    # Settings of each instrument that the scenario has a section of, by name.
-    instruments: Mapping[str, Any] = field(default_factory=dict, hash=False)
-
-    @property
-    def instruments_give_attitude(self) -> bool:
-        """Whether an instrument gives the attitude in place of the message of the ADCS."""
-        return any(simulated_instruments()[name].gives_attitude for name in self.instruments)
 
     @property
     def has_flat_ground(self) -> bool:
@@ -414,16 +408,12 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
         raise ScenarioError(f"{source}: not TOML: {error}") from None
     if "name" not in table:
         raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")
-    known = simulated_instruments()
-    sections = {key: value for key, value in table.items() if key not in known}
-    if "instruments" in sections:
+    for name in _WITHDRAWN & table.keys():
         raise ScenarioError(
-            f"{source}: unknown key 'instruments'; each instrument has a section of its own name"
+            f"{source}: section [{name}]: instruments other than the camera were withdrawn; leave the section out, "
+            "or declare the packets of the instrument in the mission description"
         )
-    installed: dict[str, Any] = {
-        name: _read(known[name].settings, table[name], source, name) for name in known if name in table
-    }
-    scenario = dataclasses.replace(_read(Scenario, sections, source), instruments=installed)
+    scenario = _read(table, source)
     _check(scenario, source)
     return scenario
 
@@ -434,10 +424,7 @@ def format_scenario(scenario: Scenario) -> str:
     sections: list[str] = []
     for item in dataclasses.fields(scenario):
         value = getattr(scenario, item.name)
-        if item.name == "instruments":
-            for name, settings in value.items():
-                sections += _section(name, settings)
-        elif dataclasses.is_dataclass(value):
+        if dataclasses.is_dataclass(value):
             sections += _section(item.name, value)
         else:
             lines.append(f"{item.name} = {toml_text(value)}")
@@ -452,21 +439,18 @@ def _section(name: str, values: Any) -> list[str]:
     ]
 
 
-def _read(kind: type[Record], table: object, source: str, path: str = "") -> Record:
-    """Return a section, or the scenario, from its table; a fault becomes one line that names source and key."""
+def _read(table: object, source: str) -> Scenario:
+    """Return the scenario from its table; a fault becomes one line that names source and key."""
     try:
-        return read_table(kind, table, path)
+        return read_table(Scenario, table)
     except TableFault as fault:
-        # The section of an instrument has its name.
-        known = [name for name in fault.known if name != "instruments"]
-        if "." not in fault.place:
-            known += simulated_instruments() if known else []
         if not fault.known:
             raise ScenarioError(
                 f"{source}: {fault.place} must be {fault.expected}, found {fault.found}"
             ) from None
-        nearest = TableFault(fault.place, "", "", known).nearest
-        hint = f"did you mean '{nearest}'?" if nearest else f"known keys: {', '.join(known)}"
+        hint = (
+            f"did you mean '{fault.nearest}'?" if fault.nearest else f"known keys: {', '.join(fault.known)}"
+        )
         raise ScenarioError(f"{source}: unknown key '{fault.place}'; {hint}") from None
 
 
@@ -534,7 +518,6 @@ def _check(scenario: Scenario, source: str) -> None:
         _check_disturbances,
         _check_light,
         _check_navigation,
-        _check_instruments,
     ):
         check(scenario, require)
     for text in scenario.faults.events:
@@ -709,15 +692,3 @@ def _check_navigation(scenario: Scenario, require: Require) -> None:
         "reference.transverse_m",
         "at least twice reference.radial_m",
     )
-
-
-def _check_instruments(scenario: Scenario, require: Require) -> None:
-    for name, settings in scenario.instruments.items():
-        instrument = simulated_instruments()[name]
-        for limit in instrument.limits(settings):
-            require(limit.good, f"{name}.{limit.key}", limit.expected, limit.found)
-        for key in instrument.replaces:
-            section, _, item = key.partition(".")
-            there = getattr(scenario, section)
-            found, default = getattr(there, item), getattr(type(there)(), item)
-            require(found == default, key, f"left out because [{name}] takes its place", found)

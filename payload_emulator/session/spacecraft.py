@@ -21,10 +21,9 @@ from payload_emulator.flight.ports import SETTINGS_OCTETS, STORE_OCTETS, UNLIMIT
 from payload_emulator.flight.vision.detections import Detections, Detector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.camera import Camera, Exposure
-from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.loading import LoadedPayload
 from payload_emulator.session.reduced import CatalogueDetector
-from payload_emulator.session.world import NO_SAMPLES, Samples, World, clock_ticks
+from payload_emulator.session.world import World, clock_ticks
 from payload_emulator.sim.board.faults import Fault, parse_fault
 from payload_emulator.sim.board.link import LIGHT_S, Receiver
 from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
@@ -105,7 +104,6 @@ class Given:
     sensors: FloatArray
     uptime_ticks: int
     downlink_octets: int
-    instruments: Samples = field(default_factory=dict)
 
 
 class ProcessorHang(BaseException):
@@ -189,11 +187,11 @@ class Spacecraft:
     @property
     def world(self) -> World:
         """The world as far as it is flown."""
-        return self.camera.bench.world
+        return self.camera.world
 
     @world.setter
     def world(self, world: World) -> None:
-        self.camera.bench.world = world
+        self.camera.world = world
 
     def turn(self, moment: Moment) -> Turn:
         """Let the spacecraft do what is due at a moment."""
@@ -210,7 +208,6 @@ class Spacecraft:
             moment.orders,
             sunlit=moment.sunlit,
             downlink_octets=moment.downlink_octets,
-            instruments=NO_SAMPLES if exposure is None else exposure.instruments,
         )
         return Turn(moment, exposure, packets, self.receiver.clcw)
 
@@ -224,7 +221,6 @@ class Spacecraft:
         *,
         sunlit: float = 1.0,
         downlink_octets: int = UNLIMITED,
-        instruments: Samples = NO_SAMPLES,
     ) -> list[bytes]:
         """What goes down after a step; None for an image: nobody looks now. Faults change what comes in."""
         board = self.board
@@ -242,11 +238,10 @@ class Spacecraft:
         if self._camera_dead and not board.camera_on:
             self._camera_dead = False
         ticks = clock_ticks + self._clock_error_ticks
-        samples = _with_clock_error(instruments, self._clock_error_ticks)
         cause, self._booted = self._booted, None
         try:
             with counted_reads(self.truth_reads):
-                packets = self.payload.step(picture, message, ticks, telecommands, samples)
+                packets = self.payload.step(picture, message, ticks, telecommands)
         except ProcessorHang:
             self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
             packets = []
@@ -259,7 +254,6 @@ class Spacecraft:
             board.readings,
             board.uptime_ticks(),
             downlink_octets,
-            samples,
         )
         if self._down_until_ns is not None:
             return []
@@ -367,16 +361,9 @@ def new_spacecraft(world: World, loaded: LoadedPayload, first_utc_ns: int | None
     return Spacecraft(
         loaded,
         new_board(scenario.seed),
-        Camera(InstrumentBench(world)),
+        Camera(world),
         int(world.frame_utc_ns[0]) if first_utc_ns is None else first_utc_ns,
         Receiver(scenario.spacecraft_id),
         tuple(parse_fault(text) for text in scenario.faults.events),
         CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
     )
-
-
-def _with_clock_error(samples: Samples, error_ticks: int) -> Samples:
-    """Return samples as a clock with an additional error stamps them: their first column is the time."""
-    if not error_ticks:
-        return samples
-    return {name: rows + error_ticks * (np.arange(rows.shape[1]) == 0) for name, rows in samples.items()}

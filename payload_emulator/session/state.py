@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from enum import Enum
 from io import BytesIO
 from pathlib import Path
-from types import MappingProxyType, MethodType
+from types import MethodType
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ import numpy as np
 from lunar.propagation import Trajectory
 from payload_emulator.errors import RecordError
 
-VERSION = 6
+VERSION = 7
 _HEADER = re.compile(rb"LINNA spacecraft state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
 _EXPECTED = "the state of a spacecraft process (linna emulate --live --state)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")
@@ -163,8 +163,6 @@ class _Writer:
             return [kind.__name__, *([self.node(key), self.node(one)] for key, one in value.items())]
         if _SEQUENCES.get(kind.__name__) is kind:
             return [kind.__name__, *map(self.node, value)]
-        if kind is MappingProxyType:
-            return ["mapping", self.node(dict(value))]
         if kind is MethodType and isinstance(value.__self__, Trajectory):
             return ["trajectory", self.node(value.__self__)]
         if kind is np.random.Generator and isinstance(value.bit_generator, np.random.PCG64):
@@ -245,8 +243,6 @@ class _Reader:
             return _class(rest[0], Enum)(self.value(rest[1]))
         if kind in ("bytes", "bytearray"):
             return {"bytes": bytes, "bytearray": bytearray}[kind](self._octets[rest[0]])
-        if kind == "mapping":
-            return MappingProxyType(self.value(rest[0]))
         if kind == "trajectory":
             trajectory = self.value(rest[0])
             if not isinstance(trajectory, Trajectory):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import lru_cache
 from types import NoneType, UnionType
@@ -35,7 +35,6 @@ _EXPECTED = {
     "string_type": "a text",
     "tuple_type": "a list",
     "model_type": "a table",
-    "dict_type": "a table",
     "finite_number": "finite",
 }
 
@@ -113,8 +112,6 @@ def _annotation(hint: Any, name: str, bounds: Bounds | None) -> Any:
         return _annotation(only, name, bounds) | None
     if dataclasses.is_dataclass(hint):
         return _model(hint, bounds)  # type: ignore[arg-type]  # a class, not an instance
-    if origin is Mapping:
-        return dict[str, Any]
     if origin is tuple:
         several: Any = tuple  # mypy takes no computed types in brackets
         if inner[-1] is Ellipsis:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -55,10 +53,6 @@ from tmtc.cuc import TICKS_PER_SECOND
 CHUNK_S = 86_400.0
 """Time that the orbit is propagated at once; another division gives other last digits."""
 
-Samples = Mapping[str, FloatArray]
-"""Samples of each instrument by its name: rows, the on-board time first."""
-
-NO_SAMPLES: Samples = MappingProxyType({})
 _NS = 1_000_000_000
 _TICKS_NS = 200_000
 _EPHEMERIS_STEP_NS = 10 * _NS

@@ -25,7 +25,6 @@ _USUAL_REASON = {
     "gallery": "the pass has no images on the ground",
     "craters": "no catalogue was given for the map",
     "housekeeping": "no housekeeping packet was received",
-    "instruments": "no packet of an optional instrument was received",
     "events": "no event report was received",
     "consistency": "no estimator reported its own uncertainty",
     "drift": "no odometry was flown, or no path was long enough",

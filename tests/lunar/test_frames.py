@@ -19,11 +19,9 @@ from lunar.frames import (
     icrf_from_j2000,
     load_orientation,
     matrix_from_quaternion,
-    matrix_from_rotation_vector,
     mci_from_icrf,
     mcmf_from_spherical,
     quaternion_from_matrix,
-    rotation_vector_from_matrix,
     rtn_from_inertial,
     spherical_from_mcmf,
 )
@@ -172,18 +170,6 @@ def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
     back = quaternion_from_matrix(matrix)
     assert back[0] >= 0.0
     assert min(np.abs(back - q).max(), np.abs(back + q).max()) < 1e-12
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-3, 2.0, 3.1])
-def test_rotation_vectors_are_those_of_spice_and_survive_the_matrix(angle):
-    axis = np.array([0.36, -0.48, 0.8])
-    matrix = matrix_from_rotation_vector(angle * axis)
-    # SPICE axisar: rotates vectors about an axis, as here.
-    assert np.allclose(matrix, spiceypy.axisar(axis, angle), atol=1e-15)
-    assert np.allclose(rotation_vector_from_matrix(matrix), angle * axis, rtol=1e-9, atol=1e-15)
-    several = matrix_from_rotation_vector(np.zeros((2, 0, 3)))
-    assert several.shape == (2, 0, 3, 3)
-    assert rotation_vector_from_matrix(several).shape == (2, 0, 3)
 
 
 @pytest.mark.parametrize("axis", [1, 2, 3])

@@ -202,6 +202,13 @@ def test_an_archive_of_before_says_that_it_cannot_be_flown(copy: Path, tmp_path:
         replay_archive(copy, FlightBuild(), tmp_path / "out")
 
 
+def test_a_pass_with_a_withdrawn_instrument_is_refused_by_its_name(copy: Path, tmp_path: Path) -> None:
+    path = copy / "payload/inputs.jsonl"
+    path.write_text(path.read_text().replace('{"frame"', '{"instruments": {"altimeter": []}, "frame"', 1))
+    with pytest.raises(RecordError, match=r"inputs\.jsonl, line 1: .* found samples of altimeter"):
+        replay_archive(copy, FlightBuild(), tmp_path / "out")
+
+
 def test_a_parameter_of_older_code_is_dropped_and_told(copy: Path, tmp_path: Path) -> None:
     path = copy / "payload/parameters.toml"
     path.write_text(path.read_text().replace("[detector]\n", "[detector]\nforgotten = 3\n"))

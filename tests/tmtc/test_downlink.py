@@ -24,6 +24,12 @@ from tmtc.frames import Clcw, pack_clcw, unpack_clcw
 from tmtc.packets import PacketSequencer, pack_packet
 from tmtc.randomiser import randomise
 
+# Packet of the altimeter that the payload had until commit 7787a11f, from a recording.
+WITHDRAWN = bytes.fromhex(
+    "08aec000005b208110000000002e37acc8b4000000000001000037acc8b4000003000037acc8a780000046953a47c2e097e944840c4c000037ac"
+    "c8ac80000046951753c1a0a35e43eb070e000037acc8b180000046959823427dad7643d2dbfae2f3"
+)
+
 
 def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> list[bytes]:
     rng = np.random.default_rng(seed)
@@ -355,9 +361,10 @@ def test_packets_outside_the_dictionary_are_counted_as_unknown():
     from tmtc.crc import append_crc
 
     stranger = append_crc(pack_packet(0x55, bytes(30), sequence_count=0)[:-2])
-    decoded = decode(b"".join([*sent()[:5], stranger, *sent()[5:]]))
-    assert decoded.unknown == 1 and not decoded.complete
-    assert decoded.by_apid[0x55] == 1
+    decoded = decode(b"".join([*sent()[:5], stranger, WITHDRAWN, *sent()[5:]]))
+    assert decoded.unknown == 2 and not decoded.complete
+    assert decoded.by_apid[0x55] == decoded.by_apid[0x0AE] == 1
+    assert WITHDRAWN in set(decoded.cut.packets(decoded.buffer))
 
 
 def test_markers_without_frames_between_them_are_an_error_that_says_so():

@@ -53,7 +53,6 @@ from payload_emulator.flight.navigation.landmark_map import (
 )
 from payload_emulator.flight.navigation.lost_in_space import PlaceIndex, place_index
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.flight.navigation.scalar import Innovation, ScalarMeasurement, scalar_update
 from payload_emulator.flight.navigation.sighting import (
     LandmarkMap,
     Pose,
@@ -158,17 +157,11 @@ class Observation:
         Detections; None where there was no usable image.
     camera_from_icrf
         Attitude, shape (3, 3); None where the ADCS gave none: the frame is then coasted over.
-    attitude_sigma_rad
-        Standard deviation of this attitude, per axis; None: as in the parameters.
-    attitude_error
-        How the error of this attitude depends on that of the frame before; None: it is independent in each frame.
     """
 
     ticks: int
     found: Detections | None
     camera_from_icrf: FloatArray | None
-    attitude_sigma_rad: float | None = None
-    attitude_error: kalman.AttitudeError | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,7 +280,6 @@ def step(
     that left the plausible distances from the Moon is replaced by the uploaded initial state.
     """
     found, camera_from_icrf = observation.found, observation.camera_from_icrf
-    setup = _with_attitude_sigma(setup, observation.attitude_sigma_rad)
     declared_rad = setup.parameters.errors.attitude_noise_rad
     setup = _with_attitude_sigma(setup, state.attitude.sigma_rad(declared_rad))
     parameters = setup.parameters
@@ -300,8 +292,6 @@ def step(
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
     state, decided = _entered(state, prior, observation, setup)
     decided = replace(decided, attitude_declared_rad=declared_rad)
-    error = _scaled(observation.attitude_error, parameters.errors.attitude_noise_rad, declared_rad)
-    state = replace(state, estimate=kalman.with_attitude_error(state.estimate, error))
     if found is None:
         return state, _report(state, setup, Outcome.no_image, mcmf_from_icrf, decided)
     if camera_from_icrf is None or not len(found):
@@ -334,28 +324,6 @@ def step(
     return state, _report(state, setup, outcome, mcmf_from_icrf, decided)
 
 
-def measured(
-    state: AnchoredState, measurement: ScalarMeasurement, setup: AnchoredSetup
-) -> tuple[AnchoredState, Innovation | None]:
-    """Return the state after a scalar measurement, and its innovation; None where it cannot be predicted.
-
-    A measurement before the time of the estimate is not used. The state stays as it is where a measurement is not used.
-    """
-    estimate, parameters = state.estimate, setup.parameters
-    mcmf_from_icrf = setup.model.mcmf_from_icrf(measurement.ticks)
-    if measurement.ticks < estimate.ticks or mcmf_from_icrf is None:
-        return state, None
-    prior = predicted(estimate, measurement.ticks, setup.model, setup.burns, parameters.errors)
-    if prior is None or not is_usable(prior, parameters.limits):
-        return state, None
-    prediction = measurement.model(prior, mcmf_from_icrf, state.landmarks)
-    result = None if prediction is None else scalar_update(prior, measurement, prediction)
-    if result is None:
-        return state, None
-    estimate, innovation = result
-    return replace(state, estimate=estimate) if innovation.used else state, innovation
-
-
 def widened(state: AnchoredState, sigma_position_m: float, sigma_velocity_m_s: float) -> AnchoredState:
     """Return the state with more uncertainty per axis, after an event outside dynamics and burns such as a restart."""
     estimate = kalman.widened(state.estimate, sigma_position_m, sigma_velocity_m_s)
@@ -367,21 +335,9 @@ def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
     return not state.estimate.finite or state.estimate.position_sigma_m > parameters.divergence_limit_m
 
 
-def _with_attitude_sigma(setup: AnchoredSetup, sigma_rad: float | None) -> AnchoredSetup:
-    if sigma_rad is None:
-        return setup
+def _with_attitude_sigma(setup: AnchoredSetup, sigma_rad: float) -> AnchoredSetup:
     errors = replace(setup.parameters.errors, attitude_noise_rad=sigma_rad)
     return replace(setup, parameters=replace(setup.parameters, errors=errors))
-
-
-def _scaled(
-    error: kalman.AttitudeError | None, used_rad: float, declared_rad: float
-) -> kalman.AttitudeError | None:
-    """Return the attitude error with its covariances scaled from the declared to the used standard deviation."""
-    if error is None or not used_rad > declared_rad > 0.0:
-        return error
-    factor = (used_rad / declared_rad) ** 2
-    return kalman.AttitudeError(factor * error.covariance, error.memory, factor * error.added)
 
 
 def _entered(
@@ -423,7 +379,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
         tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
         return Search(prior, fix, tried if fix is None else fix.identification.candidates, expected)
     sighting = in_view(landmarks, pose, camera, search_margin_px(prior, camera, parameters.limits))
-    prior = prior.only_craters(np.append(sighting.index, kalman.TURN))
+    prior = prior.only_craters(sighting.index)
     sighting = look(landmarks, sighting.index, pose, camera, prior.shifts(sighting.index))
     if not len(sighting):
         return Search(prior, None, 0, 0)
@@ -459,9 +415,7 @@ def rotation_evidence(
             prior, parameters
         ):
             return None
-        wide = replace(state, estimate=kalman.with_attitude_error(prior, None))
-        tried = search_around(wide, pose, found, _with_attitude_sigma(setup, trial_rad))
-        fix = tried.fix
+        fix = search_around(state, pose, found, _with_attitude_sigma(setup, trial_rad)).fix
     if fix is None or len(fix.index) < parameters.monitor.least_craters:
         return None
     return replace(fix.update.rotation, trial=disagrees)
@@ -537,7 +491,7 @@ def map_frame(
     pose = kalman.pose_of(state.estimate, camera_from_icrf, mcmf_from_icrf)
     seen = in_view(landmarks, pose, setup.camera, parameters.limits.map_margin_px)
     listed = landmarks.ids[seen.index] < FIRST_LANDMARK_ID
-    used, turn_rad = _NO_CRATERS, mean[kalman.ATTITUDE] + kalman.turn_of(state.estimate)
+    used, turn_rad = _NO_CRATERS, mean[kalman.ATTITUDE]
     sigma_rad = math.hypot(parameters.errors.attitude_bias_rad, parameters.errors.attitude_noise_rad)
     if fix is not None:
         used = fix.identification.detection[landmarks.ids[fix.index] < FIRST_LANDMARK_ID]

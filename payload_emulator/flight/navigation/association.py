@@ -55,8 +55,6 @@ def associate(
     count = len(sighting)
     design = kalman.design_matrix(sighting, prior).reshape(2 * count, prior.mean.size)
     tilt = sighting.by_attitude.reshape(2 * count, 3) * parameters.errors.attitude_noise_rad
-    if int(prior.slots(kalman.TURN)[0]) >= 0:  # the attitude error is among the states
-        tilt = np.zeros_like(tilt)
     spread = (design @ prior.covariance @ design.T + tilt @ tilt.T).reshape(count, 2, count, 2)
     place = (
         sighting.by_position

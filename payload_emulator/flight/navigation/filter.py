@@ -6,8 +6,7 @@ for each crater that was used and is still in view: its offset from its catalogu
 is observed several times on a pass with the same error, so its error is a state and not independent noise; the state is
 removed when the crater leaves the view. The attitude error of a frame, one rotation for all its detections, is a state
 during an update: it is observable in a wide field of view, and the projection is too nonlinear over a degree to treat
-it as noise about the measured attitude. Where the source of the attitude states how much of the error remains from one
-frame to the next (`AttitudeError`), it is a state from frame to frame.
+it as noise about the measured attitude.
 """
 
 from __future__ import annotations
@@ -68,25 +67,6 @@ class CommonErrors:
     catalogue_correlation_rad: float = float(np.radians(30.0))
     scale: float = 0.0
     scale_sigma: float = 5e-4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AttitudeError:
-    """Error of the attitude of a frame, a rotation vector e in camera axes: e = M e(frame before) + new part.
-
-    Attributes
-    ----------
-    covariance
-        Of e, shape (3, 3).
-    memory
-        M, shape (3, 3): identity where the error lasts, zero where it is independent in each frame.
-    added
-        Covariance of the new part, shape (3, 3): covariance - M covariance(frame before) M'.
-    """
-
-    covariance: FloatArray
-    memory: FloatArray
-    added: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,32 +219,6 @@ def widened(state: FilterState, sigma_position_m: float, sigma_velocity_m_s: flo
     return FilterState(state.ticks, state.mean, covariance, state.craters)
 
 
-def with_attitude_error(state: FilterState, error: AttitudeError | None) -> FilterState:
-    """Return the state with the attitude error of the present frame; None: it does not depend on former frames."""
-    turn = int(state.slots(TURN)[0])
-    if error is None:
-        return state if turn < 0 else state.only_craters(state.craters[state.craters != TURN[0]])
-    if turn < 0:
-        state = state.with_craters(TURN, np.zeros((1, 3)))
-        turn = int(state.slots(TURN)[0])
-        memory, added = np.zeros((3, 3)), error.covariance
-    else:
-        memory, added = error.memory, error.added
-    part = slice(turn, turn + 3)
-    mean, covariance = state.mean.copy(), state.covariance.copy()
-    mean[part] = memory @ mean[part]
-    covariance[part] = memory @ covariance[part]
-    covariance[:, part] = covariance[:, part] @ memory.T
-    covariance[part, part] += added
-    return FilterState(state.ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
-
-
-def turn_of(state: FilterState) -> FloatArray:
-    """Return the estimated attitude error of the frame, rotation vector (3,); zero where it is not a state."""
-    turn = int(state.slots(TURN)[0])
-    return np.zeros(3) if turn < 0 else state.mean[turn : turn + 3]
-
-
 def transition_to(
     state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
 ) -> tuple[FloatArray | None, FloatArray, FloatArray]:
@@ -292,12 +246,12 @@ def transition_to(
 
 def pose_of(state: FilterState, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray) -> Pose:
     """Return the camera pose that a filter state stands for."""
-    mean = state.mean
+    mean, turn = state.mean, int(state.slots(TURN)[0])
     return Pose(
         mean[POSITION],
         camera_from_icrf,
         mcmf_from_icrf,
-        mean[ATTITUDE] + turn_of(state),
+        mean[ATTITUDE] if turn < 0 else mean[ATTITUDE] + mean[turn : turn + 3],
         mean[PIXEL],
         mean[OFFSET],
         float(mean[SCALE]),
@@ -343,11 +297,9 @@ def update(
     index, uv_px
         Craters (into the map) and where they were detected, shapes (n,) and (n, 2).
     variance_px2
-        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, comes from `errors`
-        if the prior has no attitude error that depends on former frames.
+        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, comes from `errors`.
     """
     count = 2 * index.size
-    lasting = int(prior.slots(TURN)[0]) >= 0
     prior = prior.with_craters(TURN, np.full((1, 3), errors.attitude_noise_rad))
     turn = int(prior.slots(TURN)[0])
     noise: FloatArray = np.diag(np.repeat(variance_px2, 2))
@@ -392,7 +344,7 @@ def update(
     if not state.finite:
         return None
     return Update(
-        state if lasting else with_attitude_error(state, None),
+        state.only_craters(state.craters[state.craters != TURN[0]]),
         nis,
         mean_innovation,
         uv_px - after.uv_px,

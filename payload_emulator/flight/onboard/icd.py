@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 
-from payload_emulator.flight.instruments import flight_instruments
 from payload_emulator.flight.onboard.modes import ALL_MODES, ALLOWED, TRANSITIONS, PayloadMode
 from payload_emulator.flight.ports import SENSORS, Board, Load, ResetCause, Stage
 from payload_emulator.flight.telemetry.store import SHARES, StoreClass
@@ -28,8 +27,8 @@ The interfaces of Fig. 1 of the paper. Only arrays, counts and octets cross them
 
 ## A step
 
-The spacecraft calls `Payload.step(image, attitude, clock_ticks, telecommand_octets, instruments)` for every frame, and
-occasionally without an image. It returns telemetry packets. The last argument is optional.
+The spacecraft calls `Payload.step(image, attitude, clock_ticks, telecommand_octets)` for every frame, and
+occasionally without an image. It returns telemetry packets.
 
 | argument | from | content |
 |---|---|---|
@@ -37,7 +36,6 @@ occasionally without an image. It returns telemetry packets. The last argument i
 | attitude | ADCS | seven f64: q_wxyz of camera from ICRF, unit Sun vector in the camera frame; NaN where absent |
 | clock_ticks | OBDH | on-board time of the image, 2^-16 s |
 | telecommand_octets | TM/TC | telecommand packets received since the preceding step, concatenated |
-| instruments | instruments | by name, samples since the preceding frame, f64 (n, k); see "Instruments" |
 | returned | TM/TC | telemetry packets, at most `downlink_octets` in total |
 """
 
@@ -85,23 +83,7 @@ that used it (u16).
 
 def format_interfaces() -> str:
     """Return the payload part of the document in Markdown."""
-    return "\n".join(
-        [_STEP, *_instruments(), *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, _FAULTS]
-    )
-
-
-def _instruments() -> list[str]:
-    """Return the columns of the samples of each optional instrument."""
-    lines = [
-        "## Instruments\n",
-        "Optional. One row per sample in time order, up to the time of the frame. The packet of the same name reports "
-        "their use.\n",
-        "| instrument | columns | gives attitude |\n|---|---|---|",
-    ]
-    for name, instrument in flight_instruments().items():
-        gives = "in place of the ADCS" if instrument.gives_attitude else "no"
-        lines.append(f"| {name} | {', '.join(instrument.columns)} | {gives} |")
-    return [*lines, ""]
+    return "\n".join([_STEP, *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, _FAULTS])
 
 
 def _ports() -> list[str]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
@@ -62,8 +61,6 @@ class FlightParameters:
         Whether a time report is sent each 16 frames of telemetry until it is changed by telecommand.
     scrub_interval_s
         Time between checks of memory until it is changed by telecommand.
-    instruments
-        Parameters of each installed instrument by name.
     """
 
     camera: PinholeCamera = field(default_factory=PinholeCamera)
@@ -71,11 +68,10 @@ class FlightParameters:
     odometry: OdometryParameters = field(default_factory=OdometryParameters)
     anchored: AnchoredParameters = field(default_factory=AnchoredParameters)
     housekeeping_interval_s: float = 60.0
-    # Without reports and instruments the text, and so the hash in telemetry, is that of builds that knew none.
+    # Without reports the text, and so the hash in telemetry, is that of builds that knew none.
     image_reports: bool = field(default=False, repr=False)
     time_reports: bool = field(default=False, repr=False)
     scrub_interval_s: float = field(default=60.0, repr=False)
-    instruments: Mapping[str, Any] = field(default_factory=dict, repr=False, hash=False)
 
     @property
     def hash(self) -> int:
@@ -85,9 +81,8 @@ class FlightParameters:
     @property
     def sha256(self) -> str:
         """SHA-256 of the parameters as text, hexadecimal."""
-        installed = "".join(f"{name}={self.instruments[name]!r}" for name in sorted(self.instruments))
-        installed += "image_reports" if self.image_reports else ""
-        return hashlib.sha256((repr(self) + installed).encode()).hexdigest()
+        reports = "image_reports" if self.image_reports else ""
+        return hashlib.sha256((repr(self) + reports).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
-from payload_emulator.flight.instruments import AttitudeEstimate
 from payload_emulator.flight.navigation import anchored, odometry
 from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored import (
@@ -25,14 +24,6 @@ from payload_emulator.flight.navigation.landmark_map import map_rows
 from payload_emulator.flight.navigation.odometry import OdometryState
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.housekeeping import StageTimer
-from payload_emulator.flight.onboard.instrument_suite import (
-    NO_SAMPLES,
-    FrameReadings,
-    Samples,
-    packets,
-    read_frame,
-    start_suite,
-)
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS, FlightParameters, FlightTables
 from payload_emulator.flight.ports import Stage
 from payload_emulator.flight.telemetry.packets import Telemetry
@@ -103,7 +94,6 @@ class Observer:
         self._anchored: AnchoredState | None = None
         self._in_trouble: set[str] = set()
         self._tables = FlightTables()
-        self._instruments = start_suite(parameters.instruments)
 
     @property
     def anchor_reads(self) -> int:
@@ -120,7 +110,6 @@ class Observer:
     def reset(self) -> None:
         """Forget all estimates; each estimator starts from its tables."""
         self._odometry.clear()
-        self._instruments = start_suite(self._parameters.instruments)
         self._start_navigator()
 
     def widen(self, position_m: float, velocity_m_s: float) -> None:
@@ -135,18 +124,15 @@ class Observer:
         score_floor: float,
         timeout_s: float,
         quiet: bool,
-        samples: Samples = NO_SAMPLES,
     ) -> None:
         """Detect craters in one frame, run every estimator on them, report both.
 
-        `quiet` leaves out the event about the quality of the image; `samples` are those of the instruments.
+        `quiet` leaves out the event about the quality of the image.
         """
         telemetry = self._telemetry
         sun = attitude[4:7] if attitude.size == 7 and np.all(np.isfinite(attitude[4:7])) else None
-        self._instruments, readings = read_frame(
-            self._parameters.instruments, self._instruments, samples, telemetry.ticks, _rotation(attitude)
-        )
-        if readings.attitude.camera_from_icrf is None:
+        camera_from_icrf = _rotation(attitude)
+        if camera_from_icrf is None:
             telemetry.event("low", "attitude_missing")
         quality, found = self._detect(image, sun, timeout_s)
         found = self._with_sizes(found)
@@ -161,13 +147,12 @@ class Observer:
                 telemetry.event("low", f"image_{quality.name.lower()}")
         self._timer.enter(Stage.navigation)
         altitude_m = _NAN
-        self._measure(readings)
         for mode in self._parameters.modes:
             if mode is Mode.anchored:
                 reason = "detector failed" if self.detector_failed else quality.name.lower()
                 if reason != "ok":
                     self._no_image[reason] += 1
-                below_m = self._anchored_frame(found if reason == "ok" else None, readings.attitude)
+                below_m = self._anchored_frame(found if reason == "ok" else None, camera_from_icrf)
             else:
                 below_m = self._odometry_frame(mode, found)
             altitude_m = below_m if np.isfinite(below_m) else altitude_m
@@ -263,26 +248,12 @@ class Observer:
                 burns,
             )
 
-    def _measure(self, readings: FrameReadings) -> None:
-        """Give the anchored estimator what instruments measured before the frame, and report each instrument."""
-        innovations = []
-        for _, _, measurement in readings.measurements:
-            innovation = None
-            if self._setup is not None and self._anchored is not None:
-                self._anchored, innovation = anchored.measured(self._anchored, measurement, self._setup)
-            innovations.append(innovation)
-        telemetry = self._telemetry
-        for name, values in packets(readings, innovations, telemetry.frame_number, telemetry.ticks):
-            telemetry.send(name, values)
-
-    def _anchored_frame(self, found: Detections | None, attitude: AttitudeEstimate) -> float:
+    def _anchored_frame(self, found: Detections | None, camera_from_icrf: FloatArray | None) -> float:
         """Run the anchored estimator on one frame, report it, and return its altitude."""
         mode, detections = Mode.anchored, 0 if found is None else len(found)
         report = None
         if self._setup is not None and self._anchored is not None:
-            observation = Observation(
-                self._telemetry.ticks, found, attitude.camera_from_icrf, attitude.sigma_rad, attitude.error
-            )
+            observation = Observation(self._telemetry.ticks, found, camera_from_icrf)
             try:
                 self._anchored, report = anchored.step(self._anchored, observation, self._setup)
             except np.linalg.LinAlgError:

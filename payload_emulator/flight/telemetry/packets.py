@@ -10,7 +10,6 @@ from typing import Any
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
-from tmtc.instruments import instrument_telemetry
 from tmtc.packets import PacketSequencer, unpack_primary_header
 
 _CLASSES = {
@@ -23,7 +22,6 @@ _CLASSES = {
     "large_data_first": StoreClass.bulk,
     "large_data_middle": StoreClass.bulk,
     "large_data_last": StoreClass.bulk,
-    **{instrument.name: StoreClass.navigation for instrument in instrument_telemetry()},
 }
 _CRITICAL_SERVICES = (1, 5)
 _EVENT_CODES = {name: code for code, name in DICTIONARY.labels("event_info", "event_id").items()}

@@ -20,6 +20,7 @@ from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, e
 from ground_service.evaluation.detection.fixes import IdentificationSamples
 from ground_service.evaluation.detection.landmarks import MappedCraters
 from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates
 from ground_service.evaluation.verdict import Limits
@@ -780,6 +781,8 @@ def test_what_is_given_is_passed_on() -> None:
 
 def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None:
     summary = summary_of(report)
+    stored = {**summary, "instruments": {"altimeter": {"samples": 3}}}  # as older versions stored it
+    assert PassFigures.model_validate(stored) == PassFigures.model_validate(summary)
     paper_of = series(report, "paper")
     named = {
         "pass_id": "7", "frames": 11, "packets": 1900, "packets_lost": 100, "packets_expected": 2000,
@@ -790,7 +793,6 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
     assert set(summary) == {
         *named,
         "detector",
-        "instruments",
         "navigation",
         "requirements",
         "error_budget",

@@ -711,51 +711,6 @@ def test_a_search_without_a_prior_covers_the_predicted_altitude() -> None:
     assert high == replace(parameters.lost, maximum_altitude_m=pytest.approx(180e3))
 
 
-def test_an_attitude_error_among_the_states_counts_once_in_the_spread(
-    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 3)
-    prior = navigator.estimate
-    pose = Pose(prior.mean[:3], orbit.attitude(2), orbit.rotations[2], np.zeros(3), np.zeros(2), np.zeros(3))
-    landmarks, parameters = navigator.state.landmarks, navigator.setup.parameters
-    sighting = in_view(landmarks, pose, orbit.case.camera, 0.0)
-    calls = recorded(monkeypatch, association, "identify", "pairs")
-    variance = parameters.errors.attitude_noise_rad**2 * np.eye(3)
-    with_error = kalman.with_attitude_error(prior, kalman.AttitudeError(variance, np.eye(3), variance))
-    found = orbit.detections(2)
-    for state in (prior, with_error):
-        association.associate(state, sighting, found, landmarks, orbit.case.camera, parameters)
-    # White in each frame or a state that nothing else depends on: the same spread.
-    np.testing.assert_allclose(calls[1][2], calls[0][2], rtol=1e-9, atol=1e-9)
-
-
-def test_a_lasting_attitude_error_stays_among_the_states_and_is_estimated(orbit: Orbit) -> None:
-    turn = np.array([2e-3, -1e-3, 1.5e-3])
-    variance, nothing = 4e-6 * np.eye(3), np.zeros((3, 3))
-
-    def observed(error: kalman.AttitudeError | None) -> FilterState:
-        navigator = orbit.navigator()
-        for k in range(6):
-            observation = Observation(
-                orbit.ticks[k],
-                orbit.detections(k),
-                Rotation.from_rotvec(turn).as_matrix() @ orbit.attitude(k),
-                2e-3,
-                error,
-            )
-            state, report = anchored.step(navigator.state, observation, navigator.setup)
-            navigator.state = state
-            assert report.outcome is Outcome.fixed
-        return navigator.estimate
-
-    lasting = observed(kalman.AttitudeError(variance, np.eye(3), nothing))
-    white = observed(None)
-    assert lasting.slots(kalman.TURN)[0] >= 0 and white.slots(kalman.TURN)[0] < 0
-    # The true attitude is the given one turned back.
-    np.testing.assert_allclose(np.abs(kalman.turn_of(lasting)), np.abs(turn), atol=5e-4)
-
-
 def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(
     orbit: Orbit, monkeypatch: pytest.MonkeyPatch
 ) -> None:

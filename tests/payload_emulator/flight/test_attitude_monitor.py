@@ -235,18 +235,6 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     assert (report.attitude_declared_rad, report.attitude_noise_rad) == (DECLARED, noise)
 
 
-def test_a_lasting_attitude_error_is_scaled_to_the_noise_that_is_used() -> None:
-    error = kalman.AttitudeError(np.eye(3), 0.5 * np.eye(3), 0.75 * np.eye(3))
-    scaled = anchored._scaled(error, 3e-3, 1e-3)
-    assert scaled is not None
-    np.testing.assert_allclose(scaled.covariance, 9.0 * np.eye(3))
-    np.testing.assert_allclose(scaled.added, 6.75 * np.eye(3))
-    np.testing.assert_allclose(scaled.memory, error.memory)
-    for used, declared in ((1e-3, 1e-3), (1e-3, 0.0)):
-        assert anchored._scaled(error, used, declared) is error
-    assert anchored._scaled(None, 3e-3, 1e-3) is None
-
-
 def looks(case: NavigationCase, state: FloatArray, rotation: FloatArray) -> tuple[FloatArray, Any]:
     return (
         nadir_camera_from_mcmf(rotation @ state[:3]) @ rotation,
