@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from lunar.constants import MOON_RADIUS_M
 from lunar.errors import LunarError
+from lunar.plausible import CAMERA_FIELD_DEG, CAMERA_PIXELS, MAP_SHIFT_M
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import Record, TableFault, read_table, toml_text
@@ -472,10 +474,7 @@ def _read(kind: type[Record], table: object, source: str, path: str = "") -> Rec
 
 ESTIMATORS = ("paper", "spherical", "anchored")
 
-LARGEST_REGISTRATION_M = 5_000.0
-"""More than any offset between published lunar height models."""
-
-_MOON_RADIUS_KM = 1737.4
+_MOON_RADIUS_KM = MOON_RADIUS_M / 1e3
 
 
 class Require(Protocol):
@@ -553,9 +552,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "dynamics.degree": (2, 1200),
     "dynamics.solar_area_to_mass_m2_kg": (0.0, 1e3),
     "dynamics.solar_reflection": (0.0, 2.0),
-    "camera.width_px": (16, 8192),
-    "camera.height_px": (16, 8192),
-    "camera.fov_deg": (1.0, 170.0),
+    "camera.width_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
+    "camera.height_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
+    "camera.fov_deg": (CAMERA_FIELD_DEG.low, CAMERA_FIELD_DEG.high),
     "camera.tilt_deg": (-60.0, 60.0),
     "camera.frame_interval_s": (_POSITIVE, _ANY),
     "window.passes": (1, _ANY),
@@ -608,7 +607,7 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
         require(
             perilune_km > _MOON_RADIUS_KM,
             "orbit.semi_major_axis_km and eccentricity",
-            "an orbit above the ground (perilune radius over 1737.4 km)",
+            f"an orbit above the ground (perilune radius over {_MOON_RADIUS_KM} km)",
             round(perilune_km, 3),
         )
 
@@ -642,9 +641,9 @@ def _check_window(scenario: Scenario, require: Require) -> None:
 def _check_terrain(scenario: Scenario, require: Require) -> None:
     shift = scenario.terrain.registration_north_east_m
     require(
-        not shift or (len(shift) == 2 and max(map(abs, shift)) <= LARGEST_REGISTRATION_M),
+        not shift or (len(shift) == 2 and max(map(abs, shift)) <= MAP_SHIFT_M),
         "terrain.registration_north_east_m",
-        f"empty or two numbers of at most {LARGEST_REGISTRATION_M:g} m",
+        f"empty or two numbers of at most {MAP_SHIFT_M:g} m",
     )
     require(
         not shift or scenario.terrain.source in ("auto", "raster", "photograph"),

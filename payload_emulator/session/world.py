@@ -23,6 +23,7 @@ from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
 from lunar.messages.oem import load_oem
+from lunar.plausible import HEIGHT_M
 from lunar.propagation import ForceModel
 from lunar.timescales import (
     format_utc,
@@ -71,8 +72,6 @@ REGISTRATION = "crater list "
 """Start of the name that says where the crater list is registered to the terrain."""
 # Rims within this of the frames tell the registration where no product does: a 15 degree tile.
 _REGISTERED_DEG = 7.5
-# No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
-_HIGHEST_GROUND_M = 12_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +156,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
         )
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     _register(terrain, truth, frame_utc_ns)
-    require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
+    require_above_ground(truth, frame_utc_ns, terrain.height_m, HEIGHT_M.high)
     names = _names(terrain, model, truth, frame_utc_ns)
     return World(scenario, truth, terrain, model, burns, frame_utc_ns, names)
 
@@ -174,7 +173,7 @@ def _external_world(
             f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
         )
     _register(terrain, truth, external.utc_ns)
-    require_above_ground(truth, external.utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
+    require_above_ground(truth, external.utc_ns, terrain.height_m, HEIGHT_M.high)
     names = (
         f"external images {external.files[0].parent.name}",
         *_names(terrain, model, truth, external.utc_ns),
