@@ -56,7 +56,7 @@ class ExternalFrames:
         """
         path = self.files[int(np.searchsorted(self.utc_ns, utc_ns))]
         try:
-            image = read_picture(path)
+            image, _ = read_picture(path)
         except DatasetError as error:
             raise ScenarioError(str(error)) from None
         width_px, height_px = self.size_px

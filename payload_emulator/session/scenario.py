@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -393,7 +393,8 @@ def load_scenario(path: Path | str) -> Scenario:
     Raises
     ------
     ScenarioError
-        The file is missing, no TOML, has unknown keys, values of a wrong type or an impossible orbit.
+        The file is missing, no TOML, has unknown keys, values of a wrong type, an impossible orbit, or a key without
+        effect.
     """
     where = shipped_file(Path(path))
     try:
@@ -405,11 +406,16 @@ def load_scenario(path: Path | str) -> Scenario:
         raise ScenarioError(
             f"{where}: expected UTF-8 text, found octet {error.object[error.start]:#04x} at {error.start}"
         ) from None
-    return parse_scenario(text, source=str(where))
+    scenario = parse_scenario(text, source=str(where))
+    _check_unused(scenario, str(where))
+    return scenario
 
 
 def parse_scenario(text: str, source: str = "scenario") -> Scenario:
-    """The scenario written in `text`; `source` names it in error messages."""
+    """The scenario written in `text`; `source` names it in error messages.
+
+    Archives state every key, so keys without effect are allowed.
+    """
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -610,6 +616,98 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
             f"an orbit above the ground (perilune radius over {_MOON_RADIUS_KM} km)",
             round(perilune_km, 3),
         )
+
+
+_UNUSED: tuple[tuple[str, Callable[[Scenario], bool], str], ...] = (
+    ("without window.search = 'none'", lambda s: s.window.search != "none", "window.duration_s"),
+    (
+        "where window.search is 'none'",
+        lambda s: s.window.search == "none",
+        "window.passes window.direction window.longitude_min_deg window.longitude_max_deg window.search_days",
+    ),
+    (
+        "with orbit.oem",
+        lambda s: bool(s.orbit.oem),
+        " ".join(f"orbit.{key}" for key in (*_ELEMENT_KEYS, "frame"))
+        + " window.search_days dynamics.earth dynamics.sun dynamics.integrator dynamics.solar_area_to_mass_m2_kg"
+        " maneuvers.periselene_altitude_km maneuvers.semi_major_axis_km maneuvers.eccentricity",
+    ),
+    (
+        "without dynamics.solar_area_to_mass_m2_kg",
+        lambda s: s.dynamics.solar_area_to_mass_m2_kg == 0.0,
+        "dynamics.solar_reflection",
+    ),
+    (
+        "without maneuvers.enabled",
+        lambda s: not s.maneuvers.enabled,
+        "maneuvers.periselene_altitude_km maneuvers.semi_major_axis_km maneuvers.eccentricity",
+    ),
+    (
+        "without burns",
+        lambda s: not s.maneuvers.enabled and s.disturbances.burn_delta_v_m_s == 0.0,
+        "maneuvers.execution_error_fraction",
+    ),
+    (
+        "with reduced images",
+        lambda s: s.camera.images == "reduced",
+        "light.photometry " + " ".join(f"sensor.{item.name}" for item in dataclasses.fields(SensorModel)),
+    ),
+    ("where the light is that of photographs", lambda s: bool(s.terrain.photographs), "light.photometry"),
+    (
+        "where light.mode is 'real'",
+        lambda s: s.light.mode == "real",
+        "light.elevation_min_deg light.elevation_max_deg light.azimuth_min_deg light.azimuth_max_deg",
+    ),
+    (
+        "with navigation.anchoring_catalogue",
+        lambda s: bool(s.navigation.anchoring_catalogue),
+        "navigation.catalogue_error_fraction_of_diameter navigation.catalogue_height_error_m",
+    ),
+    (
+        "without navigation.catalogue_distortion_m",
+        lambda s: s.navigation.catalogue_distortion_m == 0.0,
+        "navigation.catalogue_distortion_deg",
+    ),
+    (
+        "without disturbances.kidnap_distance_km",
+        lambda s: s.disturbances.kidnap_distance_km == 0.0,
+        "disturbances.kidnap_at_s disturbances.kidnap_told",
+    ),
+    (
+        "without disturbances.outage_duration_s",
+        lambda s: s.disturbances.outage_duration_s == 0.0,
+        "disturbances.outage_at_s",
+    ),
+    (
+        "without disturbances.burn_delta_v_m_s",
+        lambda s: s.disturbances.burn_delta_v_m_s == 0.0,
+        "disturbances.burn_at_s disturbances.burn_declared",
+    ),
+    (
+        "without link.burst_start",
+        lambda s: s.link.burst_start == 0.0,
+        "link.burst_end link.burst_frame_loss link.burst_bit_error_rate",
+    ),
+    (
+        "without link.stations",
+        lambda s: not s.link.stations,
+        "link.playback link.outages link.missed",
+    ),
+)
+"""Keys that have no effect: in which case, whether a scenario is one, which."""
+
+
+def _check_unused(scenario: Scenario, source: str) -> None:
+    """Refuse keys that are stated otherwise than by default and have no effect."""
+    default = Scenario("")
+    for words, is_case, keys in _UNUSED:
+        for key in keys.split() if is_case(scenario) else ():
+            section, _, name = key.partition(".")
+            found = getattr(getattr(scenario, section), name)
+            if found != getattr(getattr(default, section), name):
+                raise ScenarioError(
+                    f"{source}: {key} has no effect {words}: expected it left out, found {found!r}"
+                )
 
 
 def _check_window(scenario: Scenario, require: Require) -> None:
