@@ -156,12 +156,17 @@ def configure_visibility(commands: Any) -> None:
 
 def run_visibility(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
+    from linna.errors import UsageError
     from lunar.contacts import visibility_spans
     from lunar.datafolder import default_orientation
     from lunar.messages.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     stations = tuple(_station(text) for text in arguments.station)
+    if len({one.name for one in stations}) < len(stations):
+        raise UsageError(
+            f"--station: expected names of their own, found {', '.join(one.name for one in stations)}"
+        )
     orientation = default_orientation(data_folder())
     ephemeris = load_ephemeris(arguments.ephemeris)
     found = visibility_spans(ephemeris, orientation, stations, arguments.step)

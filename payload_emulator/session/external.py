@@ -152,6 +152,11 @@ def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
             raise ScenarioError(f"{path}, line {line}: expected a time after the line before, found {text}")
         if not (folder / name).is_file():
             raise ScenarioError(f"{path}, line {line}: expected the image {folder / name}, found none")
+        if folder / name in files:
+            first = files.index(folder / name) + 2
+            raise ScenarioError(
+                f"{path}, lines {first} and {line}: expected an image of its own, found {name} twice"
+            )
         files.append(folder / name)
     if not files:
         raise ScenarioError(f"{path}: expected at least one frame, found none")

@@ -546,8 +546,9 @@ def _check(scenario: Scenario, source: str) -> None:
         parse_fault(text)
     for text in (*scenario.link.outages, *scenario.link.missed):
         parse_outage(text)
-    for text in scenario.link.clock_errors:
-        parse_clock_error(text)
+    clocks = [parse_clock_error(text)[0] for text in scenario.link.clock_errors]
+    for key, names in (("link.stations", scenario.link.stations), ("link.clock_errors", clocks)):
+        require(len(set(names)) == len(names), key, "one entry for each station", list(names))
     require(0 <= scenario.spacecraft_id < 1024, "spacecraft_id", "from 0 to 1023", scenario.spacecraft_id)
 
 

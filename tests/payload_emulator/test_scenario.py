@@ -106,6 +106,10 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ('name = "x"\n[camera]\nfov_deg = 180', "camera.fov_deg must be from 1 to 170"),
         ('name = "x"\n[window]\nsearch = "none"', "window.duration_s must be positive"),
         ("name = ", "not TOML"),
+        (
+            'name = "x"\n[link]\nclock_errors = ["madrid 1", "madrid 2"]',
+            "link.clock_errors must be one entry for each station, found ['madrid', 'madrid']",
+        ),
     ],
 )
 def test_what_cannot_be_flown_is_refused(text: str, message: str) -> None:

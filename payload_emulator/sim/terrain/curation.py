@@ -275,9 +275,11 @@ def _require_depths(craters: CraterCatalogue, fit: _Fit) -> None:
     TerrainError
         The heights have another scale.
     """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over_listed = fit.depth_m / craters.depth_m
     for share, of, limit in (
         (0.5 * fit.depth_m / fit.radius_m, "their diameters", Limit(-1.0, CRATER_DEPTH_RATIO.high, "")),
-        (fit.depth_m / craters.depth_m, "the depths in the list", LISTED_DEPTH_RATIO),
+        (over_listed, "the depths in the list", LISTED_DEPTH_RATIO),
     ):
         known = share[np.isfinite(share)]
         if known.size >= _MANY and not limit.holds(np.median(known)):
