@@ -619,93 +619,63 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
         )
 
 
-_UNUSED: tuple[tuple[str, Callable[[Scenario], bool], str], ...] = (
-    ("without window.search = 'none'", lambda s: s.window.search != "none", "window.duration_s"),
+_BURNS = "maneuvers periselene_altitude_km semi_major_axis_km eccentricity"
+_SEARCH = "window passes direction longitude_min_deg longitude_max_deg search_days"
+_PAPER_SUN = "light elevation_min_deg elevation_max_deg azimuth_min_deg azimuth_max_deg"
+_TABLE_ERRORS = "navigation catalogue_error_fraction_of_diameter catalogue_height_error_m"
+_SENSOR = " ".join(("sensor", *(item.name for item in dataclasses.fields(SensorModel))))
+_UNUSED: tuple[tuple[str, str, Callable[[Scenario], bool]], ...] = (
+    ("window duration_s", "without window.search = 'none'", lambda s: s.window.search != "none"),
+    (_SEARCH, "where window.search is 'none'", lambda s: s.window.search == "none"),
+    (f"orbit frame {' '.join(_ELEMENT_KEYS)}", "with orbit.oem", lambda s: bool(s.orbit.oem)),
+    ("dynamics earth sun integrator solar_area_to_mass_m2_kg", "with orbit.oem", lambda s: bool(s.orbit.oem)),
+    ("dynamics solar_reflection", "without a solar area", lambda s: not s.dynamics.solar_area_to_mass_m2_kg),
+    (_BURNS, "without maneuvers", lambda s: not s.maneuvers.enabled or bool(s.orbit.oem)),
     (
-        "where window.search is 'none'",
-        lambda s: s.window.search == "none",
-        "window.passes window.direction window.longitude_min_deg window.longitude_max_deg window.search_days",
-    ),
-    (
-        "with orbit.oem",
-        lambda s: bool(s.orbit.oem),
-        " ".join(f"orbit.{key}" for key in (*_ELEMENT_KEYS, "frame"))
-        + " window.search_days dynamics.earth dynamics.sun dynamics.integrator dynamics.solar_area_to_mass_m2_kg"
-        " maneuvers.periselene_altitude_km maneuvers.semi_major_axis_km maneuvers.eccentricity",
-    ),
-    (
-        "without dynamics.solar_area_to_mass_m2_kg",
-        lambda s: s.dynamics.solar_area_to_mass_m2_kg == 0.0,
-        "dynamics.solar_reflection",
-    ),
-    (
-        "without maneuvers.enabled",
-        lambda s: not s.maneuvers.enabled,
-        "maneuvers.periselene_altitude_km maneuvers.semi_major_axis_km maneuvers.eccentricity",
-    ),
-    (
+        "maneuvers execution_error_fraction",
         "without burns",
-        lambda s: not s.maneuvers.enabled and s.disturbances.burn_delta_v_m_s == 0.0,
-        "maneuvers.execution_error_fraction",
+        lambda s: not s.maneuvers.enabled and not s.disturbances.burn_delta_v_m_s,
+    ),
+    (_SENSOR, "with reduced images", lambda s: s.camera.images == "reduced"),
+    ("light photometry", "with reduced images", lambda s: s.camera.images == "reduced"),
+    ("light photometry", "with photographs", lambda s: bool(s.terrain.photographs)),
+    (_PAPER_SUN, "where light.mode is 'real'", lambda s: s.light.mode == "real"),
+    (_TABLE_ERRORS, "with anchoring_catalogue", lambda s: bool(s.navigation.anchoring_catalogue)),
+    (
+        "navigation catalogue_distortion_deg",
+        "without catalogue_distortion_m",
+        lambda s: not s.navigation.catalogue_distortion_m,
     ),
     (
-        "with reduced images",
-        lambda s: s.camera.images == "reduced",
-        "light.photometry " + " ".join(f"sensor.{item.name}" for item in dataclasses.fields(SensorModel)),
+        "disturbances kidnap_at_s kidnap_told",
+        "without kidnap_distance_km",
+        lambda s: not s.disturbances.kidnap_distance_km,
     ),
-    ("where the light is that of photographs", lambda s: bool(s.terrain.photographs), "light.photometry"),
+    ("disturbances outage_at_s", "without outage_duration_s", lambda s: not s.disturbances.outage_duration_s),
     (
-        "where light.mode is 'real'",
-        lambda s: s.light.mode == "real",
-        "light.elevation_min_deg light.elevation_max_deg light.azimuth_min_deg light.azimuth_max_deg",
-    ),
-    (
-        "with navigation.anchoring_catalogue",
-        lambda s: bool(s.navigation.anchoring_catalogue),
-        "navigation.catalogue_error_fraction_of_diameter navigation.catalogue_height_error_m",
+        "disturbances burn_at_s burn_declared",
+        "without burn_delta_v_m_s",
+        lambda s: not s.disturbances.burn_delta_v_m_s,
     ),
     (
-        "without navigation.catalogue_distortion_m",
-        lambda s: s.navigation.catalogue_distortion_m == 0.0,
-        "navigation.catalogue_distortion_deg",
+        "link burst_end burst_frame_loss burst_bit_error_rate",
+        "without burst_start",
+        lambda s: not s.link.burst_start,
     ),
-    (
-        "without disturbances.kidnap_distance_km",
-        lambda s: s.disturbances.kidnap_distance_km == 0.0,
-        "disturbances.kidnap_at_s disturbances.kidnap_told",
-    ),
-    (
-        "without disturbances.outage_duration_s",
-        lambda s: s.disturbances.outage_duration_s == 0.0,
-        "disturbances.outage_at_s",
-    ),
-    (
-        "without disturbances.burn_delta_v_m_s",
-        lambda s: s.disturbances.burn_delta_v_m_s == 0.0,
-        "disturbances.burn_at_s disturbances.burn_declared",
-    ),
-    (
-        "without link.burst_start",
-        lambda s: s.link.burst_start == 0.0,
-        "link.burst_end link.burst_frame_loss link.burst_bit_error_rate",
-    ),
-    (
-        "without link.stations",
-        lambda s: not s.link.stations,
-        "link.playback link.outages link.missed",
-    ),
+    ("link playback outages missed", "without link.stations", lambda s: not s.link.stations),
 )
-"""Keys that have no effect: in which case, whether a scenario is one, which."""
+"""Keys that have no effect (section, then keys), in which case, and whether a scenario is one."""
 
 
 def _check_unused(scenario: Scenario, source: str) -> None:
     """Refuse keys that are stated otherwise than by default and have no effect."""
     default = Scenario("")
-    for words, is_case, keys in _UNUSED:
-        for key in keys.split() if is_case(scenario) else ():
-            section, _, name = key.partition(".")
+    for keys, words, is_case in _UNUSED:
+        section, *names = keys.split() if is_case(scenario) else [""]
+        for name in names:
             found = getattr(getattr(scenario, section), name)
             if found != getattr(getattr(default, section), name):
+                key = f"{section}.{name}"
                 raise ScenarioError(
                     f"{source}: {key} has no effect {words}: expected it left out, found {found!r}"
                 )
