@@ -175,8 +175,7 @@ class RasterLayer:
     ) -> None:
         """The lattice has pixel centres at latitude ``90 - (row + 0.5 + north_offset) / ppd``, likewise longitude."""
         self.pixels_per_degree = pixels_per_degree
-        self.north_offset = files[0].row - _first(files[0].row)
-        self.west_offset = files[0].column - _first(files[0].column)
+        self.north_offset, self.west_offset = _offset(files[0].row), _offset(files[0].column)
         self.files = tuple(files)
         self.turn = 360.0 * pixels_per_degree
         self._chunks = chunks
@@ -348,16 +347,16 @@ def open_layers(
     for path in paths:
         ppd, file = _open_header(Path(path), heights)
         steps = 1.0 / SAME_LATTICE_PIXELS
-        offsets = (round((edge - _first(edge)) * steps) / steps + 0.0 for edge in (file.row, file.column))
+        offsets = (round(_offset(edge) * steps) / steps + 0.0 for edge in (file.row, file.column))
         groups.setdefault((ppd, *offsets), []).append(file)
     shared = ChunkCache() if chunks is None else chunks
     layers = [RasterLayer(key[0], files, shared, relief) for key, files in groups.items()]
     return sorted(layers, key=lambda layer: layer.pixels_per_degree)
 
 
-def _first(edge: float) -> int:
-    """Return the pixel of the lattice at an edge; half a pixel off always counts as plus a half."""
-    return math.ceil(edge - 0.5 - 1e-6)
+def _offset(edge: float) -> float:
+    """Return the offset of an edge from the lattice, -0.5 to 0.5; half a pixel off always counts as plus a half."""
+    return round(edge - math.ceil(edge - 0.5 - 1e-6), 6) + 0.0
 
 
 def _lattice_span(edge: float, count: int, first: int, wanted: int) -> tuple[int, int]:
@@ -535,8 +534,7 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     across = down = middle_deg = 0.0
     west, north = transform.c, transform.f
     if crs.is_geographic:
-        across = down = crs.units_factor[1] / math.radians(1.0)
-        across = down = 1.0 / across
+        across = down = math.radians(1.0) / crs.units_factor[1]
     elif values.get("proj") == "eqc" and values.get("lat_0", 0.0) == 0.0:
         unit_m = crs.linear_units_factor[1]
         down = degree / unit_m
