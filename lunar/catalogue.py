@@ -24,6 +24,7 @@ from lunar.compressed import read_expanded
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
+from lunar.plausible import CRATER_COVER, CRATER_DEPTH_RATIO, CRATER_DIAMETER_M, CRATER_MEDIAN_M, HEIGHT_M
 
 TWO_PI = 2.0 * math.pi
 
@@ -312,7 +313,8 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
     Raises
     ------
     DataFileError
-        If the file cannot be read, its columns are unknown, or a value is not a number or out of range.
+        If the file cannot be read, its columns are unknown, a value is not a number or out of range, two craters have
+        one id, or diameters, depths and places do not fit each other.
     """
     path = Path(path)
     columns = _read_columns(path)
@@ -321,7 +323,11 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
         if needed <= names:
             catalogue = reader(path, columns)
             _check_ranges(path, catalogue)
-            return _without_repetitions(catalogue)
+            kept = _first_of_repetitions(catalogue)
+            _check_identity(path, catalogue.ids, kept)
+            catalogue = catalogue.select(kept)
+            _check_whole(path, catalogue)
+            return catalogue
     known = "; ".join(", ".join(sorted(needed)) for _, needed in _READERS)
     raise DataFileError(
         path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing"
@@ -423,35 +429,58 @@ def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool
         raise
 
 
-def _flags(texts: list[str]) -> BoolArray:
-    return np.array([text.strip().lower() in ("1", "true") for text in texts], dtype=np.bool_)
+def _places(path: Path, columns: dict[str, list[str]], latitude: str, longitude: str) -> list[FloatArray]:
+    """Return latitudes and longitudes in radians of columns in degrees."""
+    angles = []
+    for name, low, high in ((latitude, -90.0, 90.0), (longitude, -360.0, 720.0)):
+        values = _numbers(path, columns, name)
+        wrong = np.flatnonzero(~((values >= low) & (values <= high)))
+        if wrong.size:
+            expected = f"a {'latitude' if name == latitude else 'longitude'} of {low:g}..{high:g} deg"
+            raise DataFileError(path, f"line {wrong[0] + 2}", expected, f"{values[wrong[0]]:g}")
+        angles.append(np.radians(values))
+    return angles
+
+
+def _ids(path: Path, columns: dict[str, list[str]]) -> IntArray:
+    numbers = _numbers(path, columns, "id")
+    whole = (np.rint(numbers) == numbers) & (np.abs(numbers) < 2.0**53)
+    if not whole.all():
+        row = int(np.argmin(whole))
+        raise DataFileError(path, f"line {row + 2}, column id", "a whole number", columns["id"][row])
+    return numbers.astype(np.int64)
+
+
+def _flags(path: Path, columns: dict[str, list[str]], name: str) -> BoolArray:
+    texts = [text.strip().lower() for text in columns[name]]
+    for row, text in enumerate(texts):
+        if text not in ("1", "true", "0", "false", ""):
+            raise DataFileError(path, f"line {row + 2}, column {name}", "1, 0, true or false", repr(text))
+    return np.array([text in ("1", "true") for text in texts], dtype=np.bool_)
 
 
 def _read_lu(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     return make_catalogue(
-        np.radians(_numbers(path, columns, "latitude_deg")),
-        np.radians(_numbers(path, columns, "longitude_deg")),
+        *_places(path, columns, "latitude_deg", "longitude_deg"),
         _numbers(path, columns, "diameter_m"),
         source="LU1319381",
-        ids=_numbers(path, columns, "id").astype(np.int64),
+        ids=_ids(path, columns),
         depth_m=_numbers(path, columns, "depth_m", missing=True),
     )
 
 
 def _read_composite(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     return make_catalogue(
-        np.radians(_numbers(path, columns, "latitude_deg")),
-        np.radians(_numbers(path, columns, "longitude_deg")),
+        *_places(path, columns, "latitude_deg", "longitude_deg"),
         1000.0 * _numbers(path, columns, "diameter_km"),
         source="composite of " + ", ".join(sorted(set(columns["source"]))),
-        complete=_flags(columns["tile_complete"]),
+        complete=_flags(path, columns, "tile_complete"),
     )
 
 
 def _read_robbins(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     return make_catalogue(
-        np.radians(_numbers(path, columns, "lat")),
-        np.radians(_numbers(path, columns, "lon")),
+        *_places(path, columns, "lat", "lon"),
         1000.0 * _numbers(path, columns, "diam"),
         source="Robbins",
     )
@@ -459,8 +488,7 @@ def _read_robbins(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
 
 def _read_robbins_whole(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     return make_catalogue(
-        np.radians(_numbers(path, columns, "LAT_CIRC_IMG")),
-        np.radians(_numbers(path, columns, "LON_CIRC_IMG")),
+        *_places(path, columns, "LAT_CIRC_IMG", "LON_CIRC_IMG"),
         1000.0 * _numbers(path, columns, "DIAM_CIRC_IMG"),
         source="Robbins",
     )
@@ -468,14 +496,13 @@ def _read_robbins_whole(path: Path, columns: dict[str, list[str]]) -> CraterCata
 
 def _read_own(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     return make_catalogue(
-        np.radians(_numbers(path, columns, "latitude_deg")),
-        np.radians(_numbers(path, columns, "longitude_deg")),
+        *_places(path, columns, "latitude_deg", "longitude_deg"),
         _numbers(path, columns, "diameter_m"),
         source=path.name,
-        ids=_numbers(path, columns, "id").astype(np.int64),
+        ids=_ids(path, columns),
         rim_height_m=_numbers(path, columns, "rim_height_m", missing=True),
         depth_m=_numbers(path, columns, "depth_m", missing=True),
-        complete=_flags(columns["complete"]),
+        complete=_flags(path, columns, "complete"),
     )
 
 
@@ -493,27 +520,85 @@ _KNOWN_COLUMNS = frozenset().union(*(needed for _, needed in _READERS), {"rim_he
 def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
     checks = (
         (
-            np.abs(catalogue.latitude_rad) <= math.pi / 2 + 1e-12,
-            "a latitude of -90..90 deg",
-            catalogue.latitude_rad,
+            CRATER_DIAMETER_M.holds(catalogue.diameter_m),
+            f"a diameter of {CRATER_DIAMETER_M}",
+            catalogue.diameter_m,
         ),
-        (np.isfinite(catalogue.longitude_rad), "a longitude", catalogue.longitude_rad),
-        (catalogue.diameter_m > 0.0, "a diameter above 0", catalogue.diameter_m),
+        (
+            HEIGHT_M.holds(catalogue.rim_height_m) | np.isnan(catalogue.rim_height_m),
+            f"a rim height of {HEIGHT_M} above the map sphere",
+            catalogue.rim_height_m,
+        ),
     )
     for good, expected, values in checks:
         if not np.all(good):
             row = int(np.flatnonzero(~good)[0])
-            value = math.degrees(values[row]) if "itude" in expected else values[row]
-            raise DataFileError(path, f"line {row + 2}", expected, f"{value:g}")
+            raise DataFileError(path, f"line {row + 2}", expected, f"{values[row]:.10g}")
 
 
-def _without_repetitions(catalogue: CraterCatalogue) -> CraterCatalogue:
+def _check_identity(path: Path, ids: IntArray, kept: IntArray) -> None:
+    """Refuse an id of two craters; `kept` are the rows that are no repetitions."""
+    order = kept[np.argsort(ids[kept], kind="stable")]
+    twice = np.flatnonzero(np.diff(ids[order]) == 0)
+    if twice.size:
+        first, second = order[twice[0]], order[twice[0] + 1]
+        raise DataFileError(
+            path,
+            f"lines {first + 2} and {second + 2}, column id",
+            "an id of its own for each crater (two lists joined?)",
+            f"{ids[first]} twice",
+        )
+
+
+def _check_whole(path: Path, catalogue: CraterCatalogue) -> None:
+    """Refuse a list whose typical diameter, depth, rim height or density shows another unit."""
     if len(catalogue) == 0:
-        return catalogue
+        return
+    diameter_m = catalogue.diameter_m
+    median_m = float(np.median(diameter_m))
+    if not CRATER_MEDIAN_M.holds(median_m):
+        raise DataFileError(
+            path, "", f"a median diameter of {CRATER_MEDIAN_M}", f"{median_m:.6g} m; another unit?"
+        )
+    ratio = (catalogue.depth_m / diameter_m)[catalogue.depth_m > 0.0]
+    if ratio.size and not CRATER_DEPTH_RATIO.holds(np.median(ratio)):
+        found = f"{np.median(ratio):.3g}; another unit of depths?"
+        raise DataFileError(path, "", f"a median depth over diameter of {CRATER_DEPTH_RATIO}", found)
+    heights_m = catalogue.rim_height_m[np.isfinite(catalogue.rim_height_m)]
+    if heights_m.size >= _MANY and heights_m.std() > 0.0 and np.abs(heights_m).max() <= HEIGHT_M.high / 1e3:
+        found = f"none over {np.abs(heights_m).max():.3g} m; kilometres?"
+        raise DataFileError(
+            path, "", f"some of {heights_m.size} rim heights over {HEIGHT_M.high / 1e3:g} m", found
+        )
+    cover = len(catalogue) * 0.25 * math.pi * median_m**2 / _spanned_m2(catalogue, median_m)
+    if len(catalogue) >= _MANY and cover > CRATER_COVER:
+        found = f"{cover:.3g} times that ground; angles or diameters in another unit?"
+        raise DataFileError(
+            path, "", f"craters that cover at most {CRATER_COVER:g} of the ground they span", found
+        )
+
+
+_MANY = 20
+
+
+def _spanned_m2(catalogue: CraterCatalogue, margin_m: float) -> float:
+    """Return the area of the ground about all craters between their latitudes and longitudes."""
+    margin = margin_m / MOON_RADIUS_M
+    low, high = catalogue.latitude_rad.min() - margin, catalogue.latitude_rad.max() + margin
+    south, north = max(low, -0.5 * math.pi), min(high, 0.5 * math.pi)
+    gaps = np.diff(np.sort(catalogue.longitude_rad), append=catalogue.longitude_rad.min() + TWO_PI)
+    width = min(
+        TWO_PI, TWO_PI - float(gaps.max()) + margin / max(math.cos(max(abs(south), abs(north))), 1e-3)
+    )
+    return float(MOON_RADIUS_M**2 * (math.sin(north) - math.sin(south)) * width)
+
+
+def _first_of_repetitions(catalogue: CraterCatalogue) -> IntArray:
+    """Return the rows, ascending, that are not equal to one before in place and diameter."""
     columns = (catalogue.diameter_m, catalogue.longitude_rad, catalogue.latitude_rad)
     order = np.lexsort(columns)
-    same = np.ones(len(order) - 1, dtype=np.bool_)
+    same = np.ones(max(len(order) - 1, 0), dtype=np.bool_)
     for column in columns:
         same &= np.diff(column[order]) == 0.0
     # The sort is stable, so the first of equal rows is kept.
-    return catalogue.select(np.delete(np.arange(len(order)), order[1:][same])) if np.any(same) else catalogue
+    return np.asarray(np.delete(np.arange(len(order)), order[1:][same]), dtype=np.int64)

@@ -362,6 +362,16 @@ def continuous_quaternions(q: ArrayLike) -> FloatArray:
     return np.asarray(given * signs[: len(given), None])
 
 
+def rotation_vector_from_matrix(matrix: ArrayLike) -> FloatArray:
+    """Return rotation vectors ``(..., 3)``, rad and at most pi long, of rotation matrices ``(..., 3, 3)``."""
+    q = quaternion_from_matrix(matrix)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., :1])
+    # Without a rotation the limit of angle over sine is 2.
+    ratio = np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
+    return np.asarray(q[..., 1:] * ratio)
+
+
 def _stack_rows(rows: list[list[Any]]) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 

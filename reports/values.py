@@ -235,7 +235,8 @@ class NavigationSeries:
     error after it; ``reset_error_m`` (n,) holds the horizontal error at the instant before, NaN elsewhere.
     The optional arrays (n,) are quantities on which the error may depend; ``nees`` (of the position under its full
     covariance) has three degrees of freedom, ``nis`` ``nis_dof``. ``squared_normalised_errors`` replaces ``nees`` if
-    only standard deviations are known: squared errors over variances, summed over the axes.
+    only standard deviations are known: squared errors over variances, summed over the axes. ``not_applicable`` says
+    which assumption of the estimator the pass does not meet; empty if all are met.
     """
 
     name: str
@@ -265,6 +266,7 @@ class NavigationSeries:
     wrong_fixes: int | None = None
     error_budget: ErrorBudget | None = None
     drift_by_length: tuple[DriftSample, ...] = ()
+    not_applicable: str = ""
 
 
 @dataclass(frozen=True, slots=True)

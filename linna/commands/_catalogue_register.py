@@ -22,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--terrain F",
         Path,
-        "height rasters in longitude and latitude (default: those of the data folder)",
+        "height rasters in any projection (default: those of the data folder)",
         nargs="+",
     )
     option(
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         missing = "--terrain: expected height rasters" if catalogue else "CATALOGUE: expected a crater list"
         raise UsageError(f"{missing}, found none named and none in the data folder")
     made = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    registration = register(catalogue, terrain, made, parse_region(arguments.region))
+    registration = register(catalogue, terrain, made, parse_region(arguments.region), data.dem_global)
     out = arguments.out or data_directory() / PRODUCT
     save_registration(out, registration)
     tiles = by_tile(registration)

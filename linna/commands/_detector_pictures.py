@@ -31,6 +31,7 @@ def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
     """Add the options of an evaluation on a labelled set; `tested` holds what can be evaluated on."""
     option(tested, "--coco DIR", Path, "a set of images with crater boxes or polygons in COCO files")
     of_set = evaluate.add_argument_group("with --coco")
+    option(of_set, "--category NAME", str, "category of craters (default: those whose name says crater)", "")
     _add_search(of_set)
     option(
         of_set, "--pixel-m", ABOVE_ZERO, "ground covered by a pixel; gives classes in km", default=math.nan
@@ -79,6 +80,7 @@ def evaluate_set(arguments: argparse.Namespace) -> int:
             range_px=(low, high),
             two_scales=arguments.two_scales,
             level=arguments.level,
+            category=arguments.category,
         ),
         lambda pictures: progress(pictures, len(pictures), "evaluate", "images"),
     )
@@ -99,6 +101,8 @@ def refuse_options_of_sets(arguments: argparse.Namespace) -> None:
         raise UsageError("--two-scales: expected together with --coco, found with --dataset")
     if arguments.sun_azimuth_deg is not None:
         raise UsageError("--sun-azimuth-deg: expected together with --coco, found with --dataset")
+    if arguments.category:
+        raise UsageError("--category: expected together with --coco, found with --dataset")
 
 
 def _add_search(parser: Any) -> None:
@@ -122,6 +126,7 @@ def _detect(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
     from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.flight.vision.picture_search import search_picture, sun_at_azimuth
+    from payload_emulator.flight.vision.preprocess import quality_reason
     from payload_emulator.session.picture_files import read_picture
     from payload_emulator.training.evaluate.sheets import draw_detections, format_detections, save_png
 
@@ -133,11 +138,13 @@ def _detect(arguments: argparse.Namespace) -> int:
     sun = None if arguments.sun_azimuth_deg is None else sun_at_azimuth(arguments.sun_azimuth_deg)
     images: list[dict[str, Any]] = []
     for path in arguments.images:
-        image = read_picture(path)
+        image, remark = read_picture(path)
         outcome = search_picture(detector, image, sun, two_scales=arguments.two_scales)
         item: dict[str, Any] = {
             "file": str(path),
             "quality": outcome.quality.name.lower(),
+            "reason": quality_reason(image, outcome.quality),
+            "pixels": remark,
             "sun": _sun(outcome, arguments.sun_azimuth_deg),
             "detections": _detections(outcome.detections, image.shape[1], arguments),
         }
@@ -147,7 +154,8 @@ def _detect(arguments: argparse.Namespace) -> int:
         if arguments.picture:
             save_png(draw_detections(image, item["detections"]), arguments.picture)
     text = "\n".join(map(format_detections, images))
-    return emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
+    emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
+    return 0 if any(item["quality"] == "ok" for item in images) else 1
 
 
 def _sun(outcome: Any, given_deg: float | None) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
         curate,
         "--terrain F",
         Path,
-        "height rasters in longitude and latitude (default: the 128 px/deg tiles of the available data)",
+        "height rasters in any projection (default: the 128 px/deg tiles of the available data)",
         nargs="+",
     )
     option(
@@ -120,7 +120,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
         depth_ratio=arguments.depth_ratio,
     )
     listed = load_catalogue(arguments.catalogue)
-    heights = RasterHeights(paths)
+    heights = RasterHeights(paths, data_folder().dem_global)
     curation = curate(listed, heights, region, rules)
     table = curation.table
     octets = pack_catalogue_table(table)
@@ -138,6 +138,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
         "registration_sigma_m": curation.offset_sigma_m,
         "height_correction_m": curation.height_correction_m,
         "pixels_per_degree": heights.pixels_per_degree,
+        "terrain": heights.readings,
         "median_shift_m": float(np.median(shift_m)) if len(table) else None,
         "median_sigma_m": np.median(table.sigma_m, axis=0) if len(table) else None,
         "octets": len(octets),
@@ -151,6 +152,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
         f"rims lie {curation.offset_m[0]:.0f} m east, {curation.offset_m[1]:.0f} m north of the list on average "
         f"(+- {curation.offset_sigma_m:.0f} m, by place from {curation.registration.rims.sum()} rims); "
         f"{heights.pixels_per_degree:g} px/deg, rim heights raised by {curation.height_correction_m:.0f} m",
+        *(heights.readings if arguments.terrain else ()),
         f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
     ]
     return emit(arguments, figures, text="\n".join(lines))

@@ -10,6 +10,7 @@ from linna.output import emit, finish, log, progress
 from linna.parser import ABOVE_ZERO, number, option
 
 if TYPE_CHECKING:
+    from payload_emulator.session.external import ExternalFrames
     from payload_emulator.session.scenario import Scenario
 
 
@@ -142,7 +143,8 @@ def run(arguments: argparse.Namespace) -> int:
         modes=arguments.mode, seed=arguments.seed, anchoring_catalogue=arguments.anchoring_catalogue
     )
     if arguments.check:
-        return _check(arguments, scenario)
+        external = None if arguments.images is None else load_external(arguments.images, scenario)
+        return _check(arguments, scenario, external)
     if arguments.live:
         return _live(arguments, scenario)
     if arguments.out is None:
@@ -162,15 +164,15 @@ def run(arguments: argparse.Namespace) -> int:
     return emit(arguments, summary, text=describe(summary, arguments.out))
 
 
-def _check(arguments: argparse.Namespace, scenario: Scenario) -> int:
+def _check(arguments: argparse.Namespace, scenario: Scenario, external: ExternalFrames | None) -> int:
     from ground_service.missions.model import parse_mission
     from linna.data import data_folder
     from lunar.timescales import format_utc
+    from payload_emulator.session.emulator import checked_world
     from payload_emulator.session.mission import mission_text
-    from payload_emulator.session.world import build_world
 
     data = data_folder()
-    world = build_world(scenario, data)
+    world = checked_world(scenario, data, external)
     mission = parse_mission(mission_text(world, data), scenario.name)
     times = world.frame_utc_ns
     figures = {
@@ -181,13 +183,15 @@ def _check(arguments: argparse.Namespace, scenario: Scenario) -> int:
         "estimators": list(scenario.navigation.estimators),
         "stations": list(scenario.link.stations),
         "unknown": list(mission.unknown),
+        "ends": world.ends,
         "data": list(world.data_names),
     }
     return emit(
         arguments,
         figures,
         text=f"{scenario.name}: {len(times)} frames, {figures['start_utc']} to {figures['stop_utc']}, estimators "
-        f"{', '.join(scenario.navigation.estimators)}\ndata: {'; '.join(world.data_names)}",
+        f"{', '.join(scenario.navigation.estimators)}\n{f'{world.ends}{chr(10)}' if world.ends else ''}"
+        f"data: {'; '.join(world.data_names)}",
     )
 
 

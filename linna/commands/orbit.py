@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_propagate(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from lunar.messages.oem import format_oem
-    from payload_emulator.session.orbit import force_model, propagate_scenario, sample
+    from payload_emulator.session.orbit import force_model, propagate_to_impact, sample
     from payload_emulator.session.scenario import load_scenario
 
     out: Path = arguments.out
@@ -46,7 +46,7 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     model = force_model(scenario, data)
     started = time.perf_counter()
     duration_s = arguments.days * 86_400.0
-    orbit = propagate_scenario(scenario, model, duration_s)
+    orbit, impact = propagate_to_impact(scenario, model, duration_s)
     propagated = time.perf_counter()
     ephemeris, states = sample(orbit, arguments.step)
     save(out, format_oem(ephemeris).encode())
@@ -57,6 +57,7 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     figures = _figures(orbit, states, wall_s)
     figures["data"] = list(data.names()) or ["built-in gravity and IAU orientation only"]
     figures["out"] = str(out)
+    figures["ends"] = "" if impact is None else f"{impact}: states until then"
     return emit(arguments, figures, _text(figures))
 
 
@@ -130,6 +131,7 @@ def _text(figures: dict[str, Any]) -> str:
         f"{burn['after']['eccentricity']:.6f}"
         for burn in burns
     ]
+    lines += [figures["ends"]] if figures["ends"] else []
     lines.append(f"{figures['states']} states in {figures['wall_s']:.2f} s -> {figures['out']}")
     return "\n".join(lines)
 
@@ -154,11 +156,16 @@ def configure_visibility(commands: Any) -> None:
 
 def run_visibility(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder, load_orbit
+    from linna.errors import UsageError
     from lunar.contacts import visibility_spans
     from lunar.datafolder import default_orientation
     from lunar.timescales import format_utc
 
     stations = tuple(_station(text) for text in arguments.station)
+    if len({one.name for one in stations}) < len(stations):
+        raise UsageError(
+            f"--station: expected names of their own, found {', '.join(one.name for one in stations)}"
+        )
     orientation = default_orientation(data_folder())
     ephemeris = load_orbit(arguments.ephemeris)
     found = visibility_spans(ephemeris, orientation, stations, arguments.step)

@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray
+from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
-from lunar.timescales import tdb_s_from_utc_ns
-from payload_emulator.errors import TerrainError
+from lunar.timescales import format_utc, tdb_s_from_utc_ns
+from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.session.world import World, clock_ticks
 from payload_emulator.sim.orbit.truth import attitude_message, perturbed
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.photometry import Photometry
-from payload_emulator.sim.render.renderer import render
+from payload_emulator.sim.render.renderer import highest_latitude_rad, render
 from payload_emulator.sim.render.sensor import Picture, take_picture
+from payload_emulator.sim.terrain.tiles import POLE_LIMIT_RAD
 
 _NS = 1_000_000_000
 _MS = 1_000_000
@@ -29,6 +31,8 @@ _REDUCED_PX = 8
 NO_PICTURE: Picture = np.empty((0, 0, 3), dtype=np.uint8)
 # With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
 _NIGHT_RAD = np.radians(12.0)
+# Shadows come from ground of up to 75 km beyond a picture, whose corners lie beyond its edges.
+_SHADOW_RAD = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,15 +145,8 @@ def expose(world: World, utc_ns: int, picture: Picture | None = None) -> Exposur
 
 
 def _scene(world: World, utc_ns: int, picture: Picture | None = None) -> _Scene:
-    scenario = world.scenario
-    number = int(np.searchsorted(world.frame_utc_ns, utc_ns))
-    is_listed = number < world.frame_utc_ns.size and int(world.frame_utc_ns[number]) == utc_ns
-    rng = np.random.default_rng((scenario.seed, number if is_listed else utc_ns // _MS))
-    position = world.truth.positions_mcmf(utc_ns)[0]
+    rng, position, camera_from_mcmf, sun = _pose(world, utc_ns)
     tdb_s = float(tdb_s_from_utc_ns(utc_ns))
-    sun = true_sun_direction(world, position, utc_ns, rng)
-    pointing = np.radians(scenario.attitude.pointing_error_deg) * rng.standard_normal(3)
-    camera_from_mcmf = perturbed(world.camera_from_mcmf(position), pointing)
     mcmf_from_icrf = world.truth.orientation.mcmf_from_icrf(tdb_s)
     camera_from_icrf = camera_from_mcmf @ mcmf_from_icrf
     measured = None if world.external is None else world.external.camera_from_icrf(utc_ns)
@@ -159,6 +156,50 @@ def _scene(world: World, utc_ns: int, picture: Picture | None = None) -> _Scene:
     if picture is None:
         radiance, picture = _seen(world, utc_ns, position, camera_from_mcmf, sun)
     return _Scene(utc_ns, camera_from_mcmf, camera_from_icrf, sun, radiance, picture, rng)
+
+
+def _pose(world: World, utc_ns: int) -> tuple[np.random.Generator, FloatArray, FloatArray, FloatArray]:
+    """Return the draws still to come, position (3,), attitude (3, 3) and direction to the Sun (3,), MCMF, at a time."""
+    scenario = world.scenario
+    number = int(np.searchsorted(world.frame_utc_ns, utc_ns))
+    is_listed = number < world.frame_utc_ns.size and int(world.frame_utc_ns[number]) == utc_ns
+    rng = np.random.default_rng((scenario.seed, number if is_listed else utc_ns // _MS))
+    position = world.truth.positions_mcmf(utc_ns)[0]
+    sun = true_sun_direction(world, position, utc_ns, rng)
+    pointing = np.radians(scenario.attitude.pointing_error_deg) * rng.standard_normal(3)
+    return rng, position, perturbed(world.camera_from_mcmf(position), pointing), sun
+
+
+def require_renderable(world: World) -> None:
+    """Refuse a flight over ground nearer to a pole than terrain can be had, by its first such frame.
+
+    Raises
+    ------
+    ScenarioError
+        A picture or an altimeter needs ground beyond the limit of latitude.
+    """
+    scenario, times = world.scenario, world.frame_utc_ns
+    latitude, _, altitude = spherical_from_mcmf(world.truth.positions_mcmf(times))
+    latitude = np.abs(latitude)
+    below = latitude >= POLE_LIMIT_RAD if "altimeter" in scenario.instruments else np.zeros(times.size, bool)
+    in_view = latitude + np.arccos(MOON_RADIUS_M / (MOON_RADIUS_M + altitude)) + _SHADOW_RAD >= POLE_LIMIT_RAD
+    if scenario.camera.images == "reduced" or world.external is not None:
+        in_view[:] = False
+    for number in np.flatnonzero(below | in_view):
+        _, position, camera_from_mcmf, sun = _pose(world, int(times[number]))
+        needed = float(latitude[number])
+        if in_view[number] and not _is_night(position, sun):
+            needed = max(needed, highest_latitude_rad(world.true_camera, position, camera_from_mcmf, sun))
+        if needed >= POLE_LIMIT_RAD and (below[number] or in_view[number]):
+            raise ScenarioError(
+                f"scenario {scenario.name}: expected ground within {np.degrees(POLE_LIMIT_RAD):.0f} deg of latitude "
+                f"({world.terrain.name}), found {np.degrees(needed):.2f} deg needed by frame {number + 1} of "
+                f"{times.size} at {format_utc(int(times[number]), 0)}; see window.latitude_limit_deg"
+            )
+
+
+def _is_night(position_mcmf_m: FloatArray, sun_mcmf: FloatArray) -> bool:
+    return bool(position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m))
 
 
 def _exposed(world: World, scene: _Scene) -> Exposure:
@@ -191,7 +232,7 @@ def _seen(
         return None, world.external.image(utc_ns)
     if world.scenario.camera.images == "reduced":
         return None, np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
-    if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
+    if _is_night(position_mcmf_m, sun_mcmf):
         return np.zeros((camera.height_px, camera.width_px), dtype=np.float32), None
     law = Photometry(world.scenario.light.photometry)
     return render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance, None

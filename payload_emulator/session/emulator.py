@@ -25,8 +25,9 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.flight.ports import ResetCause
+from payload_emulator.session.camera import require_renderable
 from payload_emulator.session.external import ExternalFrames
-from payload_emulator.session.loading import LoadedPayload
+from payload_emulator.session.loading import LoadedPayload, check_payload_files
 from payload_emulator.session.mission import MISSION_FILE, mission_text, save_attitudes
 from payload_emulator.session.recording import (
     StepInput,
@@ -97,7 +98,7 @@ def emulate(
     """
     started = time.monotonic()
     _require_replaceable(out)
-    world = build_world(scenario, data, external)
+    world = checked_world(scenario, data, external)
     frames_kept = frames_kept if external is None else None
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
@@ -110,6 +111,20 @@ def emulate(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return summary
+
+
+def checked_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:
+    """Return the world of a scenario, checked for all that its flight needs.
+
+    Raises
+    ------
+    ScenarioError, TerrainError, ModelError, TableError
+        The scenario cannot be flown.
+    """
+    check_payload_files(scenario)
+    world = build_world(scenario, data, external)
+    require_renderable(world)
+    return world
 
 
 @dataclass(slots=True, eq=False)
@@ -163,7 +178,8 @@ def _emulate_into(
 ) -> dict[str, Any]:
     scenario = world.scenario
     loaded, reference, catalogue = load_scenario_payload(world, data)
-    warnings = [] if world.external is None else sun_warnings(world, loaded.detector)
+    warnings = [world.ends] if world.ends else []
+    warnings += [] if world.external is None else sun_warnings(world, loaded.detector)
     total = int(world.frame_utc_ns.size)
     kept = (
         set(range(total))

@@ -56,7 +56,7 @@ class ExternalFrames:
         """
         path = self.files[int(np.searchsorted(self.utc_ns, utc_ns))]
         try:
-            image = read_picture(path)
+            image, _ = read_picture(path)
         except DatasetError as error:
             raise ScenarioError(str(error)) from None
         width_px, height_px = self.size_px
@@ -152,6 +152,11 @@ def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
             raise ScenarioError(f"{path}, line {line}: expected a time after the line before, found {text}")
         if not (folder / name).is_file():
             raise ScenarioError(f"{path}, line {line}: expected the image {folder / name}, found none")
+        if folder / name in files:
+            first = files.index(folder / name) + 2
+            raise ScenarioError(
+                f"{path}, lines {first} and {line}: expected an image of its own, found {name} twice"
+            )
         files.append(folder / name)
     if not files:
         raise ScenarioError(f"{path}: expected at least one frame, found none")

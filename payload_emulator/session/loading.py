@@ -259,21 +259,38 @@ def _attitude_errors(scenario: Scenario) -> CommonErrors:
 def _catalogue_octets(scenario: Scenario, catalogue: CraterCatalogue) -> bytes:
     """The anchoring catalogue as uploaded: the table the scenario names, else one of the terrain's craters."""
     navigation = scenario.navigation
-    if named := navigation.anchoring_catalogue:
-        try:
-            octets = Path(named).read_bytes()
-        except OSError as error:
-            raise TableError(
-                f"navigation.anchoring_catalogue {named}: expected a table made by linna catalogue curate, "
-                f"found {error.strerror}"
-            ) from None
-    else:
-        octets = pack_catalogue_table(onboard_catalogue(scenario, catalogue))
+    octets = _named_catalogue(scenario) or pack_catalogue_table(onboard_catalogue(scenario, catalogue))
     table = unpack_catalogue_table(octets)
     if not (distortion_m := navigation.catalogue_distortion_m):
         return octets
     correlation_deg = navigation.catalogue_distortion_deg
     return pack_catalogue_table(displaced(table, distortion_m, correlation_deg, scenario.seed))
+
+
+def _named_catalogue(scenario: Scenario) -> bytes:
+    """Return the table that the scenario names; no octets if it names none."""
+    if not (named := scenario.navigation.anchoring_catalogue):
+        return b""
+    try:
+        return Path(named).read_bytes()
+    except OSError as error:
+        raise TableError(
+            f"navigation.anchoring_catalogue {named}: expected a table made by linna catalogue curate, "
+            f"found {error.strerror}"
+        ) from None
+
+
+def check_payload_files(scenario: Scenario) -> None:
+    """Refuse a scenario whose network or table of craters cannot be read.
+
+    Raises
+    ------
+    ModelError, TableError
+        There is none, or it is damaged.
+    """
+    OnnxDetector(network_octets(scenario.detector.network), detector_parameters(scenario))
+    if octets := _named_catalogue(scenario):
+        unpack_catalogue_table(octets)
 
 
 def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:

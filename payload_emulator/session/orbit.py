@@ -11,6 +11,7 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.datafolder import DataFolder, default_gravity, default_orientation
 from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, EphemerisSegment
+from lunar.errors import ImpactError
 from lunar.frames import IauOrientation, Orientation, mci_from_icrf
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
@@ -20,6 +21,7 @@ from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import Scenario
 
 _NS = 1_000_000_000
+_BEFORE_IMPACT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +108,25 @@ def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float)
         )
     state = initial_state_icrf(scenario, model.gm_m3_s2)
     return propagate_from(scenario, model, scenario.epoch_utc_ns, state, duration_s)
+
+
+def propagate_to_impact(
+    scenario: Scenario, model: ForceModel, duration_s: float
+) -> tuple[ScenarioOrbit, ImpactError | None]:
+    """Return the orbit from the scenario's epoch on as far as it lives, and the impact that ends it before.
+
+    Raises
+    ------
+    ImpactError
+        The orbit hits the Moon within seconds.
+    """
+    try:
+        return propagate_scenario(scenario, model, duration_s), None
+    except ImpactError as impact:
+        lived_s = (impact.utc_ns - scenario.epoch_utc_ns) / _NS - _BEFORE_IMPACT_S
+        if lived_s <= 0.0:
+            raise
+        return propagate_scenario(scenario, model, lived_s), impact
 
 
 def propagate_from(

@@ -8,12 +8,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from lunar.constants import MOON_RADIUS_M
 from lunar.errors import LunarError
+from lunar.plausible import CAMERA_FIELD_DEG, CAMERA_PIXELS, MAP_SHIFT_M
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
@@ -385,7 +387,8 @@ def load_scenario(path: Path | str) -> Scenario:
     Raises
     ------
     ScenarioError
-        The file is missing, no TOML, has unknown keys, values of a wrong type or an impossible orbit.
+        The file is missing, no TOML, has unknown keys, values of a wrong type, an impossible orbit, or a key without
+        effect.
     """
     where = shipped_file(Path(path))
     try:
@@ -397,11 +400,16 @@ def load_scenario(path: Path | str) -> Scenario:
         raise ScenarioError(
             f"{where}: expected UTF-8 text, found octet {error.object[error.start]:#04x} at {error.start}"
         ) from None
-    return parse_scenario(text, source=str(where))
+    scenario = parse_scenario(text, source=str(where))
+    _check_unused(scenario, str(where))
+    return scenario
 
 
 def parse_scenario(text: str, source: str = "scenario") -> Scenario:
-    """The scenario written in `text`; `source` names it in error messages."""
+    """The scenario written in `text`; `source` names it in error messages.
+
+    Archives state every key, so keys without effect are allowed.
+    """
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -456,10 +464,7 @@ def _read(table: object, source: str) -> Scenario:
 
 ESTIMATORS = ("paper", "spherical", "anchored")
 
-LARGEST_REGISTRATION_M = 5_000.0
-"""More than any offset between published lunar height models."""
-
-_MOON_RADIUS_KM = 1737.4
+_MOON_RADIUS_KM = MOON_RADIUS_M / 1e3
 
 
 class Require(Protocol):
@@ -524,8 +529,9 @@ def _check(scenario: Scenario, source: str) -> None:
         parse_fault(text)
     for text in (*scenario.link.outages, *scenario.link.missed):
         parse_outage(text)
-    for text in scenario.link.clock_errors:
-        parse_clock_error(text)
+    clocks = [parse_clock_error(text)[0] for text in scenario.link.clock_errors]
+    for key, names in (("link.stations", scenario.link.stations), ("link.clock_errors", clocks)):
+        require(len(set(names)) == len(names), key, "one entry for each station", list(names))
     require(0 <= scenario.spacecraft_id < 1024, "spacecraft_id", "from 0 to 1023", scenario.spacecraft_id)
 
 
@@ -536,9 +542,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "dynamics.degree": (2, 1200),
     "dynamics.solar_area_to_mass_m2_kg": (0.0, 1e3),
     "dynamics.solar_reflection": (0.0, 2.0),
-    "camera.width_px": (16, 8192),
-    "camera.height_px": (16, 8192),
-    "camera.fov_deg": (1.0, 170.0),
+    "camera.width_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
+    "camera.height_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
+    "camera.fov_deg": (CAMERA_FIELD_DEG.low, CAMERA_FIELD_DEG.high),
     "camera.tilt_deg": (-60.0, 60.0),
     "camera.frame_interval_s": (_POSITIVE, _ANY),
     "window.passes": (1, _ANY),
@@ -591,9 +597,71 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
         require(
             perilune_km > _MOON_RADIUS_KM,
             "orbit.semi_major_axis_km and eccentricity",
-            "an orbit above the ground (perilune radius over 1737.4 km)",
+            f"an orbit above the ground (perilune radius over {_MOON_RADIUS_KM} km)",
             round(perilune_km, 3),
         )
+
+
+_BURNS = "maneuvers periselene_altitude_km semi_major_axis_km eccentricity"
+_SEARCH = "window passes direction longitude_min_deg longitude_max_deg search_days"
+_PAPER_SUN = "light elevation_min_deg elevation_max_deg azimuth_min_deg azimuth_max_deg"
+_TABLE_ERRORS = "navigation catalogue_error_fraction_of_diameter catalogue_height_error_m"
+_SENSOR = " ".join(("sensor", *(item.name for item in dataclasses.fields(SensorModel))))
+_UNUSED: tuple[tuple[str, str, Callable[[Scenario], bool]], ...] = (
+    ("window duration_s", "without window.search = 'none'", lambda s: s.window.search != "none"),
+    (_SEARCH, "where window.search is 'none'", lambda s: s.window.search == "none"),
+    (f"orbit frame {' '.join(_ELEMENT_KEYS)}", "with orbit.oem", lambda s: bool(s.orbit.oem)),
+    ("dynamics earth sun integrator solar_area_to_mass_m2_kg", "with orbit.oem", lambda s: bool(s.orbit.oem)),
+    ("dynamics solar_reflection", "without a solar area", lambda s: not s.dynamics.solar_area_to_mass_m2_kg),
+    (_BURNS, "without maneuvers", lambda s: not s.maneuvers.enabled or bool(s.orbit.oem)),
+    (
+        "maneuvers execution_error_fraction",
+        "without burns",
+        lambda s: not s.maneuvers.enabled and not s.disturbances.burn_delta_v_m_s,
+    ),
+    (_SENSOR, "with reduced images", lambda s: s.camera.images == "reduced"),
+    ("light photometry", "with reduced images", lambda s: s.camera.images == "reduced"),
+    ("light photometry", "with photographs", lambda s: bool(s.terrain.photographs)),
+    (_PAPER_SUN, "where light.mode is 'real'", lambda s: s.light.mode == "real"),
+    (_TABLE_ERRORS, "with anchoring_catalogue", lambda s: bool(s.navigation.anchoring_catalogue)),
+    (
+        "navigation catalogue_distortion_deg",
+        "without catalogue_distortion_m",
+        lambda s: not s.navigation.catalogue_distortion_m,
+    ),
+    (
+        "disturbances kidnap_at_s kidnap_told",
+        "without kidnap_distance_km",
+        lambda s: not s.disturbances.kidnap_distance_km,
+    ),
+    ("disturbances outage_at_s", "without outage_duration_s", lambda s: not s.disturbances.outage_duration_s),
+    (
+        "disturbances burn_at_s burn_declared",
+        "without burn_delta_v_m_s",
+        lambda s: not s.disturbances.burn_delta_v_m_s,
+    ),
+    (
+        "link burst_end burst_frame_loss burst_bit_error_rate",
+        "without burst_start",
+        lambda s: not s.link.burst_start,
+    ),
+    ("link playback outages missed", "without link.stations", lambda s: not s.link.stations),
+)
+"""Keys that have no effect (section, then keys), in which case, and whether a scenario is one."""
+
+
+def _check_unused(scenario: Scenario, source: str) -> None:
+    """Refuse keys that are stated otherwise than by default and have no effect."""
+    default = Scenario("")
+    for keys, words, is_case in _UNUSED:
+        section, *names = keys.split() if is_case(scenario) else [""]
+        for name in names:
+            found = getattr(getattr(scenario, section), name)
+            if found != getattr(getattr(default, section), name):
+                key = f"{section}.{name}"
+                raise ScenarioError(
+                    f"{source}: {key} has no effect {words}: expected it left out, found {found!r}"
+                )
 
 
 def _check_window(scenario: Scenario, require: Require) -> None:
@@ -625,9 +693,9 @@ def _check_window(scenario: Scenario, require: Require) -> None:
 def _check_terrain(scenario: Scenario, require: Require) -> None:
     shift = scenario.terrain.registration_north_east_m
     require(
-        not shift or (len(shift) == 2 and max(map(abs, shift)) <= LARGEST_REGISTRATION_M),
+        not shift or (len(shift) == 2 and max(map(abs, shift)) <= MAP_SHIFT_M),
         "terrain.registration_north_east_m",
-        f"empty or two numbers of at most {LARGEST_REGISTRATION_M:g} m",
+        f"empty or two numbers of at most {MAP_SHIFT_M:g} m",
     )
     require(
         not shift or scenario.terrain.source in ("auto", "raster", "photograph"),

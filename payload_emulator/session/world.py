@@ -16,11 +16,13 @@ from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, EphemerisSegment
+from lunar.errors import ImpactError
 from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
 from lunar.messages.oem import load_oem
+from lunar.plausible import HEIGHT_M
 from lunar.propagation import ForceModel
 from lunar.timescales import (
     format_utc,
@@ -31,7 +33,7 @@ from lunar.timescales import (
 )
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.external import ExternalFrames, external_scenario
-from payload_emulator.session.orbit import force_model, propagate_from, propagate_scenario
+from payload_emulator.session.orbit import force_model, propagate_from, propagate_to_impact
 from payload_emulator.session.rims import rims_of, sources_of
 from payload_emulator.session.scenario import ReferenceSection, Scenario, WindowSection
 from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
@@ -65,15 +67,14 @@ REGISTRATION = "crater list "
 """Start of the name that says where the crater list is registered to the terrain."""
 # Rims within this of the frames tell the registration where no product does: a 15 degree tile.
 _REGISTERED_DEG = 7.5
-# No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
-_HIGHEST_GROUND_M = 12_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
     """The simulated world of a scenario: what is true in it, and when the payload looks.
 
-    `external` holds frames that others took, which take the place of rendered ones.
+    `external` holds frames that others took, which take the place of rendered ones. `ends` says where the orbit hits
+    the Moon, if that is within the days searched.
     """
 
     scenario: Scenario
@@ -84,6 +85,7 @@ class World:
     frame_utc_ns: IntArray
     data_names: tuple[str, ...]
     external: ExternalFrames | None = None
+    ends: str = ""
 
     @property
     def clock_utc_ns(self) -> int:
@@ -136,7 +138,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
     model = force_model(scenario, data)
     if external is not None:
         return _external_world(external_scenario(scenario, external), external, terrain, model)
-    truth, burns, windows = _fly_to_windows(scenario, model, terrain)
+    truth, burns, windows, ends = _fly_to_windows(scenario, model, terrain)
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
     band_rad = _band_rad(scenario)
     frames = [frame_times(truth, start, stop, interval_ns, band_rad) for start, stop in windows]
@@ -151,9 +153,9 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
         )
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     _register(terrain, truth, frame_utc_ns)
-    require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
+    require_above_ground(truth, frame_utc_ns, terrain.height_m, HEIGHT_M.high)
     names = _names(terrain, model, truth, frame_utc_ns)
-    return World(scenario, truth, terrain, model, burns, frame_utc_ns, names)
+    return World(scenario, truth, terrain, model, burns, frame_utc_ns, names, ends=ends)
 
 
 def _external_world(
@@ -168,7 +170,7 @@ def _external_world(
             f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
         )
     _register(terrain, truth, external.utc_ns)
-    require_above_ground(truth, external.utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
+    require_above_ground(truth, external.utc_ns, terrain.height_m, HEIGHT_M.high)
     names = (
         f"external images {external.files[0].parent.name}",
         *_names(terrain, model, truth, external.utc_ns),
@@ -196,7 +198,7 @@ def open_world(scenario: Scenario, data: DataFolder, *, is_declared: bool = Fals
             f"scenario {scenario.name}: expected an orbit to propagate without end, found {found}"
         )
     world = build_world(scenario, data)
-    truth, burns = _propagate(scenario, world.model, CHUNK_S / 86_400.0)
+    truth, burns, _ = _propagate(scenario, world.model, CHUNK_S / 86_400.0)
     reference = scenario.epoch_utc_ns if is_declared else world.clock_utc_ns
     if not scenario.clock.reference:
         scenario = replace(scenario, clock=replace(scenario.clock, reference=format_utc(reference, 9)))
@@ -341,30 +343,34 @@ def frame_utc_ns(world: World, ticks: int) -> int:
 
 def _fly_to_windows(
     scenario: Scenario, model: ForceModel, terrain: Terrain
-) -> tuple[Truth, tuple[TrueBurn, ...], list[tuple[int, int]]]:
-    """Propagate in chunks until the wanted windows are found; truth, burns on the way, windows."""
+) -> tuple[Truth, tuple[TrueBurn, ...], list[tuple[int, int]], str]:
+    """Propagate in chunks until the wanted windows are found; truth, burns on the way, windows, end of the orbit."""
     window = scenario.window
     not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
     if scenario.orbit.oem:
         truth = _truth_of_ephemeris(load_oem(Path(scenario.orbit.oem)), model.orientation)
-        return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns))
+        return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns)), ""
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
         reach_days = (
             (not_before - scenario.epoch_utc_ns) / _NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
         )
     while True:
-        truth, burns = _propagate(scenario, model, reach_days)
+        truth, burns, impact = _propagate(scenario, model, reach_days)
+        ends = "" if impact is None else str(impact)
         if window.search == "none":
-            return truth, burns, _windows(scenario, truth, terrain, not_before)
+            if impact is not None and truth.stop_utc_ns < not_before + round(window.duration_s * _NS):
+                raise impact
+            return truth, burns, _windows(scenario, truth, terrain, not_before), ends
         crossings = _crossings(scenario, truth, terrain, not_before)
         found = [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable]
         if len(found) >= window.passes:
-            return truth, burns, found[: window.passes]
-        if reach_days >= window.search_days:
+            return truth, burns, found[: window.passes], ends
+        if ends or reach_days >= window.search_days:
             raise ScenarioError(
                 f"scenario {scenario.name}: window.search expected {window.passes} {window.direction} window(s) over "
-                f"{terrain.name} within {window.search_days} days, found {len(found)}; {_no_band(crossings, window)}"
+                f"{terrain.name} within {window.search_days} days (window.search_days), found {len(found)}; "
+                f"{ends or _no_band(crossings, window)}"
             )
         reach_days = min(2.0 * reach_days, window.search_days)
 
@@ -422,21 +428,23 @@ def _crossings(scenario: Scenario, truth: Truth, terrain: Terrain, not_before_ut
     )
 
 
-def _propagate(scenario: Scenario, model: ForceModel, days: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
-    duration_s = days * 86_400.0
-    orbit = propagate_scenario(scenario, model, duration_s)
-    stop_utc_ns = scenario.epoch_utc_ns + round(duration_s * _NS)
+def _propagate(
+    scenario: Scenario, model: ForceModel, days: float
+) -> tuple[Truth, tuple[TrueBurn, ...], ImpactError | None]:
+    """Return the flight over some days, or up to the impact that ends it before."""
+    orbit, impact = propagate_to_impact(scenario, model, days * 86_400.0)
+    stop_utc_ns = scenario.epoch_utc_ns + round(days * 86_400.0 * _NS)
+    if impact is not None:
+        stop_utc_ns = scenario.epoch_utc_ns + math.floor(orbit.trajectory.elapsed_s[-1] * _NS)
     burns = _executed(scenario, orbit.maneuvers)
-    return (
-        Truth(
-            orbit.trajectory.state,
-            scenario.epoch_utc_ns,
-            stop_utc_ns,
-            model.orientation,
-            tuple(burn.utc_ns for burn in burns),
-        ),
-        burns,
+    truth = Truth(
+        orbit.trajectory.state,
+        scenario.epoch_utc_ns,
+        stop_utc_ns,
+        model.orientation,
+        tuple(burn.utc_ns for burn in burns),
     )
+    return truth, burns, impact
 
 
 def _executed(scenario: Scenario, maneuvers: tuple[Maneuver, ...]) -> tuple[TrueBurn, ...]:

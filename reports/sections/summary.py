@@ -84,10 +84,11 @@ def _statistics_table(view: PassView) -> Table:
         color = view.styles[one.name][0]
         reads = one.anchor_reads_after_start
         kind = {"baseline": "baseline", "smoothed": "smoothed"}.get(one.kind, "flown")
+        words = "flown, not applicable" if one.not_applicable else kind
         rows.append(
             (
                 Cell(one.name, swatch=role_of(color), strong=one.kind != "baseline"),
-                kind,
+                words,
                 number_text(s.median_3d_m, 0),
                 number_text(s.p68_3d_m, 0),
                 number_text(s.p95_3d_m, 0),
@@ -114,7 +115,10 @@ def _statistics_table(view: PassView) -> Table:
         ),
         tuple(rows),
         note="Drift is the horizontal error gathered since the last reset, at the instant before the next, over the "
-        "path since that reset; the median over resets. A dash means that there is no such value.",
+        "path since that reset; the median over resets. A dash means that there is no such value."
+        + "".join(
+            f" Not applicable: {one.not_applicable}." for one in view.report.navigation if one.not_applicable
+        ),
     )
 
 

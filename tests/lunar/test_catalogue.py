@@ -152,7 +152,8 @@ def test_completing_fills_the_empty_tiles_up_to_the_papers_counts():
         ("lat,lon,diam\n1,2\n", "line 2: expected 3 values, found 2"),
         ("lat,lon,diam\n1,2,3\n1,2,x\n", "line 3, column diam: expected a number, found 'x'"),
         ("lat,lon,diam\n91,2,3\n", "line 2: expected a latitude"),
-        ("lat,lon,diam\n1,2,-3\n", "line 2: expected a diameter above 0"),
+        ("lat,lon,diam\n1,2,-3\n", "line 2: expected a diameter of 1 to 2600000 m, found -3000"),
+        ("lat,lon,diam\n1,2,8200\n", "line 2: expected a diameter of 1 to 2600000 m, found 8200000"),
         ("lat,lon,diam\n1,nan,3\n", "line 2: expected a longitude"),
     ],
 )
@@ -178,3 +179,68 @@ def test_quoted_values_are_read_too(tmp_path):
     path.write_text('"lat","lon","diam"\n"1.5","-10","25"\n')
     catalogue = load_catalogue(path)
     assert np.degrees(catalogue.longitude_rad) == pytest.approx([350.0])
+
+
+OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
+1,-35.1,259.8,5931.0,112.0,1060.0,1
+1,-36.2,260.3,8000.0,10.0,1200.0,1
+2,-36.2,260.3,8000.0,10.0,1200.0,1
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (OWN, "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
+        (OWN.replace("\n1,-36", "\n1.7,-36"), "line 3, column id: expected a whole number, found 1.7"),
+        (
+            OWN.replace("\n1,-36", "\n3,-36").replace(",112.0,", ",1737512.0,"),
+            "line 2: expected a rim height",
+        ),
+        (OWN.replace("\n1,-36", "\n3,-36").replace(",1060.0,1", ",1060.0,yes"), "line 2, column complete"),
+    ],
+)
+def test_two_craters_of_one_id_and_impossible_values_are_refused(tmp_path, text, message):
+    path = tmp_path / "own.csv"
+    path.write_text(text)
+    with pytest.raises(DataFileError, match=message):
+        load_catalogue(path)
+
+
+def test_a_crater_that_is_listed_twice_with_one_id_counts_once(tmp_path):
+    path = tmp_path / "own.csv"
+    path.write_text(OWN.replace("\n1,-36", "\n2,-36"))
+    assert load_catalogue(path).ids.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("column", ["latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m"])
+@pytest.mark.parametrize("factor", [1e-3, 1e3, math.pi / 180.0])
+def test_a_column_in_another_unit_is_refused(tmp_path, column, factor):
+    rng = np.random.default_rng(3)
+    diameter_m = 3_000.0 * (1.0 - rng.random(60)) ** -0.5
+    table = {
+        "id": np.arange(60),
+        "latitude_deg": rng.uniform(20.0, 24.0, 60),
+        "longitude_deg": rng.uniform(30.0, 34.0, 60),
+        "diameter_m": diameter_m,
+        "rim_height_m": rng.normal(-1_000.0, 800.0, 60),
+        "depth_m": 0.15 * diameter_m,
+        "complete": np.ones(60),
+    }
+    path = tmp_path / "own.csv"
+
+    def written(values):
+        rows = np.column_stack(list(values.values()))
+        np.savetxt(path, rows, "%.9f", ",", header=",".join(values), comments="")
+        return load_catalogue(path)
+
+    assert len(written(table)) == 60
+    if factor == math.pi / 180.0:
+        if column not in ("latitude_deg", "longitude_deg"):
+            return
+        # Angles come in one unit.
+        changes = {name: table[name] * factor for name in ("latitude_deg", "longitude_deg")}
+    else:
+        changes = {column: table[column] * factor}
+    with pytest.raises(DataFileError, match="expected"):
+        written(table | changes)

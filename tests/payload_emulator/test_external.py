@@ -182,6 +182,7 @@ def edited(name, old, new):
             "line 3: expected a time",
         ),
         (edited("frames.csv", "000001.png", "none.png"), "line 3: expected the image"),
+        (edited("frames.csv", "000001.png", "000000.png"), "lines 2 and 3: expected an image of its own"),
         (lambda folder: (folder / "frames.csv").write_text("file,utc\n"), "expected at least one frame"),
         (lambda folder: (folder / "orbit.oem").unlink(), "expected one ephemeris *.oem, found 0"),
         (

@@ -1,12 +1,19 @@
 """Orbits of scenarios: which forces a scenario's keys switch on."""
 
 import numpy as np
+import pytest
 
 from lunar.datafolder import find_data
 from lunar.frames import mci_from_icrf
 from lunar.propagation import SolarPressure
 from lunar.timescales import tdb_s_from_utc_ns
-from payload_emulator.session.orbit import force_model, initial_state_icrf, propagate_scenario
+from payload_emulator.session.orbit import (
+    force_model,
+    initial_state_icrf,
+    propagate_scenario,
+    propagate_to_impact,
+    sample,
+)
 from payload_emulator.session.scenario import format_scenario, parse_scenario
 
 BARE = 'name = "x"\n[maneuvers]\nenabled = false\n[dynamics]\ngravity = "builtin"\norientation = "iau"\n'
@@ -49,3 +56,18 @@ def test_a_cartesian_state_flies_the_orbit_of_the_elements_it_came_from() -> Non
             for one in (elements, scenario)
         ]
         np.testing.assert_allclose(ends[0][:3], ends[1][:3], atol=1e-5)  # m
+
+
+def test_an_orbit_into_the_ground_is_propagated_until_then() -> None:
+    low = parse_scenario(
+        'name = "x"\n[orbit]\nsemi_major_axis_km = 1745.0\neccentricity = 0.004\n[dynamics]\ndegree = 8\n'
+        'gravity = "builtin"\n[maneuvers]\nenabled = false'
+    )
+    model = force_model(low, find_data(None))
+    orbit, impact = propagate_to_impact(low, model, 30 * 86_400.0)
+    assert impact is not None
+    lived_s = (impact.utc_ns - low.epoch_utc_ns) / 1e9
+    assert orbit.trajectory.elapsed_s[-1] == pytest.approx(lived_s - 1.0, abs=1e-3)
+    ephemeris, _ = sample(orbit, 60.0)
+    assert impact.utc_ns - 61_000_000_000 < ephemeris.stop_utc_ns < impact.utc_ns
+    assert propagate_to_impact(low, model, 0.5 * lived_s)[1] is None

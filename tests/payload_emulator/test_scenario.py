@@ -107,6 +107,10 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ('name = "x"\n[window]\nsearch = "none"', "window.duration_s must be positive"),
         ("name = ", "not TOML"),
         ('name = "x"\n[altimeter]', "section [altimeter]: instruments other than the camera were withdrawn"),
+        (
+            'name = "x"\n[link]\nclock_errors = ["madrid 1", "madrid 2"]',
+            "link.clock_errors must be one entry for each station, found ['madrid', 'madrid']",
+        ),
     ],
 )
 def test_what_cannot_be_flown_is_refused(text: str, message: str) -> None:
@@ -114,3 +118,50 @@ def test_what_cannot_be_flown_is_refused(text: str, message: str) -> None:
         parse_scenario(text)
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[window]\nduration_s = 600", "window.duration_s has no effect without window.search = 'none'"),
+        (
+            '[window]\nsearch = "none"\nduration_s = 600\nsearch_days = 3',
+            "window.search_days has no effect where window.search is 'none': expected it left out, found 3.0",
+        ),
+        (
+            '[orbit]\noem = "a.oem"\ninclination_deg = 40',
+            "orbit.inclination_deg has no effect with orbit.oem",
+        ),
+        ("[dynamics]\nsolar_reflection = 2", "solar_reflection has no effect without a solar area"),
+        ("[maneuvers]\nenabled = false\neccentricity = 0.1", "maneuvers.eccentricity has no effect without"),
+        ("[maneuvers]\nenabled = false\nexecution_error_fraction = 0.1", "no effect without burns"),
+        ('[light]\nmode = "real"\nelevation_max_deg = 50', "light.elevation_max_deg has no effect where"),
+        (
+            '[camera]\nimages = "reduced"\n[sensor]\nbits = 12',
+            "sensor.bits has no effect with reduced images",
+        ),
+        (
+            '[navigation]\nanchoring_catalogue = "a"\ncatalogue_height_error_m = 9',
+            "catalogue_height_error_m has no effect with anchoring_catalogue",
+        ),
+        (
+            "[navigation]\ncatalogue_distortion_deg = 9",
+            "catalogue_distortion_deg has no effect without catalogue_distortion_m",
+        ),
+        ("[disturbances]\nkidnap_told = true", "kidnap_told has no effect without kidnap_distance_km"),
+        ("[disturbances]\noutage_at_s = 9", "outage_at_s has no effect without outage_duration_s"),
+        ("[disturbances]\nburn_at_s = 9", "burn_at_s has no effect without burn_delta_v_m_s"),
+        ("[link]\nburst_end = 0.5", "link.burst_end has no effect without burst_start"),
+        ("[link]\nplayback = true", "link.playback has no effect without link.stations"),
+    ],
+)
+def test_a_stated_key_without_effect_is_refused_and_an_archive_that_states_all_is_read(
+    tmp_path, text: str, message: str
+) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text(f'name = "x"\n{text}')
+    with pytest.raises(ScenarioError) as refusal:
+        load_scenario(file)
+    assert message in str(refusal.value) and str(file) in str(refusal.value)
+    archived = parse_scenario(file.read_text())
+    assert parse_scenario(format_scenario(archived)) == archived

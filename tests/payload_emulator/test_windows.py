@@ -7,8 +7,10 @@ import pytest
 
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
+from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session import world as world_module
+from payload_emulator.session.emulator import checked_world, emulate
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world import build_world
 
@@ -60,3 +62,76 @@ def test_a_search_in_longitudes_that_no_track_crosses_says_so() -> None:
     narrow = replace(SCENARIO.window, longitude_min_deg=10.0, longitude_max_deg=11.0)
     with pytest.raises(ScenarioError, match=r"keeps its swath within longitudes 10\.0 to 11\.0 deg"):
         build_world(replace(SCENARIO, window=narrow), DataFolder())
+
+
+FALLING = """
+name = "falling"
+[orbit]
+semi_major_axis_km = 1770.0
+eccentricity = 0.004
+inclination_deg = 140.0
+raan_deg = 10.0
+argument_of_perilune_deg = 0.0
+true_anomaly_deg = 60.0
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+degree = 12
+[maneuvers]
+enabled = false
+[camera]
+frame_interval_s = 60.0
+[terrain]
+source = "procedural"
+"""
+
+
+def test_a_window_before_the_impact_of_the_orbit_is_found_and_the_impact_is_named() -> None:
+    world = build_world(parse_scenario(FALLING), DataFolder())
+    assert format_utc(int(world.frame_utc_ns[0]), 0) == "2029-08-07T01:05:00Z"
+    assert world.ends.startswith("the orbit hits the Moon at 2029-08-11T15:5")
+    many = parse_scenario(f"{FALLING}[window]\npasses = 900")
+    with pytest.raises(
+        ScenarioError, match=r"within 30\.0 days .* found \d+; the orbit hits the Moon at 2029-08-11"
+    ):
+        build_world(many, DataFolder())
+
+
+POLAR = """
+name = "pole"
+[orbit]
+semi_major_axis_km = 1770.0
+eccentricity = 0.004
+inclination_deg = 90.0
+raan_deg = 10.0
+argument_of_perilune_deg = 0.0
+true_anomaly_deg = 60.0
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+degree = 12
+[maneuvers]
+enabled = false
+[terrain]
+source = "procedural"
+[window]
+search = "none"
+latitude_limit_deg = 90.0
+start = "2029-08-07T00:05:00Z"
+duration_s = 600
+"""
+
+
+def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(
+    tmp_path,
+) -> None:
+    message = (
+        r"expected ground within 84 deg of latitude .* found 8\d\.\d+ deg needed by frame \d of 40 at 2029"
+    )
+    with pytest.raises(ScenarioError, match=message):
+        checked_world(parse_scenario(POLAR), DataFolder())
+    with pytest.raises(ScenarioError, match=message):
+        emulate(parse_scenario(POLAR), DataFolder(), tmp_path / "p")
+    assert not list(tmp_path.iterdir())
+    south = POLAR.replace("00:05:00Z", "00:40:00Z").replace("duration_s = 600", "duration_s = 300")
+    assert checked_world(parse_scenario(south), DataFolder()).frame_utc_ns.size == 20

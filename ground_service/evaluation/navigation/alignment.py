@@ -6,6 +6,7 @@ hide drift. Positions of estimates are mean-Earth (MCMF); errors are formed in I
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,6 +104,18 @@ def places_of_positions(
         np.einsum("nij,nj->ni", reference.mcmf_from_icrf, position_icrf_m)
     )
     return np.degrees(latitude), np.degrees(longitude) % 360.0, altitude
+
+
+def angle_from_meridian_deg(reference: ReferenceStates) -> float:
+    """Return the median angle of the ground track with the meridian, 0 to 90 degrees; NaN where nothing is covered."""
+    velocity = np.einsum("nij,nj->ni", reference.mcmf_from_icrf, reference.velocity_icrf_m_s)
+    up = reference.position_mcmf_m / np.linalg.norm(reference.position_mcmf_m, axis=-1, keepdims=True)
+    east = np.cross([0.0, 0.0, 1.0], up)
+    east /= np.maximum(np.linalg.norm(east, axis=-1, keepdims=True), 1e-12)
+    across = np.abs(np.einsum("ni,ni->n", velocity, east))
+    along = np.abs(np.einsum("ni,ni->n", velocity, np.cross(up, east)))
+    angles = np.degrees(np.arctan2(across, along))[reference.covered]
+    return float(np.median(angles)) if angles.size else math.nan
 
 
 def ground_path_m(reference: ReferenceStates, radius_m: float) -> FloatArray:

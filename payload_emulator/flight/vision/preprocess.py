@@ -79,6 +79,24 @@ def prepare_image(
     return PreparedImage(_mean_of_channels(image) if by_channel else normalise(gray), ImageQuality.OK)
 
 
+def quality_reason(image: NDArray[np.generic], quality: ImageQuality) -> str:
+    """Return why a frame has a quality, "" for a good one."""
+    if quality is ImageQuality.OK:
+        return ""
+    gray = _square_root_gray(image) if image.size and image.dtype.kind in "uf" else None
+    if gray is None:
+        bad = np.count_nonzero(~np.isfinite(image)) if image.dtype.kind == "f" else image.size
+        return (
+            f"{bad} of {image.size} pixels hold no number" if bad else f"shape {image.shape} of {image.dtype}"
+        )
+    if quality is ImageQuality.UNIFORM:
+        return f"deviation {gray.std(dtype=np.float64):.4f} of full scale, expected over {_UNIFORM_DEVIATION}"
+    level = _DARK_LEVEL if quality is ImageQuality.DARK else _SATURATED_LEVEL
+    share = float(np.mean(gray > np.float32(np.sqrt(level))))
+    limit = f"over {_DARK_SHARE:.1%}" if quality is ImageQuality.DARK else f"up to {_SATURATED_SHARE:.0%}"
+    return f"{share:.2%} of the pixels over {level:.1%} of full scale, expected {limit}"
+
+
 def normalise(square_root_gray: NDArray[np.float32]) -> NDArray[np.float32]:
     """Plane with the frame's mean and standard deviation removed, clipped at four deviations."""
     mean = float(square_root_gray.mean(dtype=np.float64))

@@ -268,6 +268,23 @@ def _below(position_mcmf_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     return latitude, longitude
 
 
+def highest_latitude_rad(
+    camera: PinholeCamera,
+    position_mcmf_m: npt.ArrayLike,
+    camera_from_mcmf: npt.ArrayLike,
+    sun_direction_mcmf: npt.ArrayLike,
+) -> float:
+    """Greatest absolute latitude of ground that a picture needs, shadows included, over relief of `CASTER_RELIEF_M`."""
+    view = tangent_view(position_mcmf_m, camera_from_mcmf, sun_direction_mcmf)
+    rays = _border_rays(camera, view)
+    heights = -CASTER_RELIEF_M, min(CASTER_RELIEF_M, view.altitude_m - 1.0)
+    reach = [rays[:, :2] * _reach(rays, view.altitude_m, height)[:, None] for height in heights]
+    grid = _rectangle(np.concatenate([np.zeros((1, 2)), *reach]), camera, view.altitude_m, 3.0)
+    sunward = _sunward_grid(grid, view)
+    latitude, _, _ = _outline(view, *((grid,) if sunward is None else (grid, sunward)))
+    return float(np.nanmax(np.abs(latitude)))
+
+
 def _penumbra(elevation_rad: float) -> float:
     """Half width in height of a penumbra per metre of horizontal distance to its caster."""
     high = math.tan(min(elevation_rad + SUN_ANGULAR_RADIUS_RAD, 1.5))

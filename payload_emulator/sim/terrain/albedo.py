@@ -77,16 +77,14 @@ def _is_georeferenced(path: Path) -> bool:
 
 def _median(layers: Sequence[RasterLayer]) -> float:
     """Median of values spread over all files."""
-    import rasterio
-
     values = []
     for file in (file for layer in layers for file in layer.files):
-        with rasterio.open(file.path) as source:
+        with file.opened() as source:
             shape = min(SAMPLES, file.rows), min(SAMPLES, file.columns)
             part = source.read(1, out_shape=shape).astype(np.float64)
         good = np.isfinite(part) & (part > 0.0)
-        if file.nodata is not None:
-            good &= part != file.nodata
+        if file.reading.nodata is not None:
+            good &= part != file.reading.nodata
         values.append(part[good])
     found = np.concatenate(values)
     if not found.size:

@@ -22,6 +22,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
+from lunar.plausible import CRATER_DEPTH_RATIO, LISTED_DEPTH_RATIO, Limit
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.registration import Registration, Rims, clear_rims, fit_registration
 from tmtc.tables import CatalogueTable
@@ -40,6 +41,7 @@ REGISTERED_M = (4_000.0, 16_000.0)
 centres of larger ones are 500 m off."""
 
 _BLOCK_DEG = 5.0
+_MANY = 10  # craters from which their median depth decides
 _AZIMUTHS = 48
 _FLOOR = (0.1, 0.22, 0.34)
 _RIM = np.arange(0.70, 1.3601, 0.03)
@@ -260,7 +262,32 @@ def _measured(craters: CraterCatalogue, heights: Heights) -> _Fit:
     columns = np.full((8, len(craters)), np.nan)
     for rows, window in _blocks(craters, heights):
         columns[:, rows] = _fitted(craters.select(rows), heights.pixels_per_degree, *window)
-    return _Fit(*columns)
+    fit = _Fit(*columns)
+    _require_depths(craters, fit)
+    return fit
+
+
+def _require_depths(craters: CraterCatalogue, fit: _Fit) -> None:
+    """Refuse heights on which craters are deeper than any, or otherwise than listed.
+
+    Raises
+    ------
+    TerrainError
+        The heights have another scale.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over_listed = fit.depth_m / craters.depth_m
+    for share, of, limit in (
+        (0.5 * fit.depth_m / fit.radius_m, "their diameters", Limit(-1.0, CRATER_DEPTH_RATIO.high, "")),
+        (over_listed, "the depths in the list", LISTED_DEPTH_RATIO),
+    ):
+        known = share[np.isfinite(share)]
+        if known.size >= _MANY and not limit.holds(np.median(known)):
+            raise TerrainError(
+                f"terrain of the curation: expected depths of {limit.high:g} times {of} at the most and "
+                f"{max(limit.low, 0.0):g} at the least (median), found {np.median(known):.2f} in {known.size} craters: "
+                "another scale of heights?"
+            )
 
 
 def _blocks(
@@ -416,16 +443,23 @@ SMOOTHING_PIXELS = 0.7
 class RasterHeights:
     """Height rasters as files: the finest resolution of those given, smoothed by a pixel against quantisation."""
 
-    def __init__(self, paths: Sequence[Path | str]) -> None:
+    def __init__(self, paths: Sequence[Path | str], relief: Path | None = None) -> None:
+        """`relief` is a coarse height raster of the Moon to compare with."""
         from payload_emulator.sim.terrain.rasters import open_layers
 
         if not paths:
             raise TerrainError("terrain of the curation: expected at least one height raster, found none")
-        layers = open_layers(paths)
+        (coarse,) = [None] if relief is None else open_layers([relief])
+        layers = open_layers(paths, relief=coarse)
         # Most craters must lie on one resolution, or heights would jump: that with most files.
         self._layer = max(layers, key=lambda layer: (len(layer.files), layer.pixels_per_degree))
         self.pixels_per_degree = float(self._layer.pixels_per_degree)
         self.files = tuple(file.path for file in self._layer.files)
+
+    @property
+    def readings(self) -> list[str]:
+        """How the values of the files that were read are taken."""
+        return self._layer.readings
 
     def window(self, south: float, north: float, west: float, east: float) -> tuple[FloatArray, float, float]:
         """Heights of a window in degrees, with latitude and longitude of the centre of its first pixel."""

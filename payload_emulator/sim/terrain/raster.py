@@ -86,8 +86,9 @@ class RasterTerrain(Terrain):
         if not paths:
             raise TerrainError("terrain rasters: expected at least one height raster, found none")
         self._chunks = ChunkCache()
-        self._fine = open_layers(paths, chunks=self._chunks)
-        self._layers = [*open_layers(coarse_paths, chunks=self._chunks), *self._fine]
+        coarse = open_layers(coarse_paths, chunks=self._chunks)
+        self._fine = open_layers(paths, chunks=self._chunks, relief=coarse[0] if coarse else None)
+        self._layers = [*coarse, *self._fine]
         self._layers.sort(key=lambda layer: layer.pixels_per_degree)
         self.registration_north_m = registration_north_m
         self.registration_east_m = registration_east_m

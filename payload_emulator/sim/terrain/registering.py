@@ -54,7 +54,9 @@ def find_registration(data: DataFolder, catalogue: Path, terrain: Sequence[Path]
     return None if _other_file(shipped, catalogue, terrain) else _on_rasters(shipped, terrain)
 
 
-def register(catalogue: Path, terrain: Sequence[Path], made_utc: str, region: Region) -> Registration:
+def register(
+    catalogue: Path, terrain: Sequence[Path], made_utc: str, region: Region, relief: Path | None = None
+) -> Registration:
     """Return the registration of a catalogue file to height rasters, with its provenance.
 
     Raises
@@ -62,7 +64,7 @@ def register(catalogue: Path, terrain: Sequence[Path], made_utc: str, region: Re
     TerrainError
         No clear rim of the catalogue lies on the rasters.
     """
-    heights = RasterHeights(terrain)
+    heights = RasterHeights(terrain, relief)
     rims = measured_rims(load_catalogue(catalogue), heights, region)
     if not len(rims):
         raise TerrainError(

@@ -14,12 +14,12 @@ from lunar.arrays import FloatArray, OctetArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
+from lunar.plausible import HEIGHT_M
 from lunar.timescales import format_utc
 from payload_emulator.session.recipe import Recipe, Source
 from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sensor, draw_sun
 
 _LABEL_MINIMUM_M = 2_000.0
-_HIGHEST_GROUND_M = 11_000.0  # above the map sphere
 _STAMPED_MINIMUM_PX = 9.0
 _BLOCK_DEG = 8.0
 _TRIES_OF_LIGHT = 20
@@ -160,7 +160,7 @@ def _label(
 
     position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
     # No crater of fewer metres has `least_px` even on the highest ground straight below; tilt is a few degrees at most.
-    resolved_m = 0.95 * least_px * (pose.altitude_m - _HIGHEST_GROUND_M) / camera.focal_px
+    resolved_m = 0.95 * least_px * (pose.altitude_m - HEIGHT_M.high) / camera.focal_px
     labels = label_frame(
         terrain, camera, position, rotation, max(_LABEL_MINIMUM_M, resolved_m), rendering.lit
     )

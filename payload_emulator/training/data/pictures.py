@@ -1,7 +1,9 @@
 """Labelled image sets in COCO form, from any source.
 
 A set is a folder with one or more COCO files (`*.json`, at any depth). Image files lie beside their COCO file or in its
-folder `images`. A crater is a box or one or more polygons; of a polygon, centre and diameter are those of its area.
+folder `images`. Craters are the annotations whose category says crater in its name or supercategory, or all where the
+file has no categories. A crater is a box or one or more polygons; of a polygon, centre and diameter are those of its
+area. Equal labels count once.
 Further keys are read where present: `centre` and `diameter` of an annotation (as `linna dataset build` writes them),
 `sun_azimuth_deg`, `pixel_m` and `altitude_km` of an image. Pixel centres are integers, so the centre of a box that
 starts at x and is w wide is x + w / 2 - 0.5.
@@ -15,7 +17,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +33,8 @@ from payload_emulator.session.picture_files import IMAGE_SUFFIXES, read_picture
 class LabelledPicture:
     """One image of a set with its craters; arrays (n,), boxes (n, 4) as left, top, width, height from the image corner.
 
-    `crowd` marks regions that stand for many craters.
+    `crowd` marks regions that stand for many craters. `left_out` are the names of other categories, one for each label
+    that was left out; `repeated` is the number of labels equal to another.
     `sun_azimuth_deg` is that of the Sun in the image, clockwise from its top; NaN where the set does not state it, as
     `pixel_m` and `altitude_km`.
     """
@@ -47,10 +50,14 @@ class LabelledPicture:
     sun_azimuth_deg: float = math.nan
     pixel_m: float = math.nan
     altitude_km: float = math.nan
+    left_out: tuple[str, ...] = ()
+    repeated: int = 0
 
 
-def load_pictures(folder: Path) -> list[LabelledPicture]:
+def load_pictures(folder: Path, category: str = "") -> list[LabelledPicture]:
     """Images of a labelled set with their craters, in the order of the COCO files and of the images in them.
+
+    `category` names the category of craters; "": those that say crater.
 
     Raises
     ------
@@ -64,7 +71,7 @@ def load_pictures(folder: Path) -> list[LabelledPicture]:
             f"{folder}: expected a COCO file (*.json with images, annotations and categories), found "
             f"{'none' if folder.is_dir() else 'no such folder'}"
         )
-    return [picture for path, document in documents for picture in _pictures(path, document)]
+    return [picture for path, document in documents for picture in _pictures(path, document, category)]
 
 
 def _coco(path: Path) -> dict[str, Any] | None:
@@ -81,25 +88,97 @@ def _coco(path: Path) -> dict[str, Any] | None:
     return document
 
 
-def _pictures(path: Path, document: dict[str, Any]) -> list[LabelledPicture]:
-    labels: dict[Any, list[_Label]] = {}
-    for k, item in enumerate(document["images"]):
-        number = _value(item, "id", f"{path}, images[{k}]")
-        if number in labels:
-            raise DatasetError(
-                f"{path}, images[{k}].id: expected a number of its own, found {number!r} twice"
-            )
-        labels[number] = []
+def _pictures(path: Path, document: dict[str, Any], category: str) -> list[LabelledPicture]:
+    images = _identified(document["images"], "an image", f"{path}, images")
+    _identified(
+        [item for item in document["annotations"] if "id" in item], "an annotation", f"{path}, annotations"
+    )
+    craters, names = _categories(path, document, category)
+    labels: dict[Any, list[_Label]] = {number: [] for number in images}
+    others: dict[Any, list[str]] = {number: [] for number in images}
     for k, item in enumerate(document["annotations"]):
         place = f"{path}, annotations[{k}]"
         number = _value(item, "image_id", place)
         if number not in labels:
             raise DatasetError(f"{place}.image_id: expected the id of an image, found {number!r}")
-        labels[number].append(_label(item, place))
-    return [
-        _picture(path, item, labels[item["id"]], f"{path}, images[{k}]")
+        kind = _value(item, "category_id", place) if names else None
+        if names and kind not in names:
+            raise DatasetError(f"{place}.category_id: expected the id of a category, found {kind!r}")
+        if kind in craters or not names:
+            labels[number].append(_label(item, place))
+        else:
+            others[number].append(names[kind])
+    found = [
+        _picture(path, item, labels[item["id"]], others[item["id"]], f"{path}, images[{k}]")
         for k, item in enumerate(document["images"])
     ]
+    _require_boxes_in_pixels(path, found)
+    return found
+
+
+def _identified(items: Sequence[Mapping[str, Any]], what: str, place: str) -> dict[Any, Mapping[str, Any]]:
+    """Return items by their ids, which are whole numbers or texts, each once."""
+    first: dict[Any, int] = {}
+    for k, item in enumerate(items):
+        number = _value(item, "id", f"{place}[{k}]")
+        if isinstance(number, bool) or not isinstance(number, (int, str)):
+            raise DatasetError(f"{place}[{k}].id: expected a whole number or a text, found {number!r}")
+        if number in first:
+            raise DatasetError(
+                f"{place}[{k}].id: expected {what} with a number of its own, found {number!r} twice "
+                f"(also {place.rpartition(', ')[2]}[{first[number]}])"
+            )
+        first[number] = k
+    return {number: items[k] for number, k in first.items()}
+
+
+def _categories(path: Path, document: dict[str, Any], category: str) -> tuple[set[Any], dict[Any, str]]:
+    """Return the ids of the categories of craters, and the names of all categories; none where there are none."""
+    listed = document.get("categories") or []
+    if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
+        raise DatasetError(f"{path}, categories: expected a list of objects, found another value")
+    items = _identified(listed, "a category", f"{path}, categories")
+    names = {number: str(item.get("name", number)) for number, item in items.items()}
+    wanted = category.casefold()
+    craters = {
+        number
+        for number, item in items.items()
+        if (names[number].casefold() == wanted if wanted else "crater" in _words(item))
+    }
+    if (items or wanted) and not craters:
+        found = ", ".join(names.values()) or "none"
+        expected = f"the category {category!r}" if wanted else "a category that says crater, or --category"
+        raise DatasetError(f"{path}, categories: expected {expected}, found {found}")
+    return craters, names
+
+
+def _words(item: Mapping[str, Any]) -> str:
+    return f"{item.get('name')} {item.get('supercategory')}".casefold()
+
+
+def _require_boxes_in_pixels(path: Path, pictures: Sequence[LabelledPicture]) -> None:
+    """Refuse boxes with two corners in place of a size, and coordinates from 0 to 1."""
+    box = np.concatenate([picture.box_px for picture in pictures] or [np.zeros((0, 4))])
+    ends = np.concatenate([p.box_px[:, :2] + p.box_px[:, 2:] for p in pictures] or [np.zeros((0, 2))])
+    sizes = np.concatenate(
+        [np.tile([p.width_px, p.height_px], (len(p.box_px), 1)) for p in pictures] or [np.zeros((0, 2))]
+    )
+    if not len(box):
+        return
+    if ends.max() <= 2.0 < sizes.min():
+        raise DatasetError(
+            f"{path}, annotations: expected boxes and polygons in pixels, found none over {ends.max():.3g}: "
+            "coordinates from 0 to 1?"
+        )
+    corners = (box[:, 2:] > box[:, :2]).all() and len(box) > 2
+    beyond = np.count_nonzero((ends > sizes + 1.0).any(axis=1))
+    outside = np.flatnonzero((box[:, :2] + 0.5 * box[:, 2:] > sizes + 1.0).any(axis=1))
+    if (corners and beyond) or outside.size:
+        raise DatasetError(
+            f"{path}, annotations: expected boxes [x, y, width, height] in the image, found {beyond} of {len(box)} "
+            f"beyond its edge, such as {np.round(box[(ends > sizes + 1.0).any(axis=1)][0], 2).tolist()}: "
+            "[x1, y1, x2, y2]?"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +190,11 @@ class _Label:
     crowd: bool
 
 
-def _picture(path: Path, item: Mapping[str, Any], labels: list[_Label], place: str) -> LabelledPicture:
+def _picture(
+    path: Path, item: Mapping[str, Any], labels: list[_Label], others: Sequence[str], place: str
+) -> LabelledPicture:
+    every = len(labels)
+    labels = list(dict.fromkeys(labels))
     name = _value(item, "file_name", place)
     if not isinstance(name, str) or not name:
         raise DatasetError(f"{place}.file_name: expected the name of an image file, found {name!r}")
@@ -124,7 +207,7 @@ def _picture(path: Path, item: Mapping[str, Any], labels: list[_Label], place: s
         raise DatasetError(
             f"{place}.file_name: expected a file with one of {' '.join(IMAGE_SUFFIXES)}, found {found.name}"
         )
-    height_px, width_px = read_picture(found).shape[:2]
+    height_px, width_px = read_picture(found)[0].shape[:2]
     stated = (_number(item, "width", place, width_px), _number(item, "height", place, height_px))
     if stated != (width_px, height_px):
         raise DatasetError(
@@ -144,6 +227,8 @@ def _picture(path: Path, item: Mapping[str, Any], labels: list[_Label], place: s
         sun_azimuth_deg=_number(item, "sun_azimuth_deg", place, math.nan),
         pixel_m=_positive(item, "pixel_m", place),
         altitude_km=_positive(item, "altitude_km", place),
+        left_out=tuple(others),
+        repeated=every - len(labels),
     )
 
 

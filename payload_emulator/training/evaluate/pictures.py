@@ -12,6 +12,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +76,7 @@ class PictureSetOptions:
     range_px: tuple[float, float] = DIAMETER_RANGE_PX
     two_scales: bool = False
     level: str = "5"
+    category: str = ""
 
 
 def evaluate_pictures(
@@ -94,7 +96,7 @@ def evaluate_pictures(
         The set is broken, or holds no image or no crater.
     """
     options = options or PictureSetOptions()
-    pictures = load_pictures(folder)
+    pictures = load_pictures(folder, options.category)
     craters = int(sum(np.count_nonzero(~picture.crowd) for picture in pictures))
     if not craters:
         raise DatasetError(f"{folder}: expected craters, found {len(pictures)} images without any")
@@ -103,8 +105,10 @@ def evaluate_pictures(
     )
     known = bool(np.isfinite(azimuths).all())
     searches: dict[SunKnowledge, list[PictureSearch]] = {way: [] for way in SunKnowledge}
+    remarks = []
     for picture, azimuth in progress(list(zip(pictures, azimuths, strict=True))):
-        image = read_picture(picture.path)
+        image, remark = read_picture(picture.path)
+        remarks += [f"{picture.path.name}: {remark}"] if remark else []
         for way, sun in (
             (SunKnowledge.given, sun_at_azimuth(azimuth)),
             (SunKnowledge.found, None),
@@ -126,6 +130,9 @@ def evaluate_pictures(
         "level": f"{options.level} (as declared)",
         "images": len(pictures),
         "craters": craters,
+        "other_labels": dict(Counter(name for picture in pictures for name in picture.left_out)),
+        "repeated_labels": sum(picture.repeated for picture in pictures),
+        "remarks": remarks,
         "threshold": threshold,
         "two_scales": options.two_scales,
         "diameter_range_px": list(options.range_px),
@@ -172,6 +179,7 @@ def format_picture_figures(figures: dict[str, Any]) -> str:
     lines = [
         f"{figures['images']} images, {figures['craters']} labelled craters; evidence level {figures['level']}; "
         f"threshold {figures['threshold']:.2f}{', two scales' if figures['two_scales'] else ''}",
+        *_left_out(figures),
         "precision is a lower bound where labels are incomplete; intervals of F1 from resampled images (95 %)",
         _sun_line(sun),
         f"{'':34}{'P':>7}{'R':>7}{'F1':>7}  {'interval':14}{'median px':>10}{'labels':>8}",
@@ -190,6 +198,17 @@ def format_picture_figures(figures: dict[str, Any]) -> str:
         f"{bias['toward_sun_px']:+.2f}, across {bias['across_sun_px']:+.2f} ({bias['pairs']} pairs)"
     )
     return "\n".join(lines)
+
+
+def _left_out(figures: dict[str, Any]) -> list[str]:
+    """Return lines about labels and pixels that do not count."""
+    others = ", ".join(f"{count} {name}" for name, count in figures["other_labels"].items())
+    repeated = figures["repeated_labels"]
+    return [
+        *([f"labels of other categories, not counted: {others}"] if others else []),
+        *([f"labels equal to another, counted once: {repeated}"] if repeated else []),
+        *figures["remarks"],
+    ]
 
 
 def _between(values: FloatArray, limits: tuple[float, float]) -> BoolArray:

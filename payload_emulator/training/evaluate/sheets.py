@@ -71,7 +71,8 @@ def draw_detections(image: Any, detections: Sequence[dict[str, Any]]) -> Rgb:
 def format_detections(item: dict[str, Any]) -> str:
     """Rows of the detections in a file, the largest first."""
     rows = sorted(item["detections"], key=lambda row: -row["diameter_px"])
-    lines = [f"{item['file']}: {item['quality']}, {len(rows)} craters"]
+    remarks = "; ".join(text for text in (item["reason"], item["pixels"]) if text)
+    lines = [f"{item['file']}: {item['quality']}, {len(rows)} craters{f' ({remarks})' if remarks else ''}"]
     if rows:
         lines += ["    u px    v px  diameter px  score  class"]
     return "\n".join(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
+    angle_from_meridian_deg,
     error_of_places_rtn_m,
     error_of_positions_rtn_m,
     ground_path_m,
@@ -150,3 +152,14 @@ def test_a_quarter_of_the_way_round_is_a_quarter_of_the_circumference() -> None:
         np.zeros(3), np.zeros(3), np.zeros(3),
     )  # fmt: skip
     np.testing.assert_allclose(ground_path_m(track, 2.0), [0.0, math.pi, 3.0 * math.pi])
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 50.0, 130.0])
+def test_the_angle_of_the_track_with_the_meridian_is_that_of_the_velocity(angle_deg: float) -> None:
+    states = reference_states(polar(), Turning(), after(10.0, 60.0))
+    angle = math.radians(angle_deg)
+    normal = np.cross(states.position_icrf_m, states.velocity_icrf_m_s)
+    normal *= SPEED_M_S / np.linalg.norm(normal, axis=1, keepdims=True)
+    turned = math.cos(angle) * states.velocity_icrf_m_s + math.sin(angle) * normal
+    found = angle_from_meridian_deg(replace(states, velocity_icrf_m_s=turned))
+    assert found == pytest.approx(min(angle_deg, 180.0 - angle_deg), abs=1e-6)

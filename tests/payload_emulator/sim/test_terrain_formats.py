@@ -143,7 +143,7 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
         transform = rasterio.Affine(step, 0, (west - 180.0) * METRES_PER_DEGREE, 0, -step, north)
         paths.append(write_tiff(tmp_path / f"{name}.tif", transform, values, crs, compress="deflate"))
     (layer,) = open_layers(paths)
-    first_row, turn = round(90.0 * layer.pixels_per_degree) - rows // 2, layer.turn
+    first_row, turn = round(90.0 * layer.pixels_per_degree) - rows // 2, round(layer.turn)
     for first_column in (turn - 6, -6, 2 * turn - 6):
         window = layer.read(first_row, first_column, rows, 12)
         # The file's own rows, the same in the columns on both sides of the meridian: nothing lost between the tiles.
@@ -166,17 +166,11 @@ def test_jpeg_2000_of_16_bits(tmp_path):
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
 
 
-@pytest.mark.parametrize(
-    ("crs", "height_deg", "message"),
-    [
-        ("EPSG:4326", 0.1, r"a\.tif: expected a raster of the Moon .* found a body of 6378"),
-        ("+proj=longlat +R=1737400 +no_defs", 0.2, "expected square pixels in degrees"),
-    ],
-)
-def test_a_raster_of_another_body_and_pixels_longer_than_wide_are_refused(tmp_path, crs, height_deg, message):
-    transform = rasterio.Affine(0.1, 0, 0, 0, -height_deg, 10)
-    path = write_tiff(tmp_path / "a.tif", transform, np.zeros((9, 9), "int16"), crs)
-    with pytest.raises(TerrainError, match=message):
+def test_a_raster_of_another_body_is_refused(tmp_path):
+    path = write_tiff(
+        tmp_path / "a.tif", rasterio.Affine(0.1, 0, 0, 0, -0.1, 10), np.zeros((9, 9), "int16"), "EPSG:4326"
+    )
+    with pytest.raises(TerrainError, match=r"a\.tif: expected a raster of the Moon .* found a body of 6378"):
         open_layers([path])
 
 
@@ -216,3 +210,204 @@ def test_a_folder_with_sldem2015_uses_it_before_gld100(tmp_path):
     # Its own resolution is finer than the smallest crater that could be stamped: it is left as it stands.
     heights_agree(terrain, np.array([14.3]), np.array([12.2]), 0.05)
     assert len(terrain.small_craters(np.radians([14.0, 15.0]), np.radians([12.0, 13.0]))) == 0
+
+
+MOON = "+proj=longlat +R=1737400 +no_defs"
+PLACES = np.array([75.3, 77.9, 79.2]), np.array([18.2, 21.7, 15.4])
+
+
+def ground(latitude, longitude):
+    """Heights in m, smooth and of more relief than any unit hides."""
+    return 1500.0 * np.cos(np.radians(6.0 * latitude)) + 800.0 * np.sin(np.radians(5.0 * longitude))
+
+
+def write_form(
+    path, crs=MOON, west=10.0, wide=1 / 16, high=1 / 16, scale=1.0, convert=lambda h: h, dtype="float32",
+    unit=None, scales=None, count=1, nodata=None, edge=None, mask=False,
+):  # fmt: skip
+    """The ground from 72 to 82 N and 10 to 25 E as a raster in longitude and latitude times ``scale``, in one form."""
+    rows, columns = round(10 / abs(high)), round(15 / wide)
+    latitude = 82.0 - (np.arange(rows) + 0.5) * abs(high)
+    longitude = 10.0 + (np.arange(columns) + 0.5) * wide
+    values = convert(ground(latitude[:, None], longitude[None, :]))
+    if edge is not None:
+        values[:8] = edge
+    if high < 0:
+        values = values[::-1]
+    start = 82.0 if high > 0 else 72.0
+    transform = rasterio.Affine(wide * scale, 0, west * scale, 0, -high * scale, start * scale)
+    shape = {"width": columns, "height": rows, "count": count, "dtype": dtype, "nodata": nodata}
+    with rasterio.open(path, "w", driver="GTiff", crs=crs, transform=transform, **shape) as target:
+        for band in range(1, count + 1):
+            target.write(values.astype(dtype), band)
+        if unit:
+            target.units = (unit,) * count
+        if scales:
+            target.scales, target.offsets = (scales[0],), (scales[1],)
+        if mask:
+            target.write_mask((np.arange(rows) >= 8)[:, None] & np.ones((rows, columns), bool))
+    return path
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        {},
+        {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"},
+        {"convert": lambda h: h + 1_737_400.0},
+        {"convert": lambda h: h / 1e3 + 1_737.4, "dtype": "float64"},
+        {"convert": lambda h: h / 1e3, "unit": "km"},
+        {"convert": lambda h: h / 1e3 + 1_737.4, "unit": "km"},
+        {"convert": lambda h: h / 0.3048, "unit": "ft"},
+        {"convert": lambda h: h * 3937 / 1200, "unit": "US survey foot"},
+        {"convert": lambda h: h * 10.0, "unit": "dm"},
+        {"convert": lambda h: np.rint(2 * h), "dtype": "int16", "scales": (0.5, 0.0)},
+        {"convert": lambda h: np.rint(2 * h), "dtype": "int16", "scales": (0.5, 1_737_400.0)},
+        {"convert": lambda h: h / 1e3, "scales": (1.0, 1_737.4)},
+        {"convert": np.rint, "dtype": "int16", "edge": -32768},
+        {"edge": -32768.0},
+        {"edge": -99_999.0},
+        {"edge": 1e20},
+        {"edge": np.nan},
+        {"edge": 0.0, "mask": True},
+        {"edge": 5.0, "nodata": 5.0},
+        {"west": -350.0},
+        {"west": 370.0},
+        {"crs": "+proj=eqc +R=1737400 +units=km", "scale": METRES_PER_DEGREE / 1e3},
+        {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
+        {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0},
+        {"high": 1 / 32},
+        {"high": -1 / 16},
+    ],
+)
+def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
+    terrain = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS)
+    found = terrain.height_m(*np.radians(PLACES))
+    # Half a metre of whole and half metres, and what one pixel of 1.9 km bends.
+    np.testing.assert_allclose(found, ground(*PLACES), atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
+        ({"convert": lambda h: h * 1e3}, r"expected heights of -9200 to 10800 m .* found -\d\.\d+e\+06 to"),
+        ({"convert": lambda h: h / 1e3 + 1_737.4, "unit": "m"}, None),
+        ({"convert": lambda h: 30.0 * h}, "expected heights of -9200 to 10800 m"),
+        ({"unit": "K"}, "in a unit of length .* found 'k'"),
+        ({"count": 2}, "one band of heights of 16 bits or more, found 2 of float32"),
+        ({"convert": lambda h: h / 20 + 120, "dtype": "uint8"}, "found 1 of uint8: a picture"),
+        (
+            {"crs": "+proj=longlat +a=1738100 +b=1736000 +no_defs"},
+            "found an ellipsoid of 1738.1 by 1736.0 km",
+        ),
+        ({"crs": "+proj=longlat +R=1738000 +no_defs"}, r"a sphere of 1737\.4 km, found one of 1738\.000 km"),
+        ({"crs": "EPSG:4326"}, "found a body of 6378"),
+    ],
+)
+def test_a_raster_with_another_unit_zero_or_body_is_refused_with_both_numbers(tmp_path, form, message):
+    path = write_form(tmp_path / "a.tif", **form)
+    if message is None:
+        # What a file states of its unit counts: this ground is flat, at 1,737 m.
+        found = RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
+        np.testing.assert_allclose(found, 1737.4, atol=2.0)
+        return
+    with pytest.raises(TerrainError, match=message):
+        RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
+
+
+@pytest.mark.parametrize(
+    ("convert", "message"),
+    [
+        (lambda h: h, None),
+        (lambda h: 2.0 * h, "found 2 times their relief"),
+        (lambda h: h / 0.3048, "found 3.28 times their relief"),
+        (lambda h: 0.5 * h, "found 0.5 times their relief"),
+        (lambda h: h - 600.0, "-600 m above them"),
+    ],
+)
+def test_heights_of_the_form_of_the_coarse_relief_have_its_scale_and_zero(tmp_path, convert, message):
+    fine = write_form(tmp_path / "fine.tif", convert=convert)
+    (relief,) = open_layers([write_form(tmp_path / "coarse.tif", wide=1 / 4, high=1 / 4)])
+    (layer,) = open_layers([fine], relief=relief)
+    if message is None:
+        layer.read(128, 160, 160, 240)
+        assert "1.00 times the relief of coarse.tif" in layer.readings[0]
+        return
+    with pytest.raises(TerrainError, match=message):
+        layer.read(128, 160, 160, 240)
+
+
+def test_a_layer_says_how_the_values_of_its_files_are_taken(tmp_path):
+    (layer,) = open_layers([write_form(tmp_path / "a.tif", convert=lambda h: h + 1_737_400.0, edge=-32768.0)])
+    layer.read(128, 160, 160, 240)
+    (words,) = layer.readings
+    assert "a.tif: unit not stated, scale 1, zero 0, no data None; values of 17" in words
+    assert "as radii in metres; -32768 (not stated) as no data" in words
+
+
+@pytest.mark.parametrize(
+    "crs",
+    [
+        "+proj=stere +lat_0=90 +R=1737400",
+        "+proj=stere +lat_0=90 +lon_0=100 +R=1737400 +units=km",
+        "+proj=laea +lat_0=78 +lon_0=17 +R=1737400",
+        "+proj=sinu +lon_0=17 +R=1737400",
+    ],
+)
+def test_any_projection_that_gdal_knows_is_read_at_its_places(tmp_path, crs):
+    with rasterio.Env():
+        unit_m = rasterio.CRS.from_string(crs).linear_units_factor[1]
+    step, size = 1_000.0 / unit_m, 900
+    (x,), (y,) = rasterio.warp.transform(MOON, crs, [17.0], [77.5])
+    transform = rasterio.Affine(step, 0, x - 0.5 * size * step, 0, -step, y + 0.5 * size * step)
+    column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
+    across, down = transform.c + step * column, transform.f - step * row
+    east, north = map(np.array, rasterio.warp.transform(crs, MOON, across.ravel(), down.ravel()))
+    values = ground(north, east).reshape(size, size).astype("float32")
+    terrain = RasterTerrain([write_tiff(tmp_path / "a.tif", transform, values, crs)], NONE, **AS_IT_IS)
+    # Two resamplings of pixels of 1 km.
+    np.testing.assert_allclose(terrain.height_m(*np.radians(PLACES)), ground(*PLACES), atol=1.0)
+    assert terrain.covers(*np.radians([(77.5, 10.0), (17.0, 200.0)])).tolist() == [True, False]
+
+
+def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
+    transform = rasterio.Affine(1e4, 0, -3e5, 0, -1e4, 3e5)
+    values = np.arange(3600, dtype="float32").reshape(60, 60)
+    (layer,) = open_layers(
+        [write_tiff(tmp_path / "a.tif", transform, values, "+proj=stere +lat_0=-90 +R=1737400")]
+    )
+    latitude, longitude = np.radians([-90.0, -81.0, -79.5, -79.5]), np.radians([0.0, 271.0, 45.0, 0.0])
+    assert layer.holds(latitude, longitude).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('POSITIVE_LONGITUDE_DIRECTION = "WEST"', "expected longitudes to the east, found"),
+        ("MAP_PROJECTION_ROTATION = 90.0", "expected MAP_PROJECTION_ROTATION = 0"),
+    ],
+)
+def test_a_label_whose_axes_gdal_does_not_read_is_refused(tmp_path, line, message):
+    values = np.zeros((32, 32), "<i2")
+    path = write_pds3(tmp_path / "A", 8.0, 22.0, 32, 32, 16, values, "LSB_INTEGER", "METER", 0, 0.0)
+    label = path.read_text().replace('POSITIVE_LONGITUDE_DIRECTION = "EAST"', line)
+    path.write_text(label)
+    with pytest.raises(TerrainError, match=message):
+        open_layers([path])
+
+
+def test_a_map_is_read_alike_on_both_sides_of_the_meridian_where_pixels_do_not_divide_the_circle(tmp_path):
+    # 250 m: a turn has 43,665.6 pixels.
+    step, size, path = 250.0, 960, tmp_path / "a.tif"
+    west = -0.5 * size * step
+    transform = rasterio.Affine(step, 0, west, 0, -step, 0.5 * size * step)
+    longitude = np.degrees((west + (np.arange(size) + 0.5) * step) / MOON_RADIUS_M)
+    values = np.repeat((3000.0 * longitude)[None, :], size, axis=0).astype("float32")
+    write_tiff(path, transform, values, "+proj=eqc +R=1737400")
+    terrain = RasterTerrain([path], NONE, **AS_IT_IS)
+    longitude = np.array([-1.2, -0.3, -0.01, 0.0, 0.02, 0.7, 1.3])
+    for turn in (0.0, 360.0):
+        found = terrain.height_m(np.zeros(7), np.radians(longitude + turn))
+        # 0.1 m of 3000 m in a degree are a metre on the ground.
+        np.testing.assert_allclose(found, 3000.0 * longitude, atol=0.1)

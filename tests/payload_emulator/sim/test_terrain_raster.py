@@ -117,12 +117,6 @@ def test_a_raster_without_georeference_is_refused(tmp_path):
         open_layers([path])
 
 
-def test_a_projected_raster_is_refused(tmp_path):
-    path = write_raster(tmp_path / "p.tif", 10.0, 20.0, 4.0, slope, crs="+proj=stere +lat_0=90 +R=1737400")
-    with pytest.raises(TerrainError, match="found the projection stere"):
-        open_layers([path])
-
-
 def test_a_missing_or_damaged_raster_is_named(tmp_path):
     with pytest.raises(TerrainError, match=r"gone\.tif: expected a raster"):
         open_layers([tmp_path / "gone.tif"])

@@ -8,6 +8,7 @@ import pytest
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.preprocess import prepare_image, quality_reason
 from payload_emulator.session.picture_files import read_picture
 from payload_emulator.training.data.pictures import LabelledPicture, load_pictures
 from payload_emulator.training.evaluate.evaluate import open_for_evaluation
@@ -108,7 +109,7 @@ def test_several_files_at_any_depth_are_one_set(tmp_path):
         ({"images": [{"id": 1, "file_name": "labels.json"}]}, "expected a file with one of .png"),
         (
             {"images": [{"id": 1, "file_name": "a.png"}, {"id": 1, "file_name": "a.png"}]},
-            "images[1].id: expected a number of its own, found 1 twice",
+            "images[1].id: expected an image with a number of its own, found 1 twice (also images[0])",
         ),
         (
             {"images": [{"id": 1, "file_name": "a.png", "width": 95, "height": 64}]},
@@ -131,6 +132,142 @@ def test_a_broken_set_is_refused_by_place(tmp_path, change, words):
     assert "\n" not in str(refusal.value)
 
 
+CRATER, BOULDER = {"id": 0, "name": "crater"}, {"id": 2, "name": "boulder", "supercategory": "rocks"}
+BOXES = [[10, 20, 20, 20], [40, 30, 12, 12], [60, 10, 30, 30], [5, 5, 8, 8]]
+
+
+def write_labels(folder, boxes=BOXES, change=lambda document: None, **keys):
+    """A set of one image of 96 x 64 pixels with a label for each box."""
+    document = {
+        "images": [{"id": 0, "file_name": "a.png"}],
+        "annotations": [
+            {"id": k, "image_id": 0, "category_id": 0, "bbox": box} | keys for k, box in enumerate(boxes)
+        ],
+        "categories": [CRATER, BOULDER],
+    }
+    change(document)
+    write_set(folder)
+    (folder / "labels.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_labels_of_other_categories_are_no_craters_and_are_counted(tmp_path):
+    def mixed(document):
+        for item in document["annotations"][1:]:
+            item["category_id"] = 2
+
+    (picture,) = load_pictures(write_labels(tmp_path, change=mixed))
+    assert picture.box_px.tolist() == [BOXES[0]] and picture.left_out == ("boulder",) * 3
+    (picture,) = load_pictures(tmp_path, category="Boulder")
+    assert picture.box_px.tolist() == BOXES[1:] and picture.left_out == ("crater",)
+    with pytest.raises(DatasetError, match="expected the category 'rim', found crater, boulder"):
+        load_pictures(tmp_path, category="rim")
+
+
+def test_a_supercategory_says_crater_too_and_a_set_without_craters_is_refused(tmp_path):
+    def renamed(document):
+        document["categories"][0] |= {"name": "fresh", "supercategory": "Craters"}
+
+    (picture,) = load_pictures(write_labels(tmp_path / "a", change=renamed))
+    assert len(picture.u_px) == 4
+    with pytest.raises(
+        DatasetError, match="expected a category that says crater, or --category, found boulder"
+    ):
+        load_pictures(write_labels(tmp_path / "b", change=lambda d: d["categories"].pop(0)))
+
+
+def test_a_label_that_is_listed_twice_counts_once(tmp_path):
+    (picture,) = load_pictures(write_labels(tmp_path, BOXES * 2))
+    assert picture.box_px.tolist() == BOXES and picture.repeated == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: [a.update(bbox=[*a["bbox"][:2], *np.add(a["bbox"][:2], a["bbox"][2:]).tolist()])
+                    for a in d["annotations"]], r"2 of 4 beyond its edge, such as \[40.*: \[x1, y1, x2, y2\]\?"),
+        (lambda d: [a.update(bbox=(np.array(a["bbox"]) / [96, 64, 96, 64]).tolist()) for a in d["annotations"]],
+         r"none over 0\.\d+: coordinates from 0 to 1"),
+        (lambda d: d["annotations"][0].update(bbox=[300, 20, 20, 20]), "1 of 4 beyond its edge"),
+        (lambda d: d["annotations"][1].update(id=0), r"tions\[1\].id: .* found 0 twice \(also annotations\[0\]\)"),
+        (lambda d: d["categories"][1].update(id=0), "expected a category with a number of its own, found 0 twice"),
+        (lambda d: d["images"][0].update(id=1.7), r"images\[0\].id: expected a whole number or a text, found 1.7"),
+        (lambda d: d["annotations"][0].update(category_id=7), "expected the id of a category, found 7"),
+        (lambda d: d["annotations"][0].pop("category_id"), "category_id: expected a value, found none"),
+    ],
+)  # fmt: skip
+def test_a_set_with_another_order_scale_or_identity_is_refused(tmp_path, change, message):
+    assert len(load_pictures(write_labels(tmp_path))[0].u_px) == 4
+    with pytest.raises(DatasetError, match=message):
+        load_pictures(write_labels(tmp_path, change=change))
+
+
+@pytest.mark.parametrize(
+    ("orientation", "seen"),
+    [
+        (1, [[0, 1, 2], [3, 4, 5]]),
+        (2, [[2, 1, 0], [5, 4, 3]]),
+        (3, [[5, 4, 3], [2, 1, 0]]),
+        (4, [[3, 4, 5], [0, 1, 2]]),
+        (5, [[0, 3], [1, 4], [2, 5]]),
+        (6, [[3, 0], [4, 1], [5, 2]]),
+        (7, [[5, 2], [4, 1], [3, 0]]),
+        (8, [[2, 5], [1, 4], [0, 3]]),
+    ],
+)
+def test_a_picture_is_turned_as_its_exif_data_state(tmp_path, orientation, seen):
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    values = 40 * np.arange(6, dtype=np.uint8).reshape(2, 3)
+    Image.fromarray(values).save(tmp_path / "a.png", exif=exif)
+    assert (read_picture(tmp_path / "a.png")[0] // 40).tolist() == seen
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "remark"),
+    [
+        ("float32", lambda a: a.__setitem__((0, 0), np.nan), "1 without data (black) of 4096 pixels"),
+        ("float32", lambda a: a.__setitem__(slice(0, 2), np.nan), "128 without data (black) of 4096 pixels"),
+        ("int32", lambda a: a.__setitem__(slice(0, 2), -32768), "128 without data (black) of 4096 pixels"),
+        ("float32", lambda a: a.__setitem__((0, 0), -3.4e38), "1 without data (black) of 4096 pixels"),
+        ("float32", lambda a: a.__setitem__((0, 0), 6_000.0), "1 hot (cut) of 4096 pixels"),
+        ("float32", lambda a: a.__setitem__((0, 0), np.inf), "1 without data (black) of 4096 pixels"),
+        ("uint16", lambda a: a.__setitem__((0, 0), 65_535), "1 hot (cut) of 4096 pixels"),
+    ],
+)
+def test_one_bad_pixel_costs_that_pixel(tmp_path, kind, change, remark):
+    import cv2
+
+    values = (100 + np.arange(4096) % 150).reshape(64, 64).astype(kind)
+    if kind == "int32":
+        from PIL import Image
+
+        write = lambda: Image.fromarray(values).save(tmp_path / "a.tif")  # noqa: E731
+    else:
+        write = lambda: cv2.imwrite(str(tmp_path / "a.tif"), values)  # noqa: E731
+    write()
+    whole, none = read_picture(tmp_path / "a.tif")
+    assert none == ""
+    change(values)
+    write()
+    found, words = read_picture(tmp_path / "a.tif")
+    assert words == remark
+    np.testing.assert_array_equal(found[2:], whole[2:])
+
+
+def test_a_picture_that_is_not_searched_says_why():
+    night = np.zeros((64, 64), np.uint8)
+    for image, words in (
+        (night, "0.00% of the pixels over 4.0% of full scale, expected over 0.2%"),
+        (night + np.uint8(255), "100.00% of the pixels over 99.6% of full scale, expected up to 60%"),
+        (night + np.uint8(90), "deviation 0.0000 of full scale, expected over 0.004"),
+        (np.full((64, 64), np.nan), "4096 of 4096 pixels hold no number"),
+    ):
+        assert quality_reason(image, prepare_image(image).quality) == words
+
+
 def test_what_is_no_set_is_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"expected a COCO file .* found none"):
         load_pictures(tmp_path)
@@ -143,9 +280,9 @@ def test_what_is_no_set_is_refused(tmp_path):
 
 def test_arrays_are_read_as_images(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[0.0, 5.0], [10.0, 2.5]]))
-    assert read_picture(tmp_path / "a.npy").tolist() == [[0.0, 0.5], [1.0, 0.25]]
+    assert read_picture(tmp_path / "a.npy")[0].tolist() == [[0.0, 0.5], [1.0, 0.25]]
     np.save(tmp_path / "b.npy", np.array([[0, 200]], np.uint8))
-    assert read_picture(tmp_path / "b.npy").tolist() == [[0, 200]]
+    assert read_picture(tmp_path / "b.npy")[0].tolist() == [[0, 200]]
 
 
 @pytest.mark.parametrize("values", [np.array([1.0]), np.array([["x"]]), np.array([[-1]]), np.array([[None]])])
@@ -237,7 +374,8 @@ def write_bowls(folder, azimuths, *, stated):
         cv2.imwrite(str(folder / f"{k}.png"), bowl_image(sun_azimuth_deg=azimuth))
         images.append({"id": k, "file_name": f"{k}.png"} | ({"sun_azimuth_deg": azimuth} if stated else {}))
         annotations += [
-            {"id": 9 * k, "image_id": k, "bbox": [u - 19.5, v - 19.5, 40, 40]} for u, v in BOWL_CENTRES
+            {"id": 9 * k + n, "image_id": k, "bbox": [u - 19.5, v - 19.5, 40, 40]}
+            for n, (u, v) in enumerate(BOWL_CENTRES)
         ]
     document = {"images": images, "annotations": annotations, "categories": []}
     (folder / "labels.json").write_text(json.dumps(document))

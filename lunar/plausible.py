@@ -1,0 +1,84 @@
+"""Limits of plausibility: what a value about the Moon, an orbit, a time, a camera or a crater can be, with sources.
+
+Readers of files compare what they find with these limits; no other module repeats one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lunar.arrays import BoolArray
+from lunar.constants import MOON_RADIUS_M
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Least and greatest plausible value of a quantity, both included, in `unit`."""
+
+    low: float
+    high: float
+    unit: str
+
+    def holds(self, values: ArrayLike) -> BoolArray:
+        """Return whether each value lies within the limits, (...); False for NaN."""
+        found = np.asarray(values)
+        return np.asarray((found >= self.low) & (found <= self.high))
+
+    def __str__(self) -> str:
+        return f"{self.low:.10g} to {self.high:.10g} {self.unit}".strip()
+
+
+HEIGHT_M = Limit(-9_200.0, 10_800.0, "m")
+"""Heights of the ground above `MOON_RADIUS_M` (LOLA: -9.12 km in Antoniadi, 10.79 km near Engel'gardt; Smith et al.
+2017, Icarus 283)."""
+
+RADIUS_M = Limit(MOON_RADIUS_M + HEIGHT_M.low, MOON_RADIUS_M + HEIGHT_M.high, "m")
+"""Distances of the ground from the Moon's centre."""
+
+SPHERE_TOLERANCE = 0.01
+"""Greatest relative difference of a reference sphere of the Moon from `MOON_RADIUS_M`: those in use have 1735 to 1738.1
+km, other bodies of the solar system differ by more."""
+
+RELIEF_M = 3.0
+"""Least standard deviation of heights over ground of 20 km: the flattest of all 136,000 cells of that size of GLD100
+has 4.6 m, the median 300 m."""
+
+MAP_SHIFT_M = 5_000.0
+"""More than any offset between published height models of the Moon."""
+
+CRATER_DIAMETER_M = Limit(1.0, 2_600_000.0, "m")
+"""The greatest is South Pole-Aitken: 2,400 km by 2,050 km (Garrick-Bethell & Zuber 2009, Icarus 204)."""
+
+CRATER_MEDIAN_M = Limit(100.0, 300_000.0, "m")
+"""Medians of the diameters of a list: published ones have 1 km (Robbins 2019) to 31 km (over 20 km), lists of basins
+200 km."""
+
+CRATER_DEPTH_RATIO = Limit(0.003, 0.3, "")
+"""Medians of depth over diameter: fresh simple craters have 0.20 (Pike 1977), those of 2 km or more in LU1319381 0.076,
+with 0.02 and 0.21 as first and last percentile."""
+
+LISTED_DEPTH_RATIO = Limit(0.45, 1.5, "")
+"""Medians of depths measured on a height raster over those in a list: on GLD100 at 128 pixels per degree, which smooths
+small craters, 0.59 (3 to 6 km) and 0.78 (6 to 30 km) of those of LU1319381."""
+
+CRATER_COVER = 1.0
+"""Greatest ground that the craters of a list cover, all with its median diameter, over the ground that they span: 0.06
+for the 222,447 craters of LU1319381 from 2 km on; saturated ground has 0.3."""
+
+ORBIT_RADIUS_M = Limit(MOON_RADIUS_M, 66_000_000.0, "m")
+"""From the ground to the sphere of influence of the Moon (Laplace)."""
+
+ORBIT_SPEED_M_S = Limit(0.0, 3_500.0, "m/s")
+"""Arrivals from the Earth pass low over the Moon with 2.3 to 2.6 km/s; escape at the ground is at 2.376 km/s."""
+
+UTC_NS = Limit(63_072_000_000_000_000, 4_102_444_800_000_000_000, "ns")
+"""From 1972-01-01, when UTC got whole leap seconds, to 2100-01-01."""
+
+CAMERA_FIELD_DEG = Limit(1.0, 170.0, "deg")
+"""Field of view of a camera with a plane image: wider, a pixel at the edge has 130 times the scale of the middle."""
+
+CAMERA_PIXELS = Limit(16, 8192, "pixels")
+"""Width and height of an image: from one cell of the detector to the largest sensors of small spacecraft."""
