@@ -176,21 +176,20 @@ def require_renderable(world: World) -> None:
     Raises
     ------
     ScenarioError
-        A picture or an altimeter needs ground beyond the limit of latitude.
+        A picture needs ground beyond the limit of latitude.
     """
     scenario, times = world.scenario, world.frame_utc_ns
     latitude, _, altitude = spherical_from_mcmf(world.truth.positions_mcmf(times))
     latitude = np.abs(latitude)
-    below = latitude >= POLE_LIMIT_RAD if "altimeter" in scenario.instruments else np.zeros(times.size, bool)
     in_view = latitude + np.arccos(MOON_RADIUS_M / (MOON_RADIUS_M + altitude)) + _SHADOW_RAD >= POLE_LIMIT_RAD
     if scenario.camera.images == "reduced" or world.external is not None:
         in_view[:] = False
-    for number in np.flatnonzero(below | in_view):
+    for number in np.flatnonzero(in_view):
         _, position, camera_from_mcmf, sun = _pose(world, int(times[number]))
         needed = float(latitude[number])
-        if in_view[number] and not _is_night(position, sun):
+        if not _is_night(position, sun):
             needed = max(needed, highest_latitude_rad(world.true_camera, position, camera_from_mcmf, sun))
-        if needed >= POLE_LIMIT_RAD and (below[number] or in_view[number]):
+        if needed >= POLE_LIMIT_RAD:
             raise ScenarioError(
                 f"scenario {scenario.name}: expected ground within {np.degrees(POLE_LIMIT_RAD):.0f} deg of latitude "
                 f"({world.terrain.name}), found {np.degrees(needed):.2f} deg needed by frame {number + 1} of "
