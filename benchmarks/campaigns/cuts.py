@@ -62,6 +62,9 @@ MISSIONS = (
     '[[packets]]\nname = "bus"\napids = [100, 101]\npacket_checksum = "none"\n',
     f'name = "prefixed"\n[spacecraft]\nid = {PREFIXED}\n[link]\npacket_prefix_octets = {PREFIX}\n',
     f'name = "bare"\n[spacecraft]\nid = {BARE}\n[link]\npacket_checksum = "none"\n',
+    'name = "uncoded"\n[spacecraft]\nid = 94\n[link]\nframe_length = 256\ncoding = "none"\n',
+    'name = "without proof"\n[spacecraft]\nid = 95\n'
+    '[link]\nframe_length = 256\ncoding = "none"\nframe_checksum = false\n',
 )
 NEW = ("packets_new", "samples")
 SUMS = ("crc_errors", "frames", "frames_bad", "symbols_corrected")
@@ -356,8 +359,7 @@ def contents(ground: Ground, case: Case, instance: str) -> dict[str, Any]:
         )
         account = completeness(ground, key)
         figures = asdict(replace(account, receptions=(), completeness=None))
-        # settings that were remembered in the meantime are no longer proposed
-        left_out = ("source", *(OF_LOST_FRAMES if case.kind == "damaged" else ()))
+        left_out = OF_LOST_FRAMES if case.kind == "damaged" else ()
         receptions = [
             {name: value for name, value in asdict(reception).items() if name not in left_out}
             for reception in account.receptions
