@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
+from benchmarks._servers import PostgresServer
 from benchmarks.downlink import telemetry
 from ground_service.errors import DatabaseBusy, GroundError
 from ground_service.ground import Ground, open_ground
@@ -39,7 +40,6 @@ from ground_service.store import repository
 from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
-from studies.harness.parts import PostgresServer
 from tests.ground_service.archive_hash import archive_hash
 from tmtc.crc import append_crc
 from tmtc.downlink import DownlinkEncoder
