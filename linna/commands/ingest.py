@@ -22,10 +22,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "--instance", str, "instance of the spacecraft", "flight")
     option(
         parser,
-        "--recording --stream NAME",
+        "--recording NAME",
         str,
         "name of the recording of which the files are consecutive pieces (default: each file is a recording)",
-        dest="recording",
     )
     option(
         parser,
