@@ -40,15 +40,13 @@ FRAMES = 2000
 SHORT = 400
 """Number of frames of the streams of a whole recording, and of the others."""
 
-WITHOUT_CHECKSUM = f"""
-schema_version = 1
-name = "packets without error control"
+MISSION = """
+name = "test"
 [spacecraft]
-id = {SPACECRAFT}
+id = {}
 [link]
-packet_checksum = "none"
-""".encode()
-"""Mission description that states for `ingest` what `tm check` is told by an option."""
+{}
+"""
 
 WEAK = 1.5e-2
 """Bit error rate at which hardly a codeword of Reed-Solomon (255, 223) can be repaired."""
@@ -64,6 +62,8 @@ class Stream:
     files: tuple[bytes, ...]
     packets: dict[int, frozenset[bytes]]
     error_control: bool = True
+    declared: tuple[str, ...] = ()
+    """Link settings of the mission descriptions that the ingest needs."""
 
     @property
     def true(self) -> int:
@@ -222,7 +222,11 @@ def settings_change() -> Stream:
     )
     parts = [cadus(SHORT, k, kind).reshape(-1) for k, kind in enumerate(kinds)]
     packets = [one for k, kind in enumerate(kinds) for one in telemetry(SHORT, k, kind)]
-    return _one("settings change twice", np.concatenate(parts), tuple(packets))
+    declared = (
+        'frame_length = 892\ninterleave = 4\nrandomiser = "long"',
+        'frame_length = 1024\ncoding = "none"',
+    )
+    return _one("settings change twice", np.concatenate(parts), tuple(packets), declared=declared)
 
 
 def every_frame_twice() -> Stream:
@@ -273,7 +277,8 @@ def uncoded_weak() -> Stream:
     settings = LinkSettings(coding="none")
     rows = with_bit_errors(cadus(SHORT, 2, settings), 2e-5, seed=3)
     found = packets_of(can_be_read(rows, settings), telemetry(SHORT, 2, settings), settings)
-    return _one("uncoded with checksum, bit error rate 2e-5", rows, found)
+    declared = ('coding = "none"',)
+    return _one("uncoded with checksum, bit error rate 2e-5", rows, found, declared=declared)
 
 
 def without_error_control() -> Stream:
@@ -283,7 +288,8 @@ def without_error_control() -> Stream:
         pack_packet(0x200 + k % 3, rng.bytes(60 + 40 * (k % 3)), sequence_count=k // 3, secondary_header=True)
         for k in range(7200)
     ]
-    return _one("7,200 packets without error control", b"".join(packets), tuple(packets), error_control=False)
+    name, declared = "7,200 packets without error control", ('packet_checksum = "none"',)
+    return _one(name, b"".join(packets), tuple(packets), error_control=False, declared=declared)
 
 
 STREAMS: dict[str, Callable[[], Stream]] = {
@@ -353,8 +359,8 @@ def ingested(stream: Stream) -> Found:
     bare = SPACECRAFT if not stream.error_control else None
     with tempfile.TemporaryDirectory() as folder:
         ground = open_ground(Path(folder, "home"))
-        if not stream.error_control:
-            add_mission(ground, WITHOUT_CHECKSUM)
+        for number, link in enumerate(stream.declared):
+            add_mission(ground, MISSION.format(SPACECRAFT + number, link).encode())
         accounted = 0
         for number, octets in enumerate(stream.files):
             path = Path(folder, f"{number}.bin")

@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks._ground_service import answers_under_load, memory_of_a_stream
 from benchmarks._rows import Row
+from benchmarks._servers import PostgresServer
 from ground_service.errors import GroundError
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
@@ -33,7 +34,6 @@ from ground_service.store.database import prepare_database
 from ground_service.store.rollups import STATE_VALUES
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
-from studies.harness.parts import PostgresServer
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer

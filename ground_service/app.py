@@ -78,7 +78,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         ground = ground_from_settings(settings)
         app.state.ground = ground
-        app.state.uploads = UploadPool(settings.uploads_at_once)
+        app.state.uploads = UploadPool()
         # Together with the threads of uploads, jobs and the feed, not more than the connections to the database.
         threads = SQLITE_THREADS if ground.database.dialect == "sqlite" else SERVER_THREADS
         to_thread.current_default_thread_limiter().total_tokens = threads

@@ -16,6 +16,7 @@ from ground_service.app import create_app
 from ground_service.errors import ServerError
 from ground_service.ground import ground_from_settings
 from ground_service.http.origins import LOOPBACK
+from ground_service.http.uploads import UPLOADS_AT_ONCE
 from ground_service.logs import logging_config
 from ground_service.settings import Settings
 from ground_service.worker.presence import present
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 FILES_KEPT = 320
 """Open files reserved for the database, the archive and the program."""
+
+MOST_CONNECTIONS = 4096
+"""Simultaneous connections, as far as the limit of open files permits; a proxy limits those of each address."""
 
 SOCKET_MESSAGE_OCTETS = 4096
 FIRST_REQUEST_S = 1.0
@@ -67,7 +71,7 @@ def serve(settings: Settings) -> None:
         app,
         http="h11",
         ws="websockets-sansio",
-        limit_concurrency=max(min(settings.connections, files - FILES_KEPT - settings.uploads_at_once), 16),
+        limit_concurrency=max(min(MOST_CONNECTIONS, files - FILES_KEPT - UPLOADS_AT_ONCE), 16),
         ws_max_size=SOCKET_MESSAGE_OCTETS,
         # Compression needs a compressor for each socket, too much memory for short messages.
         ws_per_message_deflate=False,

@@ -192,15 +192,6 @@ class Settings(BaseSettings):
         description="Folder shared with a runner (`linna runner`) that runs payload builds; "
         "default: builds run in a local sandbox, or are refused",
     )
-    uploads_at_once: int = Field(
-        default=64,
-        ge=1,
-        le=4096,
-        description="Simultaneous uploads; further ones wait for a short time, then get 503",
-    )
-    connections: int = Field(
-        default=4096, ge=16, description="Simultaneous connections, as far as the limit of open files permits"
-    )
     sockets: int = Field(default=500, ge=1, description="Simultaneous WebSockets")
     sockets_per_user: int = Field(
         default=30, ge=1, description="Simultaneous WebSockets of one user, or of one address without users"

@@ -56,7 +56,6 @@ TASKS: dict[str, dict[str, tuple[str, str]]] = {
             "Monte Carlo runs of anchored navigation: errors compared with covariances",
         ),
         "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
-        "identify": ("identify", "rates of crater identification and of wrong identifications"),
         "camera": ("camera", "probability of craters in the footprint over the field of view"),
         "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
         "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),

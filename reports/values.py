@@ -134,7 +134,6 @@ class ReceptionQuality:
 
     station: str
     source: str
-    ambiguous: bool
     frames: int
     frames_good: int
     symbols_corrected: int

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -31,7 +31,6 @@ from payload_emulator.session.starting import load_scenario_payload
 from payload_emulator.session.world import World, build_world, registered_share
 from payload_emulator.sim.terrain.curation import Region
 
-Direction = Literal["ascending", "descending", "any"]
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 SETTLED_FRAMES = 20
@@ -83,15 +82,13 @@ class SurveySession(BaseModel):
     data: tuple[str, ...]
 
 
-def survey_scenario(
-    base: Scenario, region: Region, windows: int, direction: Direction, seed: int
-) -> Scenario:
+def survey_scenario(base: Scenario, region: Region, windows: int, seed: int) -> Scenario:
     """Return the scenario of one seed over a region."""
     window = replace(
         base.window,
         search="terrain",
         passes=windows,
-        direction=direction,
+        direction="ascending",
         latitude_limit_deg=90.0,
         longitude_min_deg=region.west_deg,
         longitude_max_deg=region.east_deg,

@@ -20,6 +20,7 @@ from ground_service.http.times import UtcTime
 from ground_service.planning.request_model import PlannedCandidate, RequestPlan
 from ground_service.store import telemetry
 from ground_service.store.vehicles import vehicle_id
+from linna import cli
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
@@ -36,7 +37,7 @@ from studies.mission_run.disturbances import UNDISTURBED, ReferenceDisturbances,
 from studies.mission_run.dynamics import FlightDynamics
 from studies.mission_run.figures import Progress, missing_windows, note_plan, windows_asked
 from studies.mission_run.ground import EmbeddedGround
-from studies.mission_run.run import MissionRun, RunTerms, _read_progress, _take_turns, run_fleet, run_mission
+from studies.mission_run.run import MissionRun, RunTerms, _take_turns, read_progress, run_fleet, run_mission
 from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
@@ -323,7 +324,7 @@ def test_a_wait_for_stored_telemetry_ends_with_an_error_or_with_all(
 def test_the_folder_of_another_version_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "progress.json").write_text(text)
     with pytest.raises(ScenarioError, match=r"progress.json: expected .* start the run in a new folder$"):
-        _read_progress(tmp_path / "progress.json")
+        read_progress(tmp_path / "progress.json")
 
 
 @pytest.mark.parametrize(("days", "asked"), [(0.1, 0), (0.5, 2), (1.0, 2), (1.2, 4), (30.0, 60)])
@@ -452,3 +453,13 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     widened = Box(-5.0, 15.0, -13.0, 13.0).widened(5.0)
     places = np.array([0.0, 17.0, 19.0]), np.array([352.0, 19.0, 0.0])
     assert inside_box(widened, *places).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    "words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"], ["--kill", "1"]]
+)
+def test_options_that_do_not_fit_are_refused_in_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -8,7 +8,7 @@ by trial where they are not given, and never fails on damage: what is lost is co
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,15 @@ from tmtc.pus import TM_HEADER_LENGTH
 from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary, Table
 from tmtc.sequence import SequenceReport, account
-from tmtc.stream import CHECKED, PacketCut, PacketForm, PrimaryHeaders, cut_packets, primary_headers
+from tmtc.stream import (
+    CHECKED,
+    PacketCut,
+    PacketForm,
+    PrimaryHeaders,
+    cut_packets,
+    find_prefix,
+    primary_headers,
+)
 
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
 _DEFAULT = LinkSettings()
@@ -353,16 +361,32 @@ def propose_settings(octets: Octets) -> LinkProposal:
     return propose_link(stream, counter, survey_markers(stream))
 
 
-def plan_of(
-    octets: Octets,
-    known: Sequence[LinkSettings] = (),
-    *,
-    dictionary: Dictionary = DICTIONARY,
-    form: PacketForm = CHECKED,
-) -> LinkPlan:
-    """Return the sections of a stream of CADUs and their link settings; no sections for bare packets.
+def propose_packets(octets: Octets) -> tuple[int, PacketForm | None]:
+    """Return the number of packets of a stream without frames, and the form that fits most of it; 0 and None if none.
 
-    `known` settings are tried first (see `link_plan.plan_link`).
+    Packets that have a checksum need not fill the stream.
+    """
+    stream = as_octets(octets)
+    for tried in (CHECKED, replace(CHECKED, error_control=False)):
+        fits = [
+            _packets_of_form(stream, replace(tried, prefix_octets=n)) for n in (0, find_prefix(stream, tried))
+        ]
+        octets_used, packets, form = max(fits, key=lambda one: one[0])
+        if 2 * octets_used >= stream.size > 0:
+            return packets, form
+    packets = int(np.count_nonzero(cut_packets(stream, form=CHECKED).crc_ok))
+    return packets, CHECKED if packets else None
+
+
+def _packets_of_form(stream: OctetArray, form: PacketForm) -> tuple[int, int, PacketForm]:
+    """Return the octets of the packets of a form and their prefixes, the number of packets, and the form."""
+    cut = cut_packets(stream, form=form)
+    good = cut.lengths[cut.crc_ok]
+    return int(good.sum()) + good.size * form.prefix_octets, good.size, form
+
+
+def plan_of(octets: Octets, *, dictionary: Dictionary = DICTIONARY, form: PacketForm = CHECKED) -> LinkPlan:
+    """Return the sections of a stream of CADUs and their link settings; no sections for bare packets.
 
     Raises
     ------
@@ -370,7 +394,7 @@ def plan_of(
         The stream contains markers, but no frame is valid under any known link setting.
     """
     stream = as_octets(octets)
-    plan = plan_link(stream, _packet_counter(stream, dictionary, form.in_frames), known)
+    plan = plan_link(stream, _packet_counter(stream, dictionary, form.in_frames))
     if plan.sections or not plan.has_regular_markers:
         return plan
     cut = cut_packets(stream, form=form)

@@ -1,9 +1,9 @@
 """Sections of a stream and their link settings: one decision for every program that reads the stream.
 
-The undamaged markers of the whole stream are surveyed. Known settings are tried first, then those that the evidence of
-the whole stream supports. Where several consecutive blocks have markers but no valid frame under any of them, other
-settings are proposed for these blocks. A section ends with the last valid frame of its settings before valid frames of
-others.
+The undamaged markers of the whole stream are surveyed. Declared settings are used where frames are valid with them.
+Without a declaration, those are used that the evidence of the whole stream supports; where several consecutive blocks
+have markers but no valid frame under them, other settings are proposed for these blocks. A section ends with the last
+valid frame of its settings before valid frames of others.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LEAST_UNPROVED = 3
 """Smallest number of frames without code and checksum from which their settings are accepted."""
 
 SMALL_OCTETS = 1 << 16
-"""Length of a stream up to which known settings are tried without undamaged markers."""
+"""Length of a stream up to which declared settings are tried without undamaged markers."""
 
 _BATCH_ROWS = 512
 
@@ -53,8 +53,8 @@ class LinkSection:
 class LinkPlan:
     """Sections of a stream, without gaps and in order; empty for a stream without frames.
 
-    `proposal` is the evidence of the whole stream (None: known settings hold). `has_regular_markers`: the stream has
-    more, or more regular, markers than random data.
+    `proposal` is the evidence of the whole stream (None: the settings are declared). `has_regular_markers`: the stream
+    has more, or more regular, markers than random data.
     """
 
     sections: tuple[LinkSection, ...]
@@ -67,35 +67,39 @@ class LinkPlan:
         return self.proposal is not None and self.proposal.ambiguous
 
 
-def plan_link(
-    stream: OctetArray,
-    count_packets: CountPackets,
-    known: Sequence[LinkSettings] = (),
-) -> LinkPlan:
-    """Return the sections of a stream.
+def declared_sections(
+    stream: OctetArray, survey: MarkerSurvey, declared: Sequence[LinkSettings]
+) -> tuple[LinkSection, ...]:
+    """Return the sections of a stream (n,) in which frames are valid with declared settings; none without such frames.
 
-    Parameters
-    ----------
-    stream : (n,) uint8
-    count_packets
-        Counts the valid packets in some CADUs of a part of the stream (see `link_check.propose_link`).
-    known
-        Settings that the stream is expected to have; those of frames without code and checksum are not tried, because
-        no frame could contradict them.
+    Frames without code and checksum are valid if their markers have the distance of the settings.
+    """
+    trial = _Trial(stream, survey)
+    proved = [one for one in declared if one.proves_frames]
+    for settings in proved:
+        trial.try_settings(settings)
+    if not trial.found:
+        # a piece so small may hold no undamaged marker
+        valid = [one for one in proved if stream.size <= SMALL_OCTETS and _valid_starts(stream, one).size]
+        valid += [one for one in declared if not one.proves_frames and _are_at_distance(survey, one)]
+        if valid:
+            trial.try_settings(valid[0], always=True)
+    return tuple(trial.sections())
+
+
+def _are_at_distance(survey: MarkerSurvey, settings: LinkSettings) -> bool:
+    return survey.distances.get(settings.cadu_length, 0) >= LEAST_UNPROVED - 1
+
+
+def plan_link(stream: OctetArray, count_packets: CountPackets) -> LinkPlan:
+    """Return the sections of a stream (n,) whose settings are not declared.
+
+    `count_packets` counts the valid packets in some CADUs of a part of the stream (see `link_check.propose_link`).
     """
     survey = survey_markers(stream)
     trial = _Trial(stream, survey)
-    for settings in dict.fromkeys(known):
-        if settings.proves_frames:
-            trial.try_settings(settings)
-    if not trial.found and stream.size <= SMALL_OCTETS:
-        # a piece so small may hold no undamaged marker
-        for settings in dict.fromkeys(known):
-            if settings.proves_frames and _valid_starts(stream, settings).size:
-                trial.try_settings(settings, always=True)
-                break
     proposal = None
-    if not trial.found and survey.markers:
+    if survey.markers:
         proposal = propose_link(stream, count_packets, survey)
         if proposal.settings is not None and not proposal.settings.proves_frames:
             whole = LinkSection(0, stream.size, proposal.settings)

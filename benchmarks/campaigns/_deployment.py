@@ -7,14 +7,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from studies.harness.parts import (
-    Part,
-    PostgresServer,
-    RedisServer,
-    bare_environment,
-    free_port,
-    listens,
-)
+from benchmarks._servers import PostgresServer, RedisServer
+from studies.harness.parts import Part, bare_environment, free_port, listens
 
 
 def service_environment(**settings: str) -> dict[str, str]:

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
+from benchmarks._servers import PostgresServer
 from benchmarks.downlink import telemetry
 from ground_service.errors import DatabaseBusy, GroundError
 from ground_service.ground import Ground, open_ground
@@ -39,7 +40,6 @@ from ground_service.store import repository
 from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
-from studies.harness.parts import PostgresServer
 from tests.ground_service.archive_hash import archive_hash
 from tmtc.crc import append_crc
 from tmtc.downlink import DownlinkEncoder
@@ -62,6 +62,9 @@ MISSIONS = (
     '[[packets]]\nname = "bus"\napids = [100, 101]\npacket_checksum = "none"\n',
     f'name = "prefixed"\n[spacecraft]\nid = {PREFIXED}\n[link]\npacket_prefix_octets = {PREFIX}\n',
     f'name = "bare"\n[spacecraft]\nid = {BARE}\n[link]\npacket_checksum = "none"\n',
+    'name = "uncoded"\n[spacecraft]\nid = 94\n[link]\nframe_length = 256\ncoding = "none"\n',
+    'name = "without proof"\n[spacecraft]\nid = 95\n'
+    '[link]\nframe_length = 256\ncoding = "none"\nframe_checksum = false\n',
 )
 NEW = ("packets_new", "samples")
 SUMS = ("crc_errors", "frames", "frames_bad", "symbols_corrected")
@@ -356,8 +359,7 @@ def contents(ground: Ground, case: Case, instance: str) -> dict[str, Any]:
         )
         account = completeness(ground, key)
         figures = asdict(replace(account, receptions=(), completeness=None))
-        # settings that were remembered in the meantime are no longer proposed
-        left_out = ("source", *(OF_LOST_FRAMES if case.kind == "damaged" else ()))
+        left_out = OF_LOST_FRAMES if case.kind == "damaged" else ()
         receptions = [
             {name: value for name, value in asdict(reception).items() if name not in left_out}
             for reception in account.receptions

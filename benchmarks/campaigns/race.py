@@ -38,6 +38,7 @@ from typing import Any
 
 from sqlalchemy import func, select
 
+from benchmarks._servers import PostgresServer
 from benchmarks.campaigns._deployment import ManyApis
 from ground_service.access.service import add_user
 from ground_service.clock import utc_now_ns
@@ -47,7 +48,6 @@ from ground_service.planning.service import WindowEntry, add_window, change_wind
 from ground_service.regression.builds import load_build, register_build
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
-from studies.harness.parts import PostgresServer
 
 SHARES = {"release": 60, "uplink": 15, "approve": 10, "window": 9, "ingest": 3, "regress": 3}
 """Share of each kind of race in percent."""

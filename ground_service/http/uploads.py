@@ -21,6 +21,7 @@ from ground_service.http.problems import BrokenOff, Busy, TooLarge, UnsupportedE
 from ground_service.store.files import FileArchive, StoredFile
 
 BLOCK_OCTETS = 1 << 19
+UPLOADS_AT_ONCE = 64
 WRITERS = 2
 WAITING_LIMIT = 256
 WAIT_S = 5.0
@@ -31,7 +32,7 @@ Result = TypeVar("Result")
 class UploadPool:
     """Upload slots of one process, and the threads that write uploads."""
 
-    def __init__(self, at_once: int) -> None:
+    def __init__(self, at_once: int = UPLOADS_AT_ONCE) -> None:
         self._places = asyncio.Semaphore(at_once)
         self._waiting = 0
         self._threads = ThreadPoolExecutor(WRITERS, thread_name_prefix="upload")

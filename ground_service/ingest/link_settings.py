@@ -1,44 +1,32 @@
-"""What is known before a piece is read: link settings, station records and declared packets.
+"""Declarations that a piece is read with: link settings, station records and packets.
 
-The settings of a mission description or of earlier receptions are tried and used where they hold. Other settings follow
-from the evidence of the octets. Only settings that the sender states are used without evidence. Settings and
-descriptions are only ever added: they are kept in memory and read again when one query shows that something was added.
+Link settings are those that the sender or the mission description states, otherwise the defaults of `LinkSettings`.
+They are never inferred from the octets. Descriptions are only ever added: they are kept in memory and read again when
+one query shows that something was added.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from sqlalchemy import Connection, Engine
 
-from ground_service.access.service import audit
 from ground_service.ingest.parameters import definitions_of_spacecraft
 from ground_service.ingest.quality import NO_RECORD, RecordFormat
-from ground_service.ingest.recording_store import (
-    Piece,
-    Surroundings,
-    add_good_link,
-    good_links,
-    surroundings,
-)
+from ground_service.ingest.recording_store import Piece, Surroundings, surroundings
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.missions.model import Link, StationLink
 from ground_service.missions.store import links_in_force
 from tmtc.link import LinkSettings
 from tmtc.stream import CHECKED, PacketForm
 
-STATED, MISSION, REMEMBERED, PROPOSED = "stated", "mission", "remembered", "proposed"
-ACTOR = "ingest"
+STATED, MISSION, DEFAULT = "stated", "mission", "default"
 
 KEPT = 64
 """Largest number of scopes, spacecraft and stations whose knowledge is kept."""
-
-DEFAULT_LINKS = (LinkSettings().explicit, LinkSettings(checksum=False).explicit)
-"""Settings that are tried without any evidence."""
 
 _NAMES = {
     "frame_length": "frame_length",
@@ -53,36 +41,31 @@ _NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLink:
-    """What is known of the link of a piece before it is read.
+    """Declared link of a piece: settings that its frames may have, station records and form of the packets.
 
-    `stated` settings are used as they are. `mission` and `remembered` settings are tried in this order. `form` is that
-    of the packets of the spacecraft.
+    `settings` are those of its sender, or of the descriptions in force of its spacecraft, or of all spacecraft; the
+    defaults come last where a spacecraft may have no description that states settings.
     """
 
-    stated: LinkSettings | None = None
-    mission: tuple[LinkSettings, ...] = ()
-    remembered: tuple[LinkSettings, ...] = ()
-    record: RecordFormat = NO_RECORD
-    form: PacketForm = CHECKED
+    stated: LinkSettings | None
+    mission: tuple[LinkSettings, ...]
+    record: RecordFormat
+    form: PacketForm
+    has_default: bool
 
     @property
-    def candidates(self) -> list[LinkSettings]:
-        """Settings to try, the most likely first."""
-        return list(dict.fromkeys([*self.mission, *self.remembered, *DEFAULT_LINKS]))
+    def settings(self) -> tuple[LinkSettings, ...]:
+        """Settings that frames may have, the most likely first."""
+        if self.stated is not None:
+            return (self.stated,)
+        default = (LinkSettings().explicit,) if self.has_default else ()
+        return tuple(dict.fromkeys((*self.mission, *default)))
 
     def source_of(self, settings: LinkSettings) -> str:
-        """Return where settings come from."""
-        same = describe(settings)
+        """Return who declares settings."""
         if self.stated is not None:
             return STATED
-        if same in [describe(one) for one in self.mission]:
-            return MISSION
-        return REMEMBERED if same in [describe(one) for one in self.remembered] else PROPOSED
-
-
-def describe(settings: LinkSettings) -> dict[str, Any]:
-    """Return settings by name; equal for settings that give equal frames."""
-    return settings.describe()
+        return MISSION if settings in self.mission else DEFAULT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,16 +108,16 @@ def expected_link(connection: Connection, piece: Piece) -> ExpectedLink:
     links = links_in_force(connection, piece.spacecraft_id, piece.scope)
     found = [settings_of(link, piece.station) for link in links.values()]
     stations = [station for link in links.values() if (station := _station(link, piece.station))]
-    remembered = [*good_links(connection, piece, piece.station), *good_links(connection, piece, None)]
     form = CHECKED
     if piece.spacecraft_id is not None:
         form = packet_form(connection, piece.spacecraft_id, piece.scope, piece.station)
+    mission = tuple(dict.fromkeys(one for one in found if one is not None))
     return ExpectedLink(
         stated=None if piece.link is None else LinkSettings.parse(piece.link).explicit,
-        mission=tuple(dict.fromkeys(one for one in found if one is not None)),
-        remembered=tuple(dict.fromkeys(remembered)),
+        mission=mission,
         record=_record(stations[0]) if stations else NO_RECORD,
         form=form,
+        has_default=piece.spacecraft_id is None or not mission,
     )
 
 
@@ -151,11 +134,9 @@ def packet_form(connection: Connection, spacecraft: int, scope: str, station: st
 
 
 def settings_of(link: Link, station: str) -> LinkSettings | None:
-    """Return the settings that a description states for a station; None if coding or frame length are not stated."""
-    stated = _stated(link, station)
-    if not {"frame_length", "coding"} <= stated.keys():
-        return None
-    return LinkSettings(**{_NAMES[name]: value for name, value in stated.items() if name in _NAMES}).explicit
+    """Return the settings that a description states for a station, with defaults; None if it states none."""
+    stated = {_NAMES[name]: value for name, value in _stated(link, station).items() if name in _NAMES}
+    return LinkSettings(**stated).explicit if stated else None
 
 
 def _stated(link: Link, station: str) -> dict[str, Any]:
@@ -176,18 +157,3 @@ def _record(station: StationLink) -> RecordFormat:
         station.time_code,
         station.time_offset or 0,
     )
-
-
-def remember_link(
-    connection: Connection,
-    piece: Piece,
-    vehicles: Iterable[int],
-    settings: LinkSettings,
-    now_utc_ns: int,
-) -> None:
-    """Record settings under which frames of spacecraft were valid, if they differ from the last ones."""
-    for vehicle in sorted(vehicles):
-        if not add_good_link(connection, piece, vehicle, settings, now_utc_ns):
-            continue
-        detail = {"ingest_id": piece.ingest_id, "station": piece.station, "settings": describe(settings)}
-        audit(connection, ACTOR, "remember link settings", f"vehicle {vehicle}", detail)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity
 from ground_service.http.times import UtcTime
@@ -22,7 +22,7 @@ class ReceivedSection(Entity):
 
     start: int
     stop: int
-    source: str = Field(description="stated, mission, remembered or proposed", examples=["mission"])
+    source: str = Field(description="stated (by the sender), mission or default", examples=["mission"])
     frame_length: int = Field(examples=[1115])
     cadu_length: int = Field(examples=[1279])
     coding: str = Field(examples=["rs"])
@@ -36,8 +36,9 @@ class ReceivedSection(Entity):
 class ReceivedLink(Entity):
     """Link quality of one piece, see `ingest.quality.Found`; null: unknown."""
 
+    model_config = ConfigDict(extra="ignore", frozen=True)  # accountings of earlier versions have more fields
+
     station: str = Field(description="Empty: not stated", examples=["madrid"])
-    ambiguous: bool = Field(description="Other link settings have equal support")
     frames: int
     frames_good: int
     codewords: int
@@ -115,6 +116,9 @@ class IngestResult(Entity):
     last_ticks: int | None = None
     vehicle_ids: tuple[int, ...] = Field(default=(), description="Vehicles whose packets the file contains")
     reception: ReceivedLink | None = Field(default=None, description="null: bare packets")
+    remark: str = Field(
+        default="", description="How the octets contradict the declared link; empty: they fit"
+    )
     uplink: tuple[ReceivedControlWords, ...] = ()
 
 

@@ -23,7 +23,7 @@ from ground_service.ingest import recording_store as recordings
 from ground_service.ingest.bare import PacketReader
 from ground_service.ingest.fragments import Fragment, complete, join
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
-from ground_service.ingest.link_settings import known_before, packet_form, remember_link
+from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
 from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
 from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
@@ -39,11 +39,11 @@ from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import plan_of
-from tmtc.errors import UnknownCoding
 from tmtc.link import LinkSettings
+from tmtc.link_plan import declared_sections
+from tmtc.marker_survey import survey_markers
 from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.stream import PacketForm, cut_packets, find_prefix, primary_headers, whole_packets
+from tmtc.stream import PacketForm, cut_packets, whole_packets
 
 Progress = Callable[[float], None]
 
@@ -51,18 +51,13 @@ WINDOW_OCTETS = 2 << 20
 """Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory:
 decoding and storing take about ten times as much."""
 
-LEAST_GOOD_FRAMES = 2
-"""Smallest number of good frames from which their link settings are remembered."""
-
 FRAGMENTS_LIMIT = 1_000
 """Number of fragments of packets from which they are stored before the end of a piece."""
 
 CERTAIN_OCTETS = 4 * CADU_MAX_OCTETS
-"""Length of a piece from which an unknown coding is an error, and not a lack of evidence."""
+"""Length of a piece from which no valid frame is a contradiction of the declaration, and not a lack of evidence."""
 
-MOST_APIDS = 8
-"""Largest number of APIDs that a message names."""
-
+CHECK = "`linna link check FILE` shows the settings of its frames or packets, to be stated in the mission description"
 HINT = "pieces of one recording are ingested with its name and their offsets (--recording NAME FILE...)"
 
 
@@ -180,7 +175,7 @@ class Reading:
         self.sections: list[Section] = []
         self.has_link = False
         self.octets_new = piece.octets
-        self.ambiguous = False
+        self.is_framed = False
         self.is_started = False
         self.result: IngestResult
 
@@ -201,11 +196,9 @@ class Reading:
                 held = batch
             fragments += reader.take_fragments()
             end = max(end, reader.end)
-        if not self.piece.stream and not self.found.frames and not self.found.packets:
-            self._refuse(
-                "no valid frame or packet"
-                + _remedy(run.read(0, min(run.octets, WINDOW_OCTETS)), self.expected.form)
-            )
+        found = self.found
+        if not (self.piece.stream or found.frames or found.packets or self.is_framed):
+            self._refuse()
         self._settle(held, fragments, is_last=True)
 
     # The run and its sections
@@ -227,34 +220,27 @@ class Reading:
         return run
 
     def _links(self, run: Run) -> list[tuple[int, int, LinkSettings | None]]:
-        """Return the parts [start, stop) of a run with their link settings; none without evidence.
+        """Return the parts [start, stop) of a run with their declared link settings; none without frames and packets.
 
-        Raises
-        ------
-        InvalidInput
-            If the piece has frames whose coding is unknown.
+        Frames that do not fit any declared settings have the first ones: their octets are kept and accounted for.
         """
-        if self.expected.stated is not None:
-            return [(0, run.octets, self.expected.stated)]
-        around = self.piece.octets <= WINDOW_OCTETS
-        octets = run.whole() if around else mapped_octets(run.files.path(self.piece.file_sha256))
-        try:
-            plan = plan_of(octets, self.expected.candidates, form=self.expected.form)
-        except UnknownCoding as error:
-            if self.piece.octets >= CERTAIN_OCTETS or not self.piece.stream:
-                self._refuse(error.found, error.expected)
-            return []
-        self.ambiguous = plan.ambiguous
-        if not plan.sections:
-            # few frames without proof look like packets
-            has_markers = plan.proposal is not None and plan.proposal.markers > 0
-            if has_markers and self.piece.stream and octets.size < CERTAIN_OCTETS:
-                return []
-            return [(0, run.octets, None)] if self._has_packets(octets) else []
-        shift = 0 if around else run.first
-        starts = [0, *(one.start + shift for one in plan.sections[1:])]
-        settings = [one.settings.explicit for one in plan.sections]
-        return list(zip(starts, [*starts[1:], run.octets], settings, strict=True))
+        expected, piece = self.expected, self.piece
+        if expected.stated is not None:
+            return [(0, run.octets, expected.stated)]
+        around = piece.octets <= WINDOW_OCTETS
+        octets = run.whole() if around else mapped_octets(run.files.path(piece.file_sha256))
+        survey = survey_markers(octets)
+        if sections := declared_sections(octets, survey, expected.settings):
+            shift = 0 if around else run.first
+            starts = [0, *(one.start + shift for one in sections[1:])]
+            ends = [*starts[1:], run.octets]
+            return list(zip(starts, ends, (one.settings for one in sections), strict=True))
+        if survey.markers and piece.stream and octets.size < CERTAIN_OCTETS:
+            return []  # few frames without proof look like packets
+        if self._has_packets(octets):
+            return [(0, run.octets, None)]
+        self.is_framed = survey.is_regular
+        return [(0, run.octets, expected.settings[0])] if survey.is_regular else []
 
     def _links_of_recording(self, run: Run) -> list[tuple[int, int, LinkSettings | None]]:
         """Return the link settings of other pieces of the recording, for one without evidence; none if not known."""
@@ -337,8 +323,8 @@ class Reading:
                 )
         return self.definitions[spacecraft]
 
-    def _refuse(self, found: str, expected: str = "a stream of CADUs or of space packets") -> NoReturn:
-        """Refuse a piece.
+    def _refuse(self) -> NoReturn:
+        """Refuse a whole recording without a frame and a packet.
 
         Raises
         ------
@@ -347,9 +333,10 @@ class Reading:
         """
         with self.ground.database.reading() as connection:
             name = recorded_name(connection, self.piece.file_sha256)
-        if self.piece.octets < CERTAIN_OCTETS and not self.piece.stream:
+        found = f"{self.piece.octets} octets with no frame or packet of the declared link; {CHECK}"
+        if self.piece.octets < CERTAIN_OCTETS:
             found += f"; {HINT}"
-        raise InvalidInput(name, "", expected, f"{self.piece.octets} octets with {found}")
+        raise InvalidInput(name, "", "a stream of CADUs or of space packets", found)
 
     # Storage
 
@@ -438,7 +425,6 @@ class Reading:
         if not is_last:
             recordings.count_stored(connection, key, added)
             return
-        self._remember(connection)
         waits = None if self.has_link else 1
         self.result = self._result(recordings.count_stored(connection, key, added, waits=waits))
         store.finish_ingest(connection, self.result, utc_now_ns())
@@ -451,14 +437,6 @@ class Reading:
             note_dictionary(connection, vehicle)
             self.vehicles[spacecraft] = vehicle
         return self.vehicles[spacecraft]
-
-    def _remember(self, connection: Connection) -> None:
-        """Remember link settings under which frames were valid."""
-        settings = tuple({one.settings for one in self.sections if one.settings is not None})
-        is_last = self.piece.spacecraft_id is not None and settings == self.expected.remembered[:1]
-        if self.found.frames_good >= LEAST_GOOD_FRAMES and not is_last:
-            for one in settings:
-                remember_link(connection, self.piece, self.vehicles.values(), one, utc_now_ns())
 
     def readable_now(self) -> list[Piece]:
         """Return the pieces that can be read because the link of their recording is known."""
@@ -507,11 +485,26 @@ class Reading:
             last_ticks=self.ticks[-1] if self.ticks else None,
             vehicle_ids=tuple(sorted(self.vehicles.values())),
             reception=self._reception(),
+            remark=self._remark(),
             uplink=tuple(
                 ReceivedControlWords(spacecraft_id=spacecraft_id, **asdict(seen))
                 for (spacecraft_id, _), seen in sorted(found.uplink.items())
             ),
         )
+
+    def _remark(self) -> str:
+        """Return how the octets contradict the declared link; empty if they fit."""
+        settings = [one.settings for one in self.sections if one.settings is not None]
+        good, frames = self.found.frames_good, self.found.frames
+        if (
+            not (frames or self.is_framed)
+            or not all(one.proves_frames for one in settings)
+            or 2 * good > frames
+        ):
+            return ""
+        declared = ", ".join(f"{name}={value}" for name, value in settings[0].describe().items())
+        source = self.expected.source_of(settings[0])
+        return f"{good} of {frames} frames are valid with the {source} link settings ({declared}): {CHECK}"
 
     def _reception(self) -> ReceivedLink | None:
         """Return the link quality, the sections of the file and the origin of their settings."""
@@ -521,7 +514,6 @@ class Reading:
         names = {one.name for one in fields(Found)} & set(ReceivedLink.model_fields)
         return ReceivedLink(
             station=self.piece.station,
-            ambiguous=self.ambiguous,
             bit_error_rate=self.found.bit_error_rate,
             octets=self.octets_new,
             octets_other=self.octets_new - self.found.octets_used,
@@ -538,23 +530,3 @@ class Reading:
                 for one, settings in framed
             ),
         )
-
-
-def _remedy(octets: OctetArray, form: PacketForm) -> str:
-    """Return what a mission description must state for octets without packets of a form; empty if nothing helps."""
-    for tried in (form, replace(form, error_control=False)):
-        prefix = find_prefix(octets, tried)
-        cut = cut_packets(octets, form=replace(tried, prefix_octets=prefix))
-        good = cut.lengths[cut.crc_ok] + prefix
-        stated = [] if tried.error_control else ['link.packet_checksum = "none"']
-        stated += [f"link.packet_prefix_octets = {prefix}"] if prefix != form.prefix_octets else []
-        if not stated or 2 * int(good.sum()) < octets.size:
-            continue
-        checksum = "" if tried.error_control else " without checksum"
-        behind = f", each behind {prefix} other octets" if prefix else ""
-        apids = ", ".join(str(one) for one in np.unique(primary_headers(octets, cut).apid)[:MOST_APIDS])
-        return (
-            f"; the first {octets.size} octets look like {good.size} packets{checksum} of APID {apids}{behind}: "
-            f"state {' and '.join(stated)} in the mission description"
-        )
-    return ""

@@ -1,4 +1,4 @@
-"""SQL of recordings: their pieces, fragments of packets that wait for others, and what is known of their links.
+"""SQL of recordings: their pieces, fragments of packets that wait for others, and the state of the archive around them.
 
 Every query uses an index and returns a bounded number of rows, so its cost does not depend on the number of pieces.
 """
@@ -17,7 +17,6 @@ from ground_service.ingest.fragments import UNKNOWN, Fragment, fits
 from ground_service.store.counters import hold
 from ground_service.store.repository import (
     FRAGMENTS,
-    GOOD_LINKS,
     INGESTS,
     MISSIONS,
     PACKET_DECODINGS,
@@ -25,7 +24,6 @@ from ground_service.store.repository import (
     PIECES,
     VEHICLES,
 )
-from tmtc.link import LinkSettings
 
 DIGEST_OCTETS = 16
 BLOCK = 64
@@ -73,7 +71,7 @@ class Neighbours:
 class Surroundings:
     """State of the archive before a piece is read.
 
-    `revision` changes when good settings, a mission description or the pass of an archive is added. The others are
+    `revision` changes when a mission description or the pass of an archive is added. The others are
     those of the vehicle of the piece, None if there is none; `has_decodings`: packets of it were decoded as declared.
     """
 
@@ -281,7 +279,7 @@ def _digest(fragment: Fragment) -> bytes:
     return hashlib.blake2b(repr(fragment).encode(), digest_size=DIGEST_OCTETS).digest()
 
 
-# Links
+# State of the archive
 
 
 def surroundings(connection: Connection, piece: Piece) -> Surroundings:
@@ -294,7 +292,6 @@ def surroundings(connection: Connection, piece: Piece) -> Surroundings:
 def _surroundings_query() -> Any:
     """Return the query of `surroundings`: aggregates of one row each, beside the vehicle if it exists."""
     scope: Any = bindparam("scope")
-    good = select(func.max(GOOD_LINKS.c.id).label("last_good"))
     missions = select(func.count().label("missions"), func.max(MISSIONS.c.id).label("last_mission"))
     vehicles = VEHICLES.alias()
     archived = (
@@ -310,7 +307,7 @@ def _surroundings_query() -> Any:
             PASSES.c.mission_id.is_not(None),
         )
     )
-    counts = [one.subquery() for one in (good, missions, archived)]
+    counts = [one.subquery() for one in (missions, archived)]
     vehicle = and_(VEHICLES.c.ccsds_id == bindparam("spacecraft_id"), VEHICLES.c.instance == scope)
     decodings = select(PACKET_DECODINGS.c.vehicle_id).where(PACKET_DECODINGS.c.vehicle_id == VEHICLES.c.id)
     return select(
@@ -318,51 +315,7 @@ def _surroundings_query() -> Any:
         decodings.exists(),
         VEHICLES.c.id,
         VEHICLES.c.decoded_version,
-    ).select_from(
-        counts[0].join(counts[1], true()).join(counts[2], true()).join(VEHICLES, vehicle, isouter=True)
-    )
+    ).select_from(counts[0].join(counts[1], true()).join(VEHICLES, vehicle, isouter=True))
 
 
 _SURROUNDINGS = _surroundings_query()
-
-
-def good_links(connection: Connection, piece: Piece, station: str | None) -> list[LinkSettings]:
-    """Return the last good settings of the spacecraft of a piece, of one station or of any, newest first."""
-    query = (
-        select(GOOD_LINKS.c.vehicle_id, GOOD_LINKS.c.station, GOOD_LINKS.c.settings)
-        .join(VEHICLES, VEHICLES.c.id == GOOD_LINKS.c.vehicle_id)
-        .where(VEHICLES.c.instance == piece.scope)
-        .order_by(GOOD_LINKS.c.id.desc())
-        .limit(BLOCK)
-    )
-    if station is not None:
-        query = query.where(GOOD_LINKS.c.station == station)
-    if piece.spacecraft_id is not None:
-        query = query.where(VEHICLES.c.ccsds_id == piece.spacecraft_id)
-    newest: dict[tuple[int, str], LinkSettings] = {}
-    for vehicle, place, settings in connection.execute(query):
-        newest.setdefault((vehicle, place), LinkSettings(**settings))
-    return list(newest.values())
-
-
-def add_good_link(
-    connection: Connection, piece: Piece, vehicle: int, settings: LinkSettings, now_utc_ns: int
-) -> bool:
-    """Add good settings of a vehicle; return False if they are its last ones of the station of the piece."""
-    last = connection.execute(
-        select(GOOD_LINKS.c.settings)
-        .where(GOOD_LINKS.c.vehicle_id == vehicle, GOOD_LINKS.c.station == piece.station)
-        .order_by(GOOD_LINKS.c.id.desc())
-        .limit(1)
-    ).scalar()
-    if last == asdict(settings):
-        return False
-    values = {
-        "vehicle_id": vehicle,
-        "station": piece.station,
-        "settings": asdict(settings),
-        "ingest_id": piece.ingest_id,
-        "since_utc_ns": now_utc_ns,
-    }
-    connection.execute(insert(GOOD_LINKS).values(values))
-    return True

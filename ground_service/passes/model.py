@@ -93,8 +93,7 @@ class Reception(Entity):
     """Link quality of one received file; null: unknown."""
 
     station: str = Field(examples=["madrid"], description="Empty: not stated")
-    source: str = Field(description="Origin of the link settings: stated, mission, remembered or proposed")
-    ambiguous: bool = Field(description="Other link settings have equal support")
+    source: str = Field(description="Origin of the link settings: stated (by the sender), mission or default")
     frames: int
     frames_good: int
     symbols_corrected: int

@@ -193,7 +193,6 @@ def _reception(received: list[ReceivedLink], octets: int) -> ReceptionQuality:
     return ReceptionQuality(
         station=received[0].station,
         source=", ".join(sorted({section.source for one in received for section in one.sections})),
-        ambiguous=all(one.ambiguous for one in received),  # the evidence of one piece is enough
         frames=total("frames"),
         frames_good=total("frames_good"),
         symbols_corrected=total("symbols_corrected"),

@@ -170,18 +170,6 @@ packets that the ingest added to the archive, `packets_joined` those of them tha
 `samples_stored` their samples, over all attempts of the ingest.
 """
 
-GOOD_LINKS = table(
-    "good_links",
-    key("id", Integer),
-    column("vehicle_id", ForeignKey("vehicles.id")),
-    column("station", String(64)),
-    column("settings", JSON),
-    column("ingest_id", ForeignKey("ingests.id")),
-    column("since_utc_ns", BigInteger),
-    Index("ix_good_links_newest", "vehicle_id", "station", "id"),
-)
-"""Link settings under which a spacecraft was received by a station; the newest row is used first."""
-
 FRAGMENTS = table(
     "fragments",
     key("id", BigKey),

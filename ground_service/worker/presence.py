@@ -52,10 +52,8 @@ OWN = frozenset(
         *(
             "allowed_hosts",
             "trusted_proxies",
-            "connections",
             "sockets",
             "sockets_per_user",
-            "uploads_at_once",
         ),
         *("drain_s", "objects_secret_key", "objects_cache_gib", "runner_exchange"),
     }

@@ -25,7 +25,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(study, "--catalogue F", str, CATALOGUE_HELP)
     option(study, "--seed", int, "seed of a synthetic catalogue", 1)
     option(study, "--step S", ABOVE_ZERO, "seconds between positions (default: every state of the file)")
-    option(study, "--fov-step DEG", number(above=0, most=150), "default: 10 degrees", 10.0)
     option(study, "--needed N", number(int, least=1, most=50), "craters needed", 3)
     option(study, "--threshold P", number(least=0, below=1), "probability to exceed", 0.9)
     finish(study, run_fov_study)
@@ -49,7 +48,7 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     study = study_field_of_view(
         mcmf_from_spherical(track.latitude_rad, track.longitude_rad, track.altitude_m),
         catalogue,
-        np.arange(10.0, 160.0 + 1e-9, arguments.fov_step).tolist(),
+        np.arange(10.0, 160.0 + 1e-9, 10.0).tolist(),
         tuple(sorted({*PAPER_COUNTS, arguments.needed})),
         arguments.needed,
         arguments.threshold,

@@ -64,9 +64,7 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
         required=True,
     )
     option(curate, "--region W,E,S,N", str, "degrees, longitude east", "0,360,-80,80")
-    option(curate, "--min-diameter KM", number(least=0.5), "default: 3 km", 3.0)
-    option(curate, "--max-diameter KM", number(most=200), "default: 30 km", 30.0)
-    option(curate, "--depth-ratio R", float, "least depth over diameter", 0.03)
+    option(curate, "--min-diameter KM", number(least=0.5, below=30), "default: 3 km", 3.0)
     finish(curate, run_curate)
 
 
@@ -103,10 +101,6 @@ def run_curate(arguments: argparse.Namespace) -> int:
     from tmtc.tables import pack_catalogue_table, table_hash
 
     region = parse_region(arguments.region)
-    if arguments.min_diameter >= arguments.max_diameter:
-        raise UsageError(
-            f"--min-diameter: expected below {arguments.max_diameter:g} km, found {arguments.min_diameter:g}"
-        )
     paths = arguments.terrain
     if paths is None:
         paths = [path for path in data_folder().dem_tiles if "128ppd" in path.name]
@@ -114,11 +108,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
             raise UsageError(
                 "--terrain: expected height rasters, found none named and no tiles of 128 px/deg in the data folder"
             )
-    rules = CurationRules(
-        smallest_m=1e3 * arguments.min_diameter,
-        largest_m=1e3 * arguments.max_diameter,
-        depth_ratio=arguments.depth_ratio,
-    )
+    rules = CurationRules(smallest_m=1e3 * arguments.min_diameter)
     listed = load_catalogue(arguments.catalogue)
     heights = RasterHeights(paths, data_folder().dem_global)
     curation = curate(listed, heights, region, rules)

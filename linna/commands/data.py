@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
-from typing import Any
 
 from linna.output import finish
 from linna.parser import option
@@ -13,7 +13,7 @@ from linna.parser import option
 def configure(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(title="verbs", required=True)
     listing = verbs.add_parser("list", help="list the products: available files, size, licence, address")
-    fetch = verbs.add_parser("fetch", help="download products into the data folder; resumes what broke off")
+    fetch = verbs.add_parser("fetch", help="download products into the data folder")
     option(fetch, "names PRODUCT", str, "default: the small ones all need", nargs="*")
     option(fetch, "--only TEXT", str, "only files with this in their name (tiles)", "")
     option(fetch, "--mirror URL", str, "take files from URL/<path in the data folder> instead", "")
@@ -66,12 +66,11 @@ def _fetch(arguments: argparse.Namespace) -> int:
     files = [file for product in products if product for file in product.files if arguments.only in file.path]
     if not files:
         raise UsageError(f"data fetch: expected files with {arguments.only!r} in their name, found none")
-    report = _Progress()
     done = []
     for file in files:
         chosen = from_mirror(file, arguments.mirror) if arguments.mirror else file
         log(f"{file.path}: from {chosen.url or 'nowhere known'} ({_size(chosen.octets)})")
-        found = fetch(chosen, root, report=report)
+        found = fetch(chosen, root, progress=sys.stderr.isatty())
         log(f"{file.path}: {found.status}, {_size(found.octets)}")
         done.append({"path": found.path, "status": found.status, "octets": found.octets})
     return emit(arguments, {"root": str(root), "files": done}, f"{len(done)} files in {root}")
@@ -108,21 +107,3 @@ def _size(octets: int) -> str:
     if not octets:
         return "size unknown"
     return f"{octets / 1e9:.2f} GB" if octets >= 1e9 else f"{octets / 1e6:.2f} MB"
-
-
-class _Progress:
-    """Writes how far a download is, every few seconds."""
-
-    def __init__(self) -> None:
-        self._last_s = 0.0
-
-    def __call__(self, path: str, have: int, total: int) -> Any:
-        import time
-
-        from linna.output import log
-
-        now = time.monotonic()
-        if now - self._last_s >= 5.0:
-            self._last_s = now
-            share = f" of {_size(total)} ({100 * have / total:.0f} %)" if total else ""
-            log(f"{path}: {_size(have)}{share}")

@@ -37,7 +37,6 @@ def _add_train(verbs: Any) -> None:
     option(train, "--steps", int, "budget in optimiser steps instead", 0)
     option(train, "--seed", int, "", 1)
     option(train, "--crop PX", int, "", 384)
-    option(train, "--batch", int, "", 8)
     option(train, "--learning-rate", float, "", 2.5e-3)
     option(train, "--landmarks F.csv", Path, "uncatalogued landmarks as further labels", None)
     option(train, "--start-from FILE", Path, "first weights: a checkpoint or an ONNX network", None)
@@ -143,7 +142,6 @@ def _train(arguments: argparse.Namespace) -> int:
     parameters = TrainParameters(
         minutes=0.0 if arguments.steps else arguments.minutes,
         steps=arguments.steps,
-        batch=arguments.batch,
         crop_px=arguments.crop,
         learning_rate=arguments.learning_rate,
         seed=arguments.seed,

@@ -22,10 +22,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "--instance", str, "instance of the spacecraft", "flight")
     option(
         parser,
-        "--recording --stream NAME",
+        "--recording NAME",
         str,
         "name of the recording of which the files are consecutive pieces (default: each file is a recording)",
-        dest="recording",
     )
     option(
         parser,
@@ -40,8 +39,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--link SETTINGS",
         str,
-        "link settings, used without evidence, such as frame_length=1115,coding=rs,randomiser=legacy,"
-        "checksum=true (default: mission description, last good settings, or the evidence of the file)",
+        "link settings, such as frame_length=1115,coding=rs,randomiser=legacy,checksum=true "
+        "(default: those of the mission description)",
     )
     add_operator_options(parser)
     finish(parser, run)
@@ -72,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
             kept = (
                 "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending", "frames_bad",
-                "symbols_corrected",
+                "symbols_corrected", "remark",
             )  # fmt: skip
             assert made.accounting is not None
             figures = made.accounting.model_dump(include=set(kept))
@@ -102,6 +101,8 @@ def _line(one: dict[str, Any]) -> str:
         f"{one['file']}: {one['packets']} packets, {one['packets_new']} new, {one['crc_errors']} damaged, "
         f"{one['frames_bad']} bad frames, {one['octets_skipped']} octets skipped"
     )
+    if one["remark"]:
+        line += f"; {one['remark']}"
     if one["octets_pending"]:
         line += (
             f"; {one['octets_pending']} octets of an incomplete frame or packet at the ends "

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ground_service.contacts.links.model import Contacts, LinkStatus
     from linna.parser import LinnaParser
     from tmtc.link_check import LinkProposal
+    from tmtc.stream import PacketForm
 
 INCONCLUSIVE = 3
 SHOWN = 6
@@ -43,13 +44,13 @@ def _configure_check(parser: LinnaParser) -> None:
 
 def check(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
-    from tmtc.downlink import decode, propose_settings
+    from tmtc.downlink import propose_packets, propose_settings
 
     octets = arguments.file.read_bytes()
     proposal = propose_settings(octets)
-    packets = 0
+    packets, form = 0, None
     if proposal.settings is None and not proposal.has_regular_markers:
-        packets = decode(octets).packets
+        packets, form = propose_packets(octets)
         if not packets:
             raise UsageError(
                 f"{arguments.file}: expected CADUs or space packets, found none in its {len(octets)} octets"
@@ -63,9 +64,11 @@ def check(arguments: argparse.Namespace) -> int:
         "markers": proposal.markers,
         "distances": dict(list(proposal.distances.items())[:SHOWN]),
         "packets_without_frames": packets,
+        "packet_checksum": None if form is None else "crc16" if form.error_control else "none",
+        "packet_prefix_octets": None if form is None else form.prefix_octets,
         "contradicts_mission": differences,
     }
-    emit(arguments, figures, text="\n".join(_lines(proposal, packets, differences)))
+    emit(arguments, figures, text="\n".join(_lines(proposal, packets, form, differences)))
     if proposal.ambiguous or (proposal.settings is None and not packets):
         return INCONCLUSIVE
     return 1 if differences else 0
@@ -93,7 +96,9 @@ def _differences(settings: Mapping[str, Any], declared: Mapping[str, Any]) -> li
     return lines
 
 
-def _lines(proposal: LinkProposal, packets: int, differences: list[str]) -> list[str]:
+def _lines(
+    proposal: LinkProposal, packets: int, form: PacketForm | None, differences: list[str]
+) -> list[str]:
     lines = [f"markers {proposal.markers}"]
     common = list(proposal.distances.items())[:SHOWN]
     if common:
@@ -108,8 +113,13 @@ def _lines(proposal: LinkProposal, packets: int, differences: list[str]) -> list
         )
     if proposal.settings is not None:
         lines.append(f"settings: {_named(proposal.settings.describe())}")
-    elif packets:
-        lines.append(f"no frames: {packets} space packets without frames")
+    elif form is not None:
+        kind = "with" if form.error_control else "without"
+        behind = f", each behind {form.prefix_octets} other octets" if form.prefix_octets else ""
+        lines.append(f"no frames: {packets} space packets {kind} checksum{behind}")
+        stated = [] if form.error_control else ['packet_checksum = "none"']
+        stated += [f"packet_prefix_octets = {form.prefix_octets}"] if form.prefix_octets else []
+        lines += [f"state in [link] of the mission description: {one}" for one in stated]
     else:
         lines.append("settings: none; no frame is valid under any known setting")
     if proposal.ambiguous:

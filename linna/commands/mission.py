@@ -54,28 +54,6 @@ def _configure_run(running: LinnaParser) -> None:
     )
     option(running, "--disturbances FILE", str, "faults of spacecraft, stations and flight dynamics")
     option(running, "--folder DIR", Path, "folder of the run (default: run-SCENARIO)")
-    option(
-        running,
-        "--distributed",
-        bool,
-        "separate processes on PostgreSQL and Redis instead of one process on SQLite",
-    )
-    option(
-        running,
-        "--database URL",
-        str,
-        "database of the distributed form (default: a PostgreSQL server of the run)",
-    )
-    option(
-        running, "--broker URL", str, "broker of the distributed form (default: a Redis server of the run)"
-    )
-    option(
-        running,
-        "--kill SEED",
-        number(int, least=0),
-        "kill processes of the distributed form at random points of this seed",
-    )
-    option(running, "--kills N", number(int, least=0), "number of kills (default: 4 a day)")
     finish(running, run_mission)
 
 
@@ -154,7 +132,6 @@ def run_mission(arguments: argparse.Namespace) -> int:
     from linna.output import log
     from payload_emulator.session.scenario import load_scenario
     from studies.mission_run import run
-    from studies.mission_run.distributed import Servers
     from studies.mission_run.disturbances import UNDISTURBED, load_disturbances
 
     try:
@@ -163,20 +140,9 @@ def run_mission(arguments: argparse.Namespace) -> int:
         rate = -1.0
     if rate < 0.0 or (rate == 0.0 and arguments.speed != "max"):
         raise UsageError(f"--speed: expected a number above 0 or max, found {arguments.speed!r}")
-    if not arguments.distributed and (arguments.kill, arguments.kills, arguments.database, arguments.broker) != (
-        None, None, None, None,
-    ):  # fmt: skip
-        raise UsageError(
-            "--kill, --kills, --database, --broker: expected --distributed with them, found none"
-        )
-    kills = 0
-    if arguments.kill is not None:
-        kills = max(round(4 * arguments.days), 1) if arguments.kills is None else arguments.kills
-    elif arguments.kills is not None:
-        raise UsageError("--kills: expected --kill SEED with it, found none")
     factor = arguments.real_time_factor
-    if factor and (rate or kills):
-        raise UsageError("--real-time-factor: expected neither --speed nor --kill with it, found one")
+    if factor and rate:
+        raise UsageError("--real-time-factor: expected no --speed with it, found one")
     disturbances = UNDISTURBED
     if arguments.disturbances is not None:
         disturbances = load_disturbances(arguments.disturbances)
@@ -186,24 +152,18 @@ def run_mission(arguments: argparse.Namespace) -> int:
         rate,
         max(1, round(60.0 * arguments.observe_hours_a_day / arguments.window_min)),
         60.0 * arguments.window_min,
-        arguments.distributed,
-        arguments.kill,
-        kills,
         factor,
         disturbances,
     )
     folder = arguments.folder or Path(f"run-{'-'.join(one.name for one in scenarios)}")
     if len(scenarios) > 1:
-        if arguments.distributed:
-            raise UsageError("--distributed: expected one scenario, found a fleet")
         fleet = run.run_fleet(scenarios, data_folder(), folder, terms, log)
         found = list(fleet["fleet"].values())
         emit(arguments, fleet, text="\n".join(_closing_text(one, folder) for one in found))
-        return 0 if all(map(_went_well, found)) else 1
-    servers = Servers(arguments.database, arguments.broker)
-    figures = run.run_mission(scenarios[0], data_folder(), folder, terms, log, servers)
+        return 0 if all(map(went_well, found)) else 1
+    figures = run.run_mission(scenarios[0], data_folder(), folder, terms, log)
     emit(arguments, figures, text=_closing_text(figures, folder))
-    return 0 if _went_well(figures) else 1
+    return 0 if went_well(figures) else 1
 
 
 def _closing_text(figures: Mapping[str, Any], folder: Path) -> str:
@@ -220,7 +180,7 @@ def _closing_text(figures: Mapping[str, Any], folder: Path) -> str:
     )
 
 
-def _went_well(figures: Mapping[str, Any]) -> bool:
+def went_well(figures: Mapping[str, Any]) -> bool:
     """Return whether each window flown is processed, each missing one explained, and no packet lost."""
     from studies.mission_run.figures import UNKNOWN
 

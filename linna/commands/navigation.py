@@ -22,7 +22,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(survey, "--seeds N", number(int, least=1), "sessions", 3)
     option(survey, "--seed S", int, "first seed (default: the scenario's)")
     option(survey, "--windows N", number(int, least=1), "windows of a session", 6)
-    option(survey, "--direction", ("ascending", "descending", "any"), "", "ascending")
     option(
         survey,
         "--scenario FILE",
@@ -46,7 +45,7 @@ def run_survey(arguments: argparse.Namespace) -> int:
     sessions = []
     for seed in range(first, first + arguments.seeds):
         log(f"seed {seed}")
-        scenario = survey_scenario(base, region, arguments.windows, arguments.direction, seed)
+        scenario = survey_scenario(base, region, arguments.windows, seed)
         sessions.append(
             survey_session(
                 scenario,

@@ -69,7 +69,7 @@ def _link_quality(receptions: tuple[ReceptionQuality, ...]) -> Table:
                 count_text(one.lock_losses),
                 count_text(one.octets),
                 count_text(one.octets_other),
-                one.source + (", ambiguous" if one.ambiguous else ""),
+                one.source,
             )
             for one in receptions
         ),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,14 +51,14 @@ class MissionGround:
     ----------
     ground
         Database and files of the service, to see whether it is idle, and for the closing figures.
-    while_waiting
-        Called during each wait; an error that it raises ends the wait, as the end of the spacecraft with its stations.
     """
 
     ground: Ground
     client: Client
     flight_dynamics: Client
-    while_waiting: Callable[[], object] = field(default=lambda: None, init=False)
+
+    def close(self, *, is_finished: bool = False) -> None:
+        """Stop the service; `is_finished`: the run does not continue."""
 
     def add_mission(self, text: bytes) -> None:
         """Add the mission description, and wait for its links."""
@@ -164,13 +164,12 @@ class MissionGround:
     def _wait(self, is_done: Callable[[], bool], what: str) -> None:
         until = time.monotonic() + SETTLE_S
         while not self._holds(is_done):
-            self.while_waiting()
             if time.monotonic() > until:
                 raise GroundError(f"mission run: expected {what} within {SETTLE_S:.0f} s, found none")
             time.sleep(POLL_S)
 
     def _holds(self, is_done: Callable[[], bool]) -> bool:
-        """Return whether a condition holds; False while a killed part of the service cannot be asked."""
+        """Return whether a condition holds; False while the service cannot be asked."""
         try:
             return is_done()
         except (*PASSING, Unreachable, Unavailable):

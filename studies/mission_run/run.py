@@ -20,14 +20,12 @@ from payload_emulator.errors import LinkError, ScenarioError
 from payload_emulator.session.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
 from payload_emulator.session.world import open_world
-from studies.harness.kills import SPACECRAFT, Keeper, plan_kills
 from studies.mission_run.checkpoints import Checkpoints
-from studies.mission_run.distributed import DistributedGround, Servers
 from studies.mission_run.disturbances import UNDISTURBED, Disturbances
 from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics
 from studies.mission_run.figures import Progress, closing_figures, months, note_plan, windows_asked
 from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround
-from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftKilled, SpacecraftProcess
+from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess
 
 REPORT = "report.json"
 DEFAULT_STATIONS = ("goldstone", "madrid", "canberra")
@@ -49,7 +47,6 @@ COUNTED = (
 """What the spacecraft counts itself."""
 
 Say = Callable[[str], None]
-OWN_SERVERS = Servers()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +55,6 @@ class RunTerms:
 
     Attributes
     ----------
-    kills
-        Number of kills of processes at points of `kill_seed`, in the distributed form.
     factor
         Simulated seconds per second that pass without waiting for the ground; 0: time waits.
     """
@@ -68,20 +63,12 @@ class RunTerms:
     rate: float = 0.0
     windows_per_day: int = 2
     window_s: float = 720.0
-    distributed: bool = False
-    kill_seed: int | None = None
-    kills: int = 0
     factor: float = 0.0
     disturbances: Disturbances = UNDISTURBED
 
 
 def run_mission(
-    scenario: Scenario,
-    data: DataFolder,
-    folder: Path,
-    terms: RunTerms,
-    say: Say,
-    servers: Servers = OWN_SERVERS,
+    scenario: Scenario, data: DataFolder, folder: Path, terms: RunTerms, say: Say
 ) -> dict[str, Any]:
     """Run a mission in a folder, or go on with the one that is there; the closing figures.
 
@@ -92,8 +79,7 @@ def run_mission(
     GroundError, LinkError
         A part did not do what is expected of it; the run can be taken up again.
     """
-    run = MissionRun(_prepared(scenario, terms), data, folder, terms, say, servers)
-    return run.run()
+    return MissionRun(prepared(scenario, terms), data, folder, terms, say).run()
 
 
 def run_fleet(
@@ -118,7 +104,7 @@ def run_fleet(
     if folder.exists() and any(folder.iterdir()):
         raise ScenarioError(f"{folder}: expected a new folder for a fleet, found one with files")
     runs = [
-        MissionRun(_prepared(one, terms), data, folder / one.spacecraft, terms, say, is_of_fleet=True)
+        MissionRun(prepared(one, terms), data, folder / one.spacecraft, terms, say, is_of_fleet=True)
         for one in scenarios
     ]
     posts: list[tuple[int, int]] = []
@@ -134,7 +120,7 @@ def run_fleet(
         if terms.factor:
             set_mission_clock(ClockFile(runs[0].clock_file).read)
             with ThreadPoolExecutor(len(flights)) as threads:
-                list(threads.map(_fly_whole, flights))
+                list(threads.map(fly_whole, flights))
         else:
             _take_turns(runs, flights)
         figures = {name: one.close(ground) for name, one in zip(names, runs, strict=True)}
@@ -153,12 +139,14 @@ def _take_turns(runs: Sequence[MissionRun], flights: Sequence[Iterator[int]]) ->
             due.append((utc_ns, k))
 
 
-def _fly_whole(flight: Iterator[int]) -> None:
+def fly_whole(flight: Iterator[int]) -> None:
+    """Let a flight go on to its end."""
     for _ in flight:
         pass
 
 
-def _prepared(scenario: Scenario, terms: RunTerms) -> Scenario:
+def prepared(scenario: Scenario, terms: RunTerms) -> Scenario:
+    """Return the scenario of a run: with ground stations, and with the disturbances of the terms."""
     if not scenario.link.stations:
         scenario = replace(scenario, link=replace(scenario.link, stations=DEFAULT_STATIONS))
     return terms.disturbances.apply(scenario)
@@ -167,6 +155,10 @@ def _prepared(scenario: Scenario, terms: RunTerms) -> Scenario:
 class MissionRun:
     """One run of a mission in a folder, by this process."""
 
+    spacecraft_class = SpacecraftProcess
+    keeps_archive = True
+    """Whether checkpoints contain the archive of the ground service."""
+
     def __init__(
         self,
         scenario: Scenario,
@@ -174,14 +166,11 @@ class MissionRun:
         folder: Path,
         terms: RunTerms,
         say: Say,
-        servers: Servers = OWN_SERVERS,
         is_of_fleet: bool = False,
     ) -> None:
         self._is_of_fleet = is_of_fleet
         self._settle_ns: int | None = None
         self._scenario, self._data, self._folder, self._terms, self._say = scenario, data, folder, terms, say
-        self._servers = servers
-        self._keeper: Keeper | None = None
         self._files = SpacecraftFiles(
             folder / "scenario.toml",
             folder / "clock",
@@ -190,7 +179,7 @@ class MissionRun:
             folder / "spacecraft.state",
             folder / "spacecraft.journal",
         )
-        home = None if terms.distributed else folder / "ground"
+        home = folder / "ground" if self.keeps_archive else None
         self._checkpoints = Checkpoints(folder, home, self._files.state)
         self._progress_file = folder / "progress.json"
         self._progress = Progress()
@@ -243,7 +232,7 @@ class MissionRun:
             count = dynamics.save_craters(self._terms.window_s, self._files.craters)
             self._say(f"catalogue: {count} craters with rim heights")
         self._progress.starts += 1
-        spacecraft = SpacecraftProcess(
+        spacecraft = self.spacecraft_class(
             self._files,
             self._scenario.link.stations,
             self._terms.days,
@@ -253,9 +242,7 @@ class MissionRun:
         )
         return spacecraft, dynamics
 
-    def _open_ground(self) -> EmbeddedGround | DistributedGround:
-        if self._terms.distributed:
-            return DistributedGround(self._folder, self._data, self._files.clock, self._servers)
+    def _open_ground(self) -> MissionGround:
         return EmbeddedGround.open(self._folder / "ground", self._data, self._files.clock)
 
     def _operate(
@@ -263,26 +250,7 @@ class MissionRun:
     ) -> None:
         flight = self.flight(spacecraft, ground, dynamics)
         self._save()
-        if isinstance(ground, DistributedGround):
-            self._keeper = self._made_keeper(spacecraft, ground)
-            self._keeper.start()
-            # A killed spacecraft takes the stations with it: what the ground waits for may need them.
-            ground.while_waiting = spacecraft.check_killed
-        try:
-            while True:
-                try:
-                    _fly_whole(flight)
-                    return
-                except SpacecraftKilled:
-                    if self._keeper is None:
-                        raise
-                    self._go_back()
-                    spacecraft.restart()
-                    self._keeper.recovered()
-                    flight = self._follow(spacecraft, ground, dynamics)
-        finally:
-            if self._keeper is not None:
-                self._keeper.stop()
+        fly_whole(flight)
 
     def _go(self, spacecraft: SpacecraftProcess, now: int) -> None:
         """Let time go on, to the time after a contact, or to the end of a turn of the fleet."""
@@ -330,7 +298,7 @@ class MissionRun:
             now = parse_utc(message["utc"]) if "utc" in message else now
             if kind == "contact":
                 self._note(message)
-                self._stop_for_kill(message["state"], now)
+                self._at_stop(message["state"], now)
                 if message["state"] == "started":
                     self._deliver_reference(ground, dynamics, now)
                     # The links have begun the contact; they ingest its first frame with the next ones.
@@ -353,7 +321,7 @@ class MissionRun:
                 spacecraft.order("state")
             elif kind in ("state", "finished"):
                 self._note({**message, "state": kind})
-                self._stop_for_kill("settled", now)
+                self._at_stop("settled", now)
                 self._wait_acknowledged(spacecraft, messages)
                 ground.wait_ingested()
                 ground.wait_settled()
@@ -361,11 +329,10 @@ class MissionRun:
                     ground.wait_sent(message["station"], self._scenario.spacecraft_id)
                 self._watch(ground, message)
                 if kind == "finished":
-                    if self._keeper is not None and not self._keeper.wait():
-                        continue  # the spacecraft was killed: its console has ended
+                    if not self._is_over():
+                        continue
                     return
-                due = time.monotonic() - self._kept_s >= CHECKPOINT_S and not self._is_of_fleet
-                if due or self._terms.kills:
+                if self._is_checkpoint_due():
                     spacecraft.order("save")
                 else:
                     self._go(spacecraft, now)
@@ -394,34 +361,15 @@ class MissionRun:
                 )
             time.sleep(POLL_S)
 
-    # Kills
+    def _is_checkpoint_due(self) -> bool:
+        return time.monotonic() - self._kept_s >= CHECKPOINT_S and not self._is_of_fleet
 
-    def _made_keeper(self, spacecraft: SpacecraftProcess, ground: DistributedGround) -> Keeper:
-        terms, epoch = self._terms, self._scenario.epoch_utc_ns
-        parts = (*ground.parts, SPACECRAFT)
-        stop = epoch + round(terms.days * DAY_NS)
-        planned = plan_kills(terms.kill_seed or 0, parts, epoch, stop, terms.kills)
-        return Keeper(
-            ground.parts,
-            planned,
-            spacecraft.kill,
-            ground.note_processes,
-            self._folder / "kills.json",
-            self._say,
-        )
+    def _at_stop(self, phase: str, utc_ns: int) -> None:
+        """Do what a campaign does at a stop of simulated time: "started", "ended" or "settled"."""
 
-    def _stop_for_kill(self, phase: str, utc_ns: int) -> None:
-        if self._keeper is not None:
-            self._keeper.at_stop(phase, utc_ns)
-
-    def _go_back(self) -> None:
-        """Return to the last exact state of the spacecraft; the ground keeps what it has."""
-        known, kept = self._progress, self._checkpoints.restore()
-        before = Progress() if kept is None else _read_progress(kept)
-        self._progress = replace(
-            before, starts=known.starts, posts=known.posts, request_id=known.request_id,
-            reference_day=known.reference_day,
-        )  # fmt: skip
+    def _is_over(self) -> bool:
+        """Return whether the run ends with the flight; False if a campaign has killed the spacecraft at its end."""
+        return True
 
     def _post(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
         """Post what a user posts: catalogue, mission description, ephemeris, standing request.
@@ -477,7 +425,6 @@ class MissionRun:
             "scenario": self._scenario.name,
             "spacecraft": self._scenario.spacecraft,
             "days": terms.days,
-            "form": "distributed" if terms.distributed else "embedded",
             **closing_figures(
                 ground,
                 self._progress,
@@ -493,8 +440,6 @@ class MissionRun:
             path = self._folder / f"report-{month}.html"
             ground.client.get_monthly_report(made.id, path)
             figures["monthly_reports"].append(str(path))
-        if self._keeper is not None:
-            figures["kills"] = {"seed": terms.kill_seed, **self._keeper.figures()}
         (self._folder / REPORT).write_text(json.dumps(figures, indent=2) + "\n")
         self._progress.finished = True
         return figures
@@ -517,19 +462,19 @@ class MissionRun:
         if not known_folder:
             return
         if self._progress_file.exists():
-            self._progress = _read_progress(self._progress_file)
+            self._progress = read_progress(self._progress_file)
         if self._progress.finished:
             return
-        if self._terms.distributed:
-            self._wall_before_s = self._progress.wall_s
-            self._go_back()
-        else:
-            # The archive goes back as well, and sends again what the spacecraft has not seen.
-            self._files.journal.unlink(missing_ok=True)
-            kept = self._checkpoints.restore()
-            self._progress = Progress() if kept is None else _read_progress(kept)
-            self._wall_before_s = self._progress.wall_s
+        self._resume()
         self._say(f"{self._folder}: continues from {self._progress.utc or 'the start'}")
+
+    def _resume(self) -> None:
+        """Return to the last checkpoint."""
+        # The archive goes back as well, and sends again what the spacecraft has not seen.
+        self._files.journal.unlink(missing_ok=True)
+        kept = self._checkpoints.restore()
+        self._progress = Progress() if kept is None else read_progress(kept)
+        self._wall_before_s = self._progress.wall_s
 
     def _save(self) -> None:
         self._progress.wall_s = round(self._wall_before_s + time.monotonic() - self._begun_s, 1)
@@ -548,7 +493,8 @@ def _next_state(messages: Iterator[dict[str, Any]]) -> dict[str, Any]:
     return message
 
 
-def _read_progress(path: Path) -> Progress:
+def read_progress(path: Path) -> Progress:
+    """Return the progress of a run from its file."""
     try:
         stated = json.loads(path.read_text())
         posts = [(first, last) for first, last in stated["posts"]]

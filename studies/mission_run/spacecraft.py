@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import sys
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +36,6 @@ class SpacecraftFiles:
     log: Path
     state: Path
     journal: Path
-
-
-class SpacecraftKilled(LinkError):
-    """The process of the spacecraft was killed; it can be started again from its last exact state."""
 
 
 class SpacecraftProcess:
@@ -75,17 +70,14 @@ class SpacecraftProcess:
             env={**environment_with_data(os.environ, data), **ALLOCATOR},
         )
         self._console: socket.socket | None = None
-        self._lock = threading.Lock()  # a killed process has ended before the next one starts
         self.restart()
 
     def restart(self) -> None:
         """Start the process, after its end from its last exact state."""
-        with self._lock:
-            self._disconnect()
-            self.was_killed = False
-            self._part.start()
-            assert self._console is not None
-            self._lines = self._console.makefile("r")
+        self._disconnect()
+        self._part.start()
+        assert self._console is not None
+        self._lines = self._console.makefile("r")
 
     def _is_connected(self) -> bool:
         with contextlib.suppress(OSError):
@@ -98,9 +90,7 @@ class SpacecraftProcess:
             for line in self._lines:
                 yield json.loads(line)
         except (OSError, ValueError) as error:
-            self.check_killed()
             raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
-        self.check_killed()
 
     def order(self, word: str) -> None:
         """Send a word to the console."""
@@ -108,19 +98,7 @@ class SpacecraftProcess:
         try:
             self._console.sendall(word.encode() + b"\n")
         except OSError as error:
-            self.check_killed()
             raise LinkError(f"spacecraft: expected its console, found {error}; see {self._log}") from None
-
-    def kill(self) -> None:
-        """Kill the process (SIGKILL)."""
-        with self._lock:
-            self.was_killed = True
-            self._part.kill()
-
-    def check_killed(self) -> None:
-        """Raise `SpacecraftKilled` if `kill` was called since the last start."""
-        if self.was_killed:
-            raise SpacecraftKilled("spacecraft: its process was killed")
 
     def mission_text(self) -> bytes:
         """Return the mission description that the spacecraft's operator hands over."""

@@ -16,10 +16,11 @@ from typing import Any
 import httpx
 import pytest
 
+from benchmarks._servers import PostgresServer
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.regression.runner import alive
-from studies.harness.parts import Part, PostgresServer, answers_http, bare_environment, free_port, listens
+from studies.harness.parts import Part, answers_http, bare_environment, free_port, listens
 from tests.ground_service.access.openid import CLIENT, running_provider
 from tests.ground_service.archive_hash import hash_of
 from tests.ground_service.object_server import running_objects

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -50,7 +51,8 @@ def test_beyond_this_machine_it_asks_for_a_proxy_and_limits_connections(tmp_path
     port = free_port()
     process = subprocess.Popen(
         [sys.executable, "-m", "linna", "serve", "--host", "0.0.0.0", "--port", str(port)],
-        env={**os.environ, "LINNA_HOME": str(tmp_path), "LINNA_CONNECTIONS": "16"},
+        env={**os.environ, "LINNA_HOME": str(tmp_path)},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (400, 400)),  # leaves 16 connections
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -103,9 +103,6 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
         (["catalogue", "register", "none.csv"], "--terrain: expected height rasters"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
         (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
-        (["identify", "lost", "--scenario", "paper-day", "--frames", "0"], "--frames"),
-        (["identify", "lost", "--scenario", "paper-day", "--min-diameter-km", "0.5"], "--min-diameter-km"),
-        (["identify", "lost", "--scenario", "paper-day", "--attitude-deg", "3"], "--attitude-deg"),
     ],
 )
 def test_bad_input_is_one_line_that_names_it(

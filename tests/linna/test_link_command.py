@@ -10,6 +10,7 @@ from linna.cli import run
 from tests.tmtc.test_downlink import make_packets
 from tmtc.cadu import ASM
 from tmtc.downlink import encode_cadus
+from tmtc.packets import pack_packet
 
 
 @pytest.fixture
@@ -60,3 +61,14 @@ def test_packets_without_frames_are_told_and_noise_is_refused(capsys, tmp_path):
     path.write_bytes(np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes())
     assert run(["link", "check", str(path)]) == 2
     assert "expected CADUs or space packets, found none in its 5000 octets" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("prefix", [0, 3])
+def test_the_form_of_packets_without_checksum_is_proposed(capsys, tmp_path, prefix):
+    packets = [bytes(prefix) + pack_packet(0x200, bytes(range(60)), sequence_count=k) for k in range(30)]
+    path = tmp_path / "foreign.bin"
+    path.write_bytes(b"".join(packets))
+    assert run(["link", "check", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "30 space packets without checksum" in shown and 'packet_checksum = "none"' in shown
+    assert (f"packet_prefix_octets = {prefix}" in shown) == (prefix > 0)

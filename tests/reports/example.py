@@ -306,9 +306,9 @@ def pass_report(
     fast = utc_ns[:: max(1, n // 400)]
     power_w = 3.2 + 0.8 * imaging[:: max(1, n // 400)]
     known = ReceptionQuality(
-        "madrid", "mission", False, 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60
+        "madrid", "mission", 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60
     )
-    unknown = ReceptionQuality("", "proposed", True, 68, 68, 0, None, 0, 86_972, 3)
+    unknown = ReceptionQuality("", "default", 68, 68, 0, None, 0, 86_972, 3)
     accounting = FrameAccounting(
         expected=frames, acquired=max(0, frames - 2), lit=max(0, frames - 2), processed=max(0, frames - 3),
         with_detections=max(0, frames - 9), navigated=max(0, frames - 14), bad_image=min(1, frames),

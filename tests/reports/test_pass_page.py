@@ -285,4 +285,4 @@ def test_the_link_quality_of_each_reception_is_a_row_of_the_page(whole_page: str
     start = whole_page.index("Link quality by reception")
     table = whole_page[start : whole_page.index("</table>", start)]
     assert "madrid" in table and "2.5e-05" in table
-    assert "not stated" in table and "proposed, ambiguous" in table
+    assert "not stated" in table and "default" in table

@@ -101,6 +101,7 @@ class LinkRunner:
         self._contact: ContactRow | None = None
         self._shown: tuple[str, str | None] | None = None
         self._ingest_fault: str | None = None
+        self._remark = ""
         self._renewed_s = self._missed_s = self._sent_s = self._refused_until_s = 0.0
         self._acknowledged = 0
         self._last_block_s = 0.0
@@ -495,6 +496,7 @@ class LinkRunner:
             heard,
             _clock_offset_ns(made, heard),
         )
+        self._remark = "" if made is None else made.remark
         self._progress.frame_octets = _frame_octets(made)
         self._progress.ends_whole = made is not None and made.octets_pending == 0
         self._progress.ingested += octets
@@ -523,8 +525,8 @@ class LinkRunner:
             state, reason = "connected", None
         if self._up is not None and self._up.fault and self._up.fault != NOT_YET:
             reason = f"{reason + '; ' if reason else ''}uplink: {self._up.fault}"
-        if self._ingest_fault:
-            reason = f"{reason + '; ' if reason else ''}{self._ingest_fault}"
+        if fault := self._ingest_fault or self._remark:
+            reason = f"{reason + '; ' if reason else ''}{fault}"
         self._show(state, reason)
 
     def _show(self, state: str, reason: str | None) -> None:

@@ -126,7 +126,7 @@ function receptionTable(receptions) {
       "frames", ["Good", "frames_good"], "symbols_corrected",
       ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : figure(row.bit_error_rate, 2)), "num"],
       "lock_losses", "octets", ["Outside frames", "octets_other"],
-      ["Link settings", (row) => row.source + (row.ambiguous ? ", ambiguous" : "")],
+      ["Link settings", (row) => row.source],
     ],
     receptions,
     "No frames of this pass have been received.",

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -255,7 +254,7 @@ def candidate_places(
     for place in fits:
         if len(apart) == _CANDIDATES:
             break
-        if all(distance_m(place, other) > _same_place_m(place, camera, parameters) for other in apart):
+        if all(_distance_m(place, other) > _same_place_m(place, camera, parameters) for other in apart):
             apart.append(place)
     return [replace(place, detection=usable[place.detection].astype(np.int64)) for place in apart]
 
@@ -267,12 +266,8 @@ def find_place(
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
 ) -> Place | None:
-    """Return the place of a single frame, None where none is safe."""
-    return believed_place(candidate_places(found, sigma_px, index, camera, parameters), parameters)
-
-
-def believed_place(places: Sequence[Place], parameters: LostParameters = LostParameters()) -> Place | None:
-    """Return the best of candidate places if chance and all others leave it, None where none is safe."""
+    """Return the best place if its probability of chance and all other places are far enough, otherwise None."""
+    places = candidate_places(found, sigma_px, index, camera, parameters)
     if not places or places[0].log_false > math.log(parameters.false_fix_limit):
         return None
     rival = places[1].log_false if len(places) > 1 else math.inf
@@ -476,7 +471,7 @@ def _log_share(
     return of_place + of_attitude + volume
 
 
-def distance_m(first: Place, second: Place) -> float:
+def _distance_m(first: Place, second: Place) -> float:
     return float(np.linalg.norm(first.position_mcmf_m - second.position_mcmf_m))
 
 

@@ -10,11 +10,9 @@ from sqlalchemy import event
 from ground_service.ground import Ground
 from ground_service.ingest import store
 from ground_service.ingest.link_settings import known_before
-from ground_service.ingest.recording_store import Piece, add_good_link
+from ground_service.ingest.recording_store import Piece
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
-from ground_service.store.files import StoredFile
-from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import vehicle_id
 from tmtc.downlink import encode_cadus
 from tmtc.link import LinkSettings
@@ -75,26 +73,21 @@ def test_a_small_piece_takes_few_statements_in_two_transactions(
     assert not any("UPDATE ingests" in one for one in statements[stored:])
 
 
-def test_what_is_known_follows_new_links_and_mission_descriptions(either: Ground, tmp_path: Path) -> None:
+def test_the_declared_link_follows_new_mission_descriptions(either: Ground) -> None:
     piece = Piece(1, "flight", SPACECRAFT, "0" * 64, 1279, "", 0)
-    settings = LinkSettings().explicit
 
     def known() -> Any:
         with either.database.reading() as connection:
             return known_before(connection, piece)
 
-    first = known()
-    assert (first.expected.mission, first.expected.remembered, first.around.vehicle_id) == ((), (), None)
+    assert known().expected.settings == (LinkSettings().explicit,)
+    assert known().around.vehicle_id is None
     with either.database.writing() as connection:
         vehicle = vehicle_id(connection, SPACECRAFT, "flight")
-        register_file(connection, StoredFile(piece.file_sha256, 1279, tmp_path), "downlink", "one", 1)
-        store.add_ingest(connection, piece.file_sha256, state="done", dictionary_version=1, now_utc_ns=1)
-        add_good_link(connection, piece, vehicle, settings, 1)
-    assert known().expected.remembered == (settings,)
     assert known().around.vehicle_id == vehicle
     text = f'name = "one"\n[spacecraft]\nid = {SPACECRAFT}\n[link]\nframe_length = 1115\ncoding = "none"\n'
     add_mission(either, text.encode(), actor="ann")
-    (stated,) = known().expected.mission
+    (stated,) = known().expected.settings
     assert (stated.frame_length, stated.coding) == (1115, "none")
     add_mission(either, text.replace("1115", "223").encode(), actor="ann")
-    assert [one.frame_length for one in known().expected.mission] == [223]
+    assert [one.frame_length for one in known().expected.settings] == [223]

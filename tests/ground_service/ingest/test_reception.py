@@ -1,4 +1,4 @@
-"""Link settings of ingests: stated, of the mission description, remembered or proposed; station records; quality."""
+"""Declared link settings of ingests, remarks where octets do not fit, station records, link quality."""
 
 import itertools
 import struct
@@ -22,8 +22,6 @@ from benchmarks.downlink import (
     with_bit_errors,
     without_error_control,
 )
-from ground_service.access.model import AuditFilter
-from ground_service.access.store import list_audit
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.model import IngestResult
@@ -94,14 +92,15 @@ def recorded(rows: np.ndarray) -> bytes:
     return b"".join(parts)
 
 
-def test_settings_come_from_the_mission_then_from_the_last_good_ones_and_else_from_the_file(
+def test_settings_come_from_the_sender_then_from_the_mission_and_else_from_the_defaults(
     ground: Ground, tmp_path: Path
 ) -> None:
     rows = cadus(30)
-    assert section(ingest(ground, tmp_path, rows[:10].tobytes()))["source"] == "proposed"
-    assert section(ingest(ground, tmp_path, rows[10:20].tobytes()))["source"] == "remembered"
+    assert section(ingest(ground, tmp_path, rows[:10].tobytes()))["source"] == "default"
     add_mission(ground, MISSION.encode())
-    assert section(ingest(ground, tmp_path, rows[20:].tobytes()))["source"] == "mission"
+    assert section(ingest(ground, tmp_path, rows[10:20].tobytes()))["source"] == "mission"
+    stated = ingest(ground, tmp_path, rows[20:].tobytes(), link="frame_length=1115")
+    assert (section(stated)["source"], stated.remark) == ("stated", "")
 
 
 def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground, make_pass: Any) -> None:
@@ -117,32 +116,14 @@ def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground,
     assert {one["source"] for one in accounting["reception"]["sections"]} == {"mission"}
 
 
-def test_good_settings_are_remembered_once_by_station_and_audited(ground: Ground, tmp_path: Path) -> None:
-    rows = cadus(30)
-    for station, part in (("", rows[:10]), ("", rows[10:20]), ("madrid", rows[20:])):
-        ingest(ground, tmp_path, part.tobytes(), station=station)
-    with ground.database.reading() as connection:
-        kept = connection.execute(select(repository.GOOD_LINKS).order_by(repository.GOOD_LINKS.c.id)).all()
-    assert [row.station for row in kept] == ["", "madrid"]
-    assert {row.settings["frame_length"] for row in kept} == {1115}
-    entries = ground.read(list_audit, AuditFilter(limit=10, offset=0)).items
-    assert [one.action for one in entries].count("remember link settings") == 2
-
-
-def test_frames_that_no_code_can_repair_are_not_remembered(ground: Ground, tmp_path: Path) -> None:
-    result = ingest(ground, tmp_path, with_bit_errors(cadus(60), 1e-2, 0).tobytes())
-    assert result.packets == 0 and result.frames_bad > 50
-    with ground.database.reading() as connection:
-        assert connection.execute(select(repository.GOOD_LINKS)).all() == []
-
-
-def test_stated_settings_are_used_without_evidence_and_wrong_ones_are_refused(
+def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(
     ground: Ground, tmp_path: Path
 ) -> None:
     octets = cadus(30).tobytes()
     right = "frame_length=1115,coding=rs,randomiser=legacy,checksum=true"
     wrong = ingest(ground, tmp_path, octets, link=right.replace("legacy", "long"))
     assert (wrong.packets, section(wrong)["source"]) == (0, "stated")
+    assert f"0 of {wrong.frames} frames are valid with the stated link settings" in wrong.remark
     assert ingest(ground, tmp_path, octets, link=right).packets == len(telemetry(30))
     for text in ("frame_length=many", "colour=red", "coding=turbo", "frame_length=3"):
         with pytest.raises(InvalidInput, match="link"):
@@ -156,22 +137,39 @@ def test_a_station_may_have_settings_of_its_own(ground: Ground, tmp_path: Path) 
     assert (section(result)["source"], section(result)["frame_length"]) == ("mission", 892)
 
 
-def test_settings_that_contradict_the_mission_are_proposed_from_the_file(
+def test_octets_that_do_not_fit_the_declared_settings_are_kept_with_a_remark(
     ground: Ground, tmp_path: Path
 ) -> None:
     add_mission(ground, MISSION.encode())
     settings = LinkSettings(frame_length=1024, coding="none")
-    result = ingest(ground, tmp_path, cadus(30, 1, settings).tobytes())
-    assert (section(result)["source"], result.packets) == ("proposed", len(telemetry(30, 1, settings)))
+    octets = cadus(30, 1, settings).tobytes()
+    result = ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT)
+    assert (section(result)["source"], result.packets) == ("mission", 0)
+    assert (result.octets, result.octets_skipped > 0) == (len(octets), True)
+    assert (
+        f"0 of {result.frames} frames are valid with the mission link settings (frame_length" in result.remark
+    )
+    assert "`linna link check FILE`" in result.remark
+    add_mission(ground, MISSION.replace("1115", "1024").replace('"rs"', '"none"').encode())
+    again = ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT)
+    assert (again.packets, again.remark) == (len(telemetry(30, 1, settings)), "")
 
 
-def test_a_remembered_link_of_another_spacecraft_does_not_spoil_frames_with_a_checksum(
-    ground: Ground, tmp_path: Path
-) -> None:
-    other = LinkSettings(checksum=False)
-    ingest(ground, tmp_path, cadus(30, 1, other, OTHER_SPACECRAFT).tobytes())
-    result = ingest(ground, tmp_path, cadus(30).tobytes())
-    assert section(result)["checksum"] is True and result.packets == len(telemetry(30))
+def test_a_file_with_few_frames_of_the_declared_settings_has_a_remark(ground: Ground, tmp_path: Path) -> None:
+    other = cadus(30, 1, LinkSettings(frame_length=1024, coding="none")).tobytes()
+    result = ingest(ground, tmp_path, cadus(30)[:10].tobytes() + other)
+    assert f"10 of {result.frames} frames are valid with the default link settings" in result.remark
+
+
+def test_each_section_has_the_declared_settings_of_its_spacecraft(ground: Ground, tmp_path: Path) -> None:
+    other = LinkSettings(frame_length=1024, coding="none")
+    text = 'name = "other"\n[spacecraft]\nid = 33\n[link]\nframe_length = 1024\ncoding = "none"\n'
+    add_mission(ground, text.encode())
+    octets = cadus(200).tobytes() + cadus(200, 1, other, OTHER_SPACECRAFT).tobytes()
+    result = ingest(ground, tmp_path, octets)
+    assert result.reception is not None
+    assert [one.source for one in result.reception.sections] == ["default", "mission"]
+    assert result.packets == len(telemetry(200)) + len(telemetry(200, 1, other))
 
 
 def test_records_of_a_station_give_reception_times_and_their_octets_are_accounted_for(
@@ -229,7 +227,7 @@ def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(
 ) -> None:
     packets = without_error_control().packets[SPACECRAFT]
     octets = b"".join(bytes(3) + packet for packet in sorted(packets))
-    with pytest.raises(InvalidInput, match=r"each behind 3 other octets.*packet_prefix_octets = 3"):
+    with pytest.raises(InvalidInput, match=r"`linna link check FILE` shows"):
         ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT)
     text = 'name = "foreign"\n[spacecraft]\nid = 76\n[link]\npacket_checksum = "none"\n'
     add_mission(ground, f"{text}[link.stations.recorder]\npacket_prefix_octets = 3\n".encode())

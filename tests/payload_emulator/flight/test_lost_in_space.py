@@ -17,7 +17,6 @@ from payload_emulator.flight.navigation._fit_kernel import Found, Image, Seen, l
 from payload_emulator.flight.navigation.lost_in_space import (
     NADIR_NORTH_UP,
     LostParameters,
-    Place,
     PlaceIndex,
     _affordable,
     _work_space,
@@ -27,7 +26,6 @@ from payload_emulator.flight.navigation.lost_in_space import (
 )
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
 from payload_emulator.flight.vision.detections import Detections, no_detections
-from studies.lost_frames import LostFrame, place_of_frames
 from tmtc.tables import CatalogueTable
 
 RADIUS_M = 1_737_400.0
@@ -147,36 +145,6 @@ def test_detections_that_are_no_numbers_are_left_out(index: PlaceIndex) -> None:
     assert result is not None
     assert np.all(np.isfinite(u[result.detection]))
     assert np.linalg.norm(result.position_mcmf_m - place) < 2_000.0
-
-
-def together_in(frames: list[LostFrame], index: PlaceIndex) -> tuple[Place, ...] | None:
-    found = [candidate_places(one.found, one.sigma_px, index, CAMERA, RULES) for one in frames]
-    return place_of_frames(found, frames, RULES)
-
-
-def test_frames_too_poor_alone_find_the_place_together(index: PlaceIndex) -> None:
-    speed_rad_s = math.sqrt(4.9028e12 / (RADIUS_M + 30e3) ** 3)
-    frames, places = [], []
-    for k in range(4):
-        latitude_deg = -6.0 + math.degrees(speed_rad_s * 15.0 * k)
-        place, found = frame(index.landmarks, latitude_deg, 4.0, 30e3, seed=20 + k, recall=0.28)
-        frames.append(LostFrame(found, found.sigma_px, 15.0 * k))
-        places.append(place)
-    alone = [find_place(f.found, f.sigma_px, index, CAMERA, RULES) for f in frames]
-    together = together_in(frames, index)
-    assert sum(place is not None for place in alone) < 4
-    assert together is not None
-    for place in together:
-        assert min(np.linalg.norm(place.position_mcmf_m - true) for true in places) < 1_500.0
-
-
-def test_no_frames_and_frames_of_different_orbits_are_no_fix(index: PlaceIndex) -> None:
-    assert together_in([], index) is None
-    first = frame(index.landmarks, -10.0, 353.0, 45e3, seed=1)[1]
-    second = frame(index.landmarks, 10.0, 367.0, 45e3, seed=2)[1]
-    frames = [LostFrame(f, f.sigma_px, 15.0 * k) for k, f in enumerate((first, second))]
-    # Each alone is certain of its place; no orbit leads from one to the other within 15 s.
-    assert together_in(frames, index) is None
 
 
 def test_fewer_inliers_suffice_on_a_smaller_map() -> None:

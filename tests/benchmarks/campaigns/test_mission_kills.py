@@ -6,20 +6,19 @@ import json
 import socket
 import sys
 import threading
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from benchmarks._servers import PidFile, PostgresServer
+from benchmarks.campaigns._kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
+from benchmarks.campaigns.mission_kills import KillableSpacecraft, KillTerms, run_killed
 from ground_service.contacts.links import service as links
 from ground_service.errors import GroundError
-from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
-from studies.harness.kills import PHASES, Keeper, Kill, PlannedKill, plan_kills
-from studies.harness.parts import Part, PidFile, PostgresServer, kill_family, runs
+from studies.harness.parts import Part, kill_family, runs
 from studies.mission_run.run import RunTerms, run_mission
-from studies.mission_run.spacecraft import SpacecraftProcess
 from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
 
@@ -40,13 +39,13 @@ KILLED = (
 def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the ground wait for the stations of a spacecraft that is killed meanwhile."""
     was_restarted = threading.Event()
-    restart, unsent = SpacecraftProcess.restart, links.unsent
+    restart, unsent = KillableSpacecraft.restart, links.unsent
 
-    def note_restart(spacecraft: SpacecraftProcess) -> None:
+    def note_restart(spacecraft: KillableSpacecraft) -> None:
         restart(spacecraft)
         was_restarted.set()
 
-    monkeypatch.setattr(SpacecraftProcess, "restart", note_restart)
+    monkeypatch.setattr(KillableSpacecraft, "restart", note_restart)
     monkeypatch.setattr(links, "unsent", lambda *given: unsent(*given) or int(not was_restarted.is_set()))
 
 
@@ -59,11 +58,11 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
     planned = tuple(
         PlannedKill(scenario.epoch_utc_ns, phase, part, delay_s, 0.1) for phase, part, delay_s in KILLED
     )
-    monkeypatch.setattr("studies.mission_run.run.plan_kills", lambda *_: planned)
+    monkeypatch.setattr("benchmarks.campaigns.mission_kills.plan_kills", lambda *_: planned)
     hold_telecommands_until_the_spacecraft_was_killed(monkeypatch)
     folder = tmp_path / "killed"
-    killing = replace(terms, distributed=True, kill_seed=1, kills=len(planned))
-    killed = run_mission(scenario, data, folder, killing, print)
+    killing = KillTerms(0.25, windows_per_day=4, window_s=600.0, kill_seed=1, kills=len(planned))
+    killed = run_killed(scenario, data, folder, killing, print)
     assert killed["kills"]["by_part"] == {part: 1 for _, part, _ in sorted(KILLED, key=lambda one: one[1])}
     assert killed["kills"]["done"] == killed["kills"]["planned"] == len(KILLED)
     # A report uses the time correlation of that moment, which further time reports of the contact change a little.
@@ -111,10 +110,10 @@ def test_a_spacecraft_is_started_again_after_the_kill_has_ended() -> None:
             done.append("killed")
 
     left, right = socket.socketpair()
-    spacecraft = SpacecraftProcess.__new__(SpacecraftProcess)
+    spacecraft = KillableSpacecraft.__new__(KillableSpacecraft)
     spacecraft.__dict__ |= {"_part": SlowPart(), "_lock": threading.Lock(), "_console": left}
     with left, right, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SpacecraftProcess, "_disconnect", lambda _: None)
+        patch.setattr(KillableSpacecraft, "_disconnect", lambda _: None)
         killer = threading.Thread(target=spacecraft.kill)
         killer.start()
         killing.wait(10.0)
@@ -252,23 +251,3 @@ def test_a_database_server_continues_with_its_files(tmp_path: Path) -> None:
     finally:
         again.part.end()
         again.remove()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--speed", "0"],
-        ["--speed", "quick"],
-        ["--window-min", "0.1"],
-        ["--kill", "1"],
-        ["--database", "postgresql://x/y"],
-        ["--distributed", "--kills", "3"],
-        ["--distributed", "--kill", "-1"],
-        ["--distributed", "--kill", "1", "--kills", "-1"],
-    ],
-)
-def test_options_that_do_not_fit_are_refused_in_one_line(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
-    assert capsys.readouterr().err.count("\n") == 1

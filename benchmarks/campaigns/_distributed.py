@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pydantic import SecretStr
 
+from benchmarks._servers import PidFile, PostgresServer, RedisServer
 from ground_service.access.service import add_token, add_user
 from ground_service.client import Client
 from ground_service.clock import ClockFile, set_mission_clock
@@ -28,17 +29,7 @@ from ground_service.store.database import prepare_database
 from ground_service.worker.app import worker_answers
 from ground_service.worker.scheduler import LEASE
 from lunar.datafolder import DataFolder
-from studies.harness.parts import (
-    Part,
-    PidFile,
-    PostgresServer,
-    RedisServer,
-    answers_http,
-    bare_environment,
-    environment_with_data,
-    free_port,
-    runs,
-)
+from studies.harness.parts import Part, answers_http, bare_environment, environment_with_data, free_port, runs
 from studies.mission_run.ground import FLIGHT_DYNAMICS, USER, MissionGround
 
 WORKERS = 2
@@ -53,11 +44,14 @@ class Servers:
     broker_url: str | None = None
 
 
+OWN_SERVERS = Servers()
+
+
 class DistributedGround(MissionGround):
     """The service as separate processes, `parts` by name."""
 
     def __init__(self, folder: Path, data: DataFolder, clock_file: Path, servers: Servers) -> None:
-        self.while_waiting = lambda: None
+        self.while_waiting: Callable[[], object] = lambda: None
         self.parts: dict[str, Part] = {}
         self.pids = PidFile(folder / "processes.json")
         self.pids.end_left_over()
@@ -72,6 +66,11 @@ class DistributedGround(MissionGround):
         except BaseException:
             self.close()
             raise
+
+    def _holds(self, is_done: Callable[[], bool]) -> bool:
+        # An error ends the wait, as the end of the spacecraft with its stations does.
+        self.while_waiting()
+        return super()._holds(is_done)
 
     def note_processes(self) -> None:
         """Record the processes, so that a later run can end them if this one is killed."""
