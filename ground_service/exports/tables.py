@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ground_service.evaluation.core import PassInputs
 from lunar.arrays import FloatArray, IntArray
+from lunar.frames import continuous_quaternions
 from lunar.ground_track import ground_track
 from reports.values import NavigationSeries
 
@@ -279,10 +280,10 @@ def _reference_epochs(inputs: PassInputs) -> IntArray:
 
 
 def _attitude(inputs: PassInputs) -> Table:
-    viewing = inputs.viewing
-    columns = [_utc(viewing.attitude_utc_ns)]
+    q_wxyz = continuous_quaternions(inputs.viewing.q_wxyz)
+    columns = [_utc(inputs.viewing.attitude_utc_ns)]
     columns += [
-        Column(f"q_{part}", viewing.q_wxyz[:, k], "", "quaternion from ICRF to camera axes, v_c = q v_i q*")
+        Column(f"q_{part}", q_wxyz[:, k], "", "quaternion from ICRF to camera axes, v_c = q v_i q*")
         for k, part in enumerate("wxyz")
     ]
     return Table("attitude", "Attitude of the camera in the frames", tuple(columns))

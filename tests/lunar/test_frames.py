@@ -15,6 +15,7 @@ from lunar.errors import DataFileError, EphemerisCoverageError
 from lunar.frames import (
     PA_FROM_ME_DE421,
     IauOrientation,
+    continuous_quaternions,
     enu_from_mcmf,
     icrf_from_j2000,
     load_orientation,
@@ -226,3 +227,11 @@ def test_a_frame_kernel_without_the_mean_earth_frame_is_refused(data_path, tmp_p
     path.write_text("KPL/FK\n\\begindata\nFRAME_31006_NAME = 'MOON_PA_DE421'\n\\begintext\n")
     with pytest.raises(DataFileError, match="three angles of a mean-Earth frame"):
         load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", path)
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_signs_of_successive_quaternions_do_not_flip(count):
+    angle = 0.3 * np.arange(count)
+    smooth = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle, 0.0 * angle], axis=1)
+    flipped = smooth * np.where(np.arange(count) % 3 == 1, -1.0, 1.0)[:, None]
+    np.testing.assert_array_equal(continuous_quaternions(flipped), smooth)

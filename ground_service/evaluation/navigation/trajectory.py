@@ -10,7 +10,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
-from lunar.frames import quaternion_from_matrix, rtn_from_inertial
+from lunar.frames import continuous_quaternions, quaternion_from_matrix, rtn_from_inertial
 
 
 def format_tum(utc_ns: IntArray, position_m: FloatArray, reference_m: FloatArray) -> str:
@@ -25,14 +25,14 @@ def format_tum(utc_ns: IntArray, position_m: FloatArray, reference_m: FloatArray
     """
     seconds = (utc_ns - utc_ns[0]) / NANOSECONDS_PER_SECOND
     velocity = np.gradient(reference_m, seconds, axis=0)
-    w, x, y, z = np.moveaxis(
-        quaternion_from_matrix(np.swapaxes(rtn_from_inertial(reference_m, velocity), 1, 2)), -1, 0
-    )
+    turns = quaternion_from_matrix(np.swapaxes(rtn_from_inertial(reference_m, velocity), 1, 2))
     lines = [
         f"{int(t) // NANOSECONDS_PER_SECOND}.{int(t) % NANOSECONDS_PER_SECOND:09d} "
         + " ".join(f"{value:.6f}" for value in position)
         + " "
         + " ".join(f"{value:.12f}" for value in turn)
-        for t, position, turn in zip(utc_ns, position_m, np.stack([x, y, z, w], axis=1), strict=True)
+        for t, position, turn in zip(
+            utc_ns, position_m, np.roll(continuous_quaternions(turns), -1, axis=1), strict=True
+        )
     ]
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n"
