@@ -41,17 +41,15 @@ class Forces(NamedTuple):
 
 
 class Method(NamedTuple):
-    """Butcher's tableau of an embedded method (stages in rows), and the order of its error estimate.
+    """Tableau of an embedded Runge-Kutta-Nystrom method (stages in rows), and the order of its error estimate.
 
-    ``b`` and ``error`` have a row for positions and one for velocities; ``nystrom``: for second-order equations.
+    ``b`` and ``error`` have a row for positions and one for velocities.
     """
 
-    nystrom: bool
     a: FloatArray
     b: FloatArray
     c: FloatArray
     error: FloatArray
-    second_error: FloatArray
     error_order: int
 
 
@@ -280,66 +278,47 @@ def _stage_place(
     c: FloatArray,
     stage: int,
     signed: float,
-    nystrom: bool,
 ) -> None:
-    """Put the position of a stage into ``work`` and, but for Nystrom's methods, its velocity into the rates ``k``."""
-    for d in range(6):
+    """Put the position of a stage into ``work``, from the accelerations ``k`` of the stages before it."""
+    for d in range(3):
         work[d] = 0.0
     for j in range(stage):
-        for d in range(6):
+        for d in range(3):
             work[d] += a[stage, j] * k[j, d]
     for d in range(3):
-        if nystrom:
-            work[d] = y[d] + signed * (c[stage] * y[d + 3] + signed * work[d + 3])
-        else:
-            work[d] = y[d] + signed * work[d]
-            k[stage, d] = y[d + 3] + signed * work[d + 3]
+        work[d] = y[d] + signed * (c[stage] * y[d + 3] + signed * work[d])
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def _step_end(
     new: FloatArray,
-    first: FloatArray,
-    second: FloatArray,
+    estimate: FloatArray,
     k: FloatArray,
     y: FloatArray,
     b: FloatArray,
     error: FloatArray,
-    second_error: FloatArray,
     signed: float,
     rtol: float,
-    nystrom: bool,
-    two_estimates: bool,
 ) -> float:
-    """Put the state at the end of a step into ``new`` and return its error over the tolerance.
-
-    With two estimates of the error these are combined (Hairer, Norsett, Wanner 1993, section II.10).
-    """
+    """Put the state at the end of a step into ``new`` and return its error over the tolerance."""
     for d in range(6):
-        new[d] = first[d] = second[d] = 0.0
-    for i in range(len(second_error)):
+        new[d] = estimate[d] = 0.0
+    for i in range(len(k)):
         for d in range(6):
             row = d // 3
-            rate = k[i, d] if d > 2 or not nystrom else signed * k[i, d + 3]
+            rate = k[i, d - 3] if d > 2 else signed * k[i, d]
             new[d] += b[row, i] * rate
-            first[d] += error[row, i] * rate
-            second[d] += second_error[i] * rate
+            estimate[d] += error[row, i] * rate
     size_r = rtol * rtol * (y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
     size_v = rtol * rtol * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
-    fine = coarse = 0.0
+    total = 0.0
     for d in range(6):
-        if nystrom and d < 3:
+        if d < 3:
             new[d] += y[d + 3]
         new[d] = y[d] + signed * new[d]
         size = size_r if d < 3 else size_v
-        fine += first[d] * first[d] / size
-        coarse += second[d] * second[d] / size
-    step = abs(signed)
-    if not two_estimates:
-        return step * math.sqrt(fine / 6.0)
-    if fine > 0.0:
-        return step * fine / math.sqrt(6.0 * (fine + 0.01 * coarse))
-    return 0.0
+        total += estimate[d] * estimate[d] / size
+    return abs(signed) * math.sqrt(total / 6.0)
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
@@ -356,22 +335,22 @@ def _keep_knot(
     for d in range(6):
         states[count, d] = y[d]
     for d in range(3):
-        rates[count, d] = k[0, d + 3]
+        rates[count, d] = k[0, d]
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def _back_to_knot(y: FloatArray, k: FloatArray, states: FloatArray, rates: FloatArray, knot: int) -> None:
-    """Put state and rates of a knot into ``y`` and stage 0."""
+    """Put state and acceleration of a knot into ``y`` and stage 0."""
     for d in range(3):
         y[d] = states[knot, d]
-        y[d + 3] = k[0, d] = states[knot, d + 3]
-        k[0, d + 3] = rates[knot, d]
+        y[d + 3] = states[knot, d + 3]
+        k[0, d] = rates[knot, d]
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def _seconds_to_periapsis(y: FloatArray, k: FloatArray) -> float:
     """Return the time to the zero of the radial speed by a step of Newton's rule, from state and rates of a knot."""
-    rate = y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 3] + y[1] * k[0, 4] + y[2] * k[0, 5]
+    rate = y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 0] + y[1] * k[0, 1] + y[2] * k[0, 2]
     seconds: float = -_radial(y) / rate
     return seconds
 
@@ -440,12 +419,11 @@ def integrate(
     acceleration at both ends.
     """
     gravity, scalars, table, scratch_size = forces
-    nystrom, a, b, c, error, second_error, order = method
+    a, b, c, error, order = method
     times, states, rates = knots
     last = len(c) - 1
     scratch, frame, work = np.empty(scratch_size), np.empty(COLUMNS), np.empty(6)
-    k, y, new, first, second = np.empty((last + 1, 6)), y0.copy(), np.empty(6), np.empty(6), np.empty(6)
-    two = bool(np.any(second_error != 0.0))
+    k, y, new, errors = np.empty((last + 1, 3)), y0.copy(), np.empty(6), np.empty(6)
     sign = 1.0 if stop_s >= start_s else -1.0
     t = t_new = start_s
     h = min(abs(first_step_s), control.max_step_s)
@@ -454,9 +432,9 @@ def integrate(
     status = REACHED
     rejected = known = False
     while True:
-        _stage_place(work, k, y, a, c, stage, signed, nystrom)
+        _stage_place(work, k, y, a, c, stage, signed)
         if not known:
-            k[stage, 3], k[stage, 4], k[stage, 5] = force_acceleration(
+            k[stage, 0], k[stage, 1], k[stage, 2] = force_acceleration(
                 t + c[stage] * signed, work[0], work[1], work[2], gravity, scalars, table, scratch, frame
             )
             evaluations += 1
@@ -480,17 +458,14 @@ def integrate(
             stage += 1
             continue
         else:
-            estimate = _step_end(
-                new, first, second, k, y, b, error, second_error, signed, control.rtol, nystrom, two
-            )
+            estimate = _step_end(new, errors, k, y, b, error, signed, control.rtol)
             h = _next_size(step, estimate, h, control.max_step_s, order, rejected)
             if estimate <= 1.0:
                 rejected = False
                 t = t_new
                 y[:] = new
-                known = nystrom  # the last stage is the first of the next step
-                if known:
-                    k[0, 3:] = k[last, 3:]
+                known = True  # the last stage is the first of the next step
+                k[0] = k[last]
                 signed, stage = 0.0, 0
                 continue
             if h < SHORTEST_STEP_S:

@@ -1,44 +1,20 @@
-"""Coefficients of the explicit Runge-Kutta methods, as plain arrays for the compiled integrator.
+"""Coefficients of RKN8(6)9FM for accelerations that do not depend on velocity; the last stage begins the next step.
+
+``C`` are the nodes, ``A`` the lower triangle of stages, ``B`` (2, stages) the weights for position and for velocity,
+``ERROR`` (2, stages) those of the error estimate.
 
 References
 ----------
-DOP853: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (2nd ed. 1993), section II.10, 8(5,3), as
-SciPy carries it.
-RKN8(6): Dormand, El-Mikkawy, Prince, IMA J. Numer. Anal. 7:235 (1987), RKN8(6)9FM, for accelerations that do not depend
-on velocity; 9 stages of which the last is the first of the next step.
+Dormand, El-Mikkawy, Prince, IMA J. Numer. Anal. 7:235 (1987).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import DOP853 as Scipy
 
 from lunar.arrays import FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tableau:
-    """One method of ``stages`` stages.
-
-    ``c`` are the nodes, ``a`` the lower triangle of stages, ``b`` (2, stages) the weights for position and for
-    velocity, ``error`` (2, stages) those of the error estimate.  A Nystrom method forms positions from accelerations
-    alone, with h^2; the others form both from rates, with h, so that their two rows are equal.  DOP853 has a second
-    estimate.  ``error_order`` is the power of h in the estimate, ``rtol`` and ``max_step_s`` what suits a low orbit.
-    """
-
-    name: str
-    nystrom: bool
-    c: FloatArray
-    a: FloatArray
-    b: FloatArray
-    error: FloatArray
-    second_error: FloatArray
-    error_order: int
-    rtol: float
-    max_step_s: float
 
 
 def _lower_triangle(*rows: Sequence[float]) -> FloatArray:
@@ -48,8 +24,8 @@ def _lower_triangle(*rows: Sequence[float]) -> FloatArray:
     return matrix
 
 
-_RKN86_C = np.array([0, 1 / 20, 1 / 10, 3 / 10, 1 / 2, 7 / 10, 9 / 10, 1, 1])
-_RKN86_A = _lower_triangle(
+C = np.array([0, 1 / 20, 1 / 10, 3 / 10, 1 / 2, 7 / 10, 9 / 10, 1, 1])
+A = _lower_triangle(
     (1 / 800,),
     (1 / 600, 1 / 300),
     (9 / 200, -9 / 100, 9 / 100),
@@ -69,7 +45,7 @@ _RKN86_A = _lower_triangle(
     ),
     (223 / 7938, 0, 1175 / 8064, 925 / 6048, 41 / 448, 925 / 14112, 1175 / 72576),
 )
-_RKN86_B = np.array(
+B = np.array(
     [
         [223 / 7938, 0, 1175 / 8064, 925 / 6048, 41 / 448, 925 / 14112, 1175 / 72576, 0, 0],
         [
@@ -78,7 +54,7 @@ _RKN86_B = np.array(
         ],
     ]
 )
-_RKN86_LOWER = np.array(
+_LOWER = np.array(
     [
         [
             *(7987313 / 109941300, 0, 1610737 / 44674560, 10023263 / 33505920, -497221 / 12409600),
@@ -90,14 +66,4 @@ _RKN86_LOWER = np.array(
         ],
     ]
 )
-
-_TWICE = np.ones((2, 1))
-RKN86 = Tableau(
-    "rkn86", True, _RKN86_C, _RKN86_A, _RKN86_B, _RKN86_B - _RKN86_LOWER, np.zeros(9), 7, 1e-9, 30.0
-)
-# SciPy's estimates have one more column, zero, for the stage that begins the next step.
-DOP853 = Tableau(
-    *("dop853", False, Scipy.C, Scipy.A, _TWICE * Scipy.B),
-    *(_TWICE * Scipy.E5[:-1], Scipy.E3[:-1], 8, 1e-10, 30.0),
-)
-TABLEAUX = {tableau.name: tableau for tableau in (RKN86, DOP853)}
+ERROR = B - _LOWER

@@ -19,7 +19,8 @@ from lunar.arrays import FloatArray
 from lunar.elements import Elements, elements_from_icrf_state
 from lunar.errors import OrbitError
 from lunar.propagation import (
-    DEFAULT_INTEGRATOR,
+    MAX_STEP_S,
+    RTOL,
     Arc,
     ForceModel,
     Trajectory,
@@ -63,9 +64,8 @@ def propagate_with_maneuvers(
     duration_s: float,
     model: ForceModel,
     rule: ManeuverRule,
-    integrator: str = DEFAULT_INTEGRATOR,
-    rtol: float | None = None,
-    max_step_s: float | None = None,
+    rtol: float = RTOL,
+    max_step_s: float = MAX_STEP_S,
 ) -> tuple[Trajectory, tuple[Maneuver, ...]]:
     """Return the maintained orbit over ``duration_s`` (forwards only), and its burns in order of time.
 
@@ -97,7 +97,6 @@ def propagate_with_maneuvers(
             state,
             float(duration_s),
             model,
-            integrator,
             rtol,
             max_step_s,
             constants.MOON_RADIUS_M,

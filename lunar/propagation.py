@@ -4,15 +4,15 @@ States are position and velocity (m, m/s) from the Moon's centre along ICRF axes
 Forces: gravity field to any degree in principal axes, tides of Earth and Sun, optionally the pressure of sunlight with
 the shadows of Moon and Earth.
 
-An adaptive method of order 8 takes the steps: the Runge-Kutta-Nystrom pair 8(6) of Dormand et al. (default: it uses
-that no force here depends on velocity) or DOP853 of Hairer et al.  Every accepted step is kept, and
-between steps a quintic through position, velocity and acceleration at both ends is read, within 1 mm and 1e-4 m/s.
+The Runge-Kutta-Nystrom pair 8(6) of Dormand et al. takes the steps: it uses that no force here depends on velocity.
+Every accepted step is kept, and between steps a quintic through position, velocity and acceleration at both ends is
+read, within 1 mm and 1e-4 m/s.
 On a low orbit at degree 100 the longest step of a method rules nearly always: the errors of equal steps cancel better
 than those of steps that follow the terrain.
 
 References
 ----------
-Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (1993), sections II.4 (step size) and II.10.
+Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (1993), sections II.4 (step size) and II.10 (DOP853).
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ if TYPE_CHECKING:
     from lunar.frames import Orientation
 
 
-DEFAULT_INTEGRATOR = "rkn86"
+RTOL, MAX_STEP_S = 1e-9, 30.0
+"""Tolerance of a step and longest step that suit a low orbit."""
 
+_ERROR_ORDER = 7
 _TABLE_STEP_S = 43_200.0
 _TABLE_TERMS = 8
 _KNOTS = 16_384
@@ -150,15 +152,14 @@ def propagate(
     velocity_icrf_m_s: ArrayLike,
     duration_s: float,
     model: ForceModel,
-    integrator: str = DEFAULT_INTEGRATOR,
-    rtol: float | None = None,
-    max_step_s: float | None = None,
+    rtol: float = RTOL,
+    max_step_s: float = MAX_STEP_S,
     ground_radius_m: float = constants.MOON_RADIUS_M,
 ) -> Trajectory:
     """Return the orbit from a state at ``epoch_tdb_s`` over ``duration_s`` (negative: backwards).
 
-    ``integrator`` is "rkn86" or "dop853"; ``rtol`` (per step, of position and velocity) and ``max_step_s``
-    are by default what suits the method on a low orbit: 0.5 m or better over 30 days at degree 100.
+    With the default ``rtol`` (per step, of position and velocity) and ``max_step_s`` a low orbit is within 0.5 m over
+    30 days at degree 100.
 
     Raises
     ------
@@ -173,7 +174,6 @@ def propagate(
         state_vector(position_icrf_m, velocity_icrf_m_s),
         float(duration_s),
         model,
-        integrator,
         rtol,
         max_step_s,
         ground_radius_m,
@@ -195,8 +195,9 @@ def propagate_with_stm(
     The state moves under the whole model, the matrix under its field to ``stm_degree`` with Earth and Sun.  Equal
     steps of the eighth-order method, none longer than ``step_s``: within 0.1 mm per orbit at 15 s and degree 100.
     """
+    from scipy.integrate import DOP853
+
     from lunar import _dynamics_kernel as kernel
-    from lunar._tableaux import DOP853
 
     start = state_vector(position_icrf_m, velocity_icrf_m_s)
     if duration_s == 0.0:
@@ -205,7 +206,7 @@ def propagate_with_stm(
     low = packed_gradient(model.gravity, min(stm_degree, _degree(model)))
     steps = max(1, int(np.ceil(abs(duration_s) / step_s - 1e-9)))
     y = kernel.transition(
-        start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.a, DOP853.b[0], DOP853.c
+        start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.A, DOP853.B, DOP853.C
     )
     return y[:3], y[3:6], y[6:].reshape(6, 6)
 
@@ -228,9 +229,8 @@ def integrate_arc(
     state: FloatArray,
     stop_s: float,
     model: ForceModel,
-    integrator: str,
-    rtol: float | None,
-    max_step_s: float | None,
+    rtol: float,
+    max_step_s: float,
     ground_radius_m: float,
     *,
     event: int = 0,
@@ -239,18 +239,11 @@ def integrate_arc(
 ) -> Arc:
     """Return the steps from ``start_s`` to ``stop_s`` after the epoch, or to the event asked for (see the kernel)."""
     from lunar import _dynamics_kernel as kernel
-    from lunar._tableaux import TABLEAUX
+    from lunar._tableaux import ERROR, A, B, C
 
-    if integrator not in TABLEAUX:
-        raise OrbitError(f"integrator: expected one of {', '.join(TABLEAUX)}, found {integrator!r}")
-    method = TABLEAUX[integrator]
-    rtol = method.rtol if rtol is None else rtol
-    max_step_s = method.max_step_s if max_step_s is None else max_step_s
     _check_arc(state, stop_s, rtol, max_step_s, ground_radius_m)
     forces = kernel.Forces(*force_arrays(model, epoch_tdb_s, start_s, stop_s))
-    tableau = kernel.Method(
-        method.nystrom, method.a, method.b, method.c, method.error, method.second_error, method.error_order
-    )
+    tableau = kernel.Method(A, B, C, ERROR, _ERROR_ORDER)
     control = kernel.Control(rtol, max_step_s, ground_radius_m, event, event_radius_m)
     parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     time, y, step, evaluations = start_s, np.ascontiguousarray(state), first_step_s, 0

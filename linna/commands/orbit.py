@@ -23,7 +23,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(propagate, "--out F.oem", Path, "ephemeris to write", required=True)
     option(propagate, "--gravity FILE", str, "coefficient file, or 'builtin'")
     option(propagate, "--degree N", int, "degree of the gravity field")
-    option(propagate, "--integrator", ("rkn86", "dop853"), "another one than the scenario's")
     option(propagate, "--no-maneuvers", bool, "let the orbit drift freely")
     finish(propagate, run_propagate)
     configure_compare(commands)
@@ -64,7 +63,7 @@ def run_propagate(arguments: argparse.Namespace) -> int:
 def _with_choices(scenario: Any, arguments: argparse.Namespace) -> Any:
     import dataclasses
 
-    changes = {"gravity": arguments.gravity, "degree": arguments.degree, "integrator": arguments.integrator}
+    changes = {"gravity": arguments.gravity, "degree": arguments.degree}
     dynamics = dataclasses.replace(
         scenario.dynamics, **{key: value for key, value in changes.items() if value is not None}
     )

@@ -132,7 +132,7 @@ def propagate_to_impact(
 def propagate_from(
     scenario: Scenario, model: ForceModel, epoch_utc_ns: int, state_icrf: FloatArray, duration_s: float
 ) -> ScenarioOrbit:
-    """Return the orbit from a state (6,) in m and m/s, with the integrator and the burns of a scenario.
+    """Return the orbit from a state (6,) in m and m/s, with the burns of a scenario.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def propagate_from(
         The orbit hits the Moon.
     """
     epoch_tdb_s, state = tdb_s_from_utc_ns(epoch_utc_ns), state_icrf
-    rule, integrator = scenario.maneuvers, scenario.dynamics.integrator
+    rule = scenario.maneuvers
     maneuvers: tuple[Maneuver, ...] = ()
     if rule.enabled:
         trajectory, maneuvers = propagate_with_maneuvers(
@@ -150,10 +150,9 @@ def propagate_from(
             duration_s,
             model,
             ManeuverRule(rule.periselene_altitude_km * 1e3, rule.semi_major_axis_km * 1e3, rule.eccentricity),
-            integrator=integrator,
         )
     else:
-        trajectory = propagate(epoch_tdb_s, state[:3], state[3:], duration_s, model, integrator=integrator)
+        trajectory = propagate(epoch_tdb_s, state[:3], state[3:], duration_s, model)
     return ScenarioOrbit(trajectory, maneuvers, model, epoch_utc_ns)
 
 

@@ -65,7 +65,6 @@ class DynamicsSection:
     orientation: Literal["auto", "iau", "de421"] = "auto"
     earth: bool = True
     sun: bool = True
-    integrator: Literal["rkn86", "dop853"] = "rkn86"
     solar_area_to_mass_m2_kg: float = 0.0
     solar_reflection: float = 1.3
 
@@ -421,6 +420,10 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
             f"{source}: section [{name}]: instruments other than the camera were withdrawn; leave the section out, "
             "or declare the packets of the instrument in the mission description"
         )
+    dynamics = table.get("dynamics")
+    # Scenarios of archives state the integrator of versions that had two.
+    if isinstance(dynamics, dict) and dynamics.pop("integrator", "rkn86") != "rkn86":
+        raise ScenarioError(f"{source}: dynamics.integrator: only 'rkn86' is left; leave the key out")
     scenario = _read(table, source)
     _check(scenario, source)
     return scenario

@@ -7,7 +7,7 @@ from linna.parser import command_parser
 
 RELIED_ON = """
 demo --out D
-orbit propagate S --days 1 --step 30 --out F.oem --gravity G --degree 8 --integrator dop853 --no-maneuvers
+orbit propagate S --days 1 --step 30 --out F.oem --gravity G --degree 8 --no-maneuvers
 orbit compare A B
 orbit interpolate F --epochs E
 catalogue stats F

@@ -106,6 +106,7 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ('name = "x"\n[camera]\nfov_deg = 180', "camera.fov_deg must be from 1 to 170"),
         ('name = "x"\n[window]\nsearch = "none"', "window.duration_s must be positive"),
         ("name = ", "not TOML"),
+        ('name = "x"\n[dynamics]\nintegrator = "dop853"', "dynamics.integrator: only 'rkn86' is left"),
         ('name = "x"\n[altimeter]', "section [altimeter]: instruments other than the camera were withdrawn"),
         (
             'name = "x"\n[link]\nclock_errors = ["madrid 1", "madrid 2"]',
@@ -165,3 +166,8 @@ def test_a_stated_key_without_effect_is_refused_and_an_archive_that_states_all_i
     assert message in str(refusal.value) and str(file) in str(refusal.value)
     archived = parse_scenario(file.read_text())
     assert parse_scenario(format_scenario(archived)) == archived
+
+
+def test_a_scenario_of_an_older_archive_reads_as_before() -> None:
+    older = 'name = "x"\n[dynamics]\ndegree = 8\nintegrator = "rkn86"'
+    assert parse_scenario(older) == parse_scenario('name = "x"\n[dynamics]\ndegree = 8')

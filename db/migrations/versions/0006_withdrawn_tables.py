@@ -1,4 +1,4 @@
-"""Remove the layouts of the telemetry displays and the actions of automation rules.
+"""Remove the layouts of the telemetry displays, the actions of automation rules and the link settings of receptions.
 
 Revision: 1.5, after 1.4
 """
@@ -14,5 +14,5 @@ depends_on = None
 
 
 def upgrade() -> None:
-    for table in ("display_objects", "automation_actions"):
+    for table in ("display_objects", "automation_actions", "good_links"):
         op.drop_table(table)
