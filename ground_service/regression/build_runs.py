@@ -142,10 +142,9 @@ def _judged(build: Build, report: Mapping[str, Any], written: Path, out: Path) -
 
 
 def _outcome(report: Mapping[str, Any], printed: str) -> tuple[str, str]:
-    cause, status, killed = report["cause"], report["exit_status"], report["signal"]
+    cause, status = report["cause"], report["exit_status"]
     last = printed.strip().splitlines()[-1][:200] if printed.strip() else ""
-    if killed is None and status is not None and status > 128:
-        killed = status - 128
+    killed = status - 128 if status is not None and status > 128 else None
     if cause:
         return str(cause), ""
     if status != 0 and report.get("full"):
@@ -156,7 +155,7 @@ def _outcome(report: Mapping[str, Any], printed: str) -> tuple[str, str]:
         return "disk", last
     if status != 0 and any(sign in printed for sign in _OUT_OF_MEMORY):
         return "memory", last
-    if status == 0 and killed is None:
+    if status == 0:
         return OK, ""
     how = f"signal {killed}" if killed is not None else f"exit status {status}"
     return "crashed", f"{how}: {last}" if last else how

@@ -377,7 +377,7 @@ def check_parameters(build: Build, *, runner: Path | None = None, private: Seque
     fault = _fault_of(told) if report["exit_status"] == CHECK_FAILED else None
     if fault is None:
         last = told.splitlines()[-1][:200] if told else "nothing printed"
-        status = report["cause"] or f"status {report['exit_status']}, signal {report['signal']}"
+        status = report["cause"] or f"status {report['exit_status']}"
         raise BuildNotChecked(build.title, f"the check of the parameters ended with {status}: {last}")
     raise fault
 

@@ -147,27 +147,30 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sandbox(arguments: argparse.Namespace) -> int:
     from ground_service.regression.runner import alive
-    from ground_service.regression.sandbox.host import REMEDY, protection
+    from ground_service.regression.sandbox.host import SandboxRefused, protection
     from ground_service.settings import load_settings
 
     exchange = load_settings().runner_exchange
-    here = protection()
-    answers = exchange is not None and alive(exchange)
+    isolation = refusal = ""
+    try:
+        isolation = protection()
+    except SandboxRefused as error:
+        refusal = str(error)
+    text = f"builds are isolated by: {isolation}"
     if exchange is not None:
-        told = f"builds run in the runner at {exchange}"
+        text = f"builds run in the runner at {exchange}"
         refusal = (
-            "" if answers else f"runner exchange {exchange}: expected a runner, found none that responds"
+            ""
+            if alive(exchange)
+            else f"runner exchange {exchange}: expected a runner, found none that responds"
         )
-    else:
-        told, refusal = f"builds are isolated by: {here.isolation}", here.refusal
-    text = f"builds are refused: {refusal}; remedy: {REMEDY}" if refusal else told
     figures = {
         "confined": not refusal,
-        "isolation": here.isolation,
+        "isolation": isolation,
         "refusal": refusal,
         "runner": str(exchange) if exchange else None,
     }
-    emit(arguments, figures, text=text)
+    emit(arguments, figures, text=f"builds are refused: {refusal}" if refusal else text)
     return 1 if refusal else 0
 
 

@@ -74,7 +74,7 @@ def _refused(*_: Any, **__: Any) -> dict[str, Any]:
 def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
     def run(request: Any, staged: Path, written: Path, printed: Path, **_: Any) -> dict[str, Any]:
         printed.write_text("Traceback\nMemoryError\n")
-        return {"cause": "", "exit_status": 0, "signal": None} | changes
+        return {"cause": "", "exit_status": 0} | changes
 
     return run
 
@@ -83,9 +83,9 @@ def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
     ("run", "told"),
     [
         (_refused, "no user namespaces"),
-        (_ended(exit_status=1), "status 1, signal None: MemoryError"),
-        (_ended(exit_status=2), "status 2, signal None: MemoryError"),
-        (_ended(exit_status=None, signal=9), "signal 9"),
+        (_ended(exit_status=1), "status 1: MemoryError"),
+        (_ended(exit_status=2), "status 2: MemoryError"),
+        (_ended(exit_status=137), "status 137"),
         (_ended(cause="timeout"), "ended with timeout"),
     ],
 )
