@@ -65,14 +65,13 @@ def _gates(report: RegressionReport) -> Table:
 
 
 def _outcome_text(gate: RegressionGate) -> str:
-    """Return the outcome of a gate with its reason and evidence, and the reason of a waiver."""
+    """Return the outcome of a gate with its reason and evidence."""
     parts = [{"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome), gate.reason, gate.evidence]
     if gate.outcome == "inconclusive" and gate.frames_needed is not None:
         parts.append(
             f"about {count_text(gate.frames_needed)} frames decide, {count_text(gate.frames)} compared"
         )
-    text = ", ".join(filter(None, parts))
-    return f"{text}; waived: {gate.waived}" if gate.waived else text
+    return ", ".join(filter(None, parts))
 
 
 def _changed(report: RegressionReport) -> list[Block]:

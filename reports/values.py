@@ -678,8 +678,8 @@ class RegressionGate:
         Number of compared frames, and number needed to decide the gate; None if unknown.
     evidence
         Number and name of the units.
-    reason, waived
-        The fact in words, and why its outcome is waived; empty if neither applies.
+    reason
+        The fact in words; may be empty.
     """
 
     name: str
@@ -694,7 +694,6 @@ class RegressionGate:
     frames_needed: int | None = None
     evidence: str = ""
     reason: str = ""
-    waived: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

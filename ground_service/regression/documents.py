@@ -94,9 +94,7 @@ def regression_text(verdict: Verdict) -> str:
     deciding = [gate for gate in verdict.gates if gate.outcome in order]
     whole = {gate.name for gate in deciding if gate.outcome == FAIL and not gate.pass_name}
     for gate in sorted(deciding, key=lambda gate: order.index(gate.outcome)):
-        if gate.waived:
-            lines.append(f"waived ({gate.outcome}): {gate.waived}: {gate.text}")
-        elif not gate.passed and not (gate.pass_name and gate.name in whole):
+        if not gate.passed and not (gate.pass_name and gate.name in whole):
             # The headline names the passes on which a metric fails that fails over all of them.
             lines.append(f"{gate.outcome}: {gate.text}")
     told = ("worse", "better")
@@ -124,8 +122,7 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
 
     Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in
     the stricter one of Apache Ant (JUnit.xsd). A pass that the candidate did not finish is one failure. What is
-    inconclusive is a failure or skipped, as the policy says; a waived case is skipped with its reason. The time of a
-    pass is that of the candidate's replay.
+    inconclusive is a failure or skipped, as the policy says. The time of a pass is that of the candidate's replay.
     """
     open_kind = "skipped" if verdict.policy.inconclusive == "skip" else "failure"
     cases: list[tuple[str, str, str, str, float]] = []
@@ -140,8 +137,6 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
             continue
         kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: open_kind, NOT_JUDGED: "skipped"}[gate.outcome]
         text = f"{gate.outcome}: {gate.text}"
-        if gate.waived:
-            kind, text = "skipped", f"waived: {gate.waived}; {text}"
         cases.append((" on ".join(filter(None, (gate.name, gate.pass_name))), "gates", kind, text, 0.0))
     if not verdict.gates and all(one.state != "candidate failed" for one in verdict.passes):
         cases.append(("gates", "gates", open_kind, "inconclusive: no gate was judged", 0.0))
@@ -359,7 +354,6 @@ def _gate(gate: Gate) -> dict[str, Any]:
     texts = {
         "pass": row.pop("pass_name") or None,
         "reason": gate.reason or None,
-        "waived": gate.waived or None,
     }
     return {**row, **texts, "passed": gate.passed, "change_bounds": bounds}
 

@@ -36,7 +36,7 @@ def headline(outcome: RegressionOutcome) -> str:
 
 
 def _reason(outcome: RegressionOutcome) -> str:
-    gates = [gate for gate in outcome.gates if not gate.waived and gate.outcome not in (INFORMS, NOT_JUDGED)]
+    gates = [gate for gate in outcome.gates if gate.outcome not in (INFORMS, NOT_JUDGED)]
     lost = [one for one in outcome.passes if one.state == "candidate failed"]
     if lost:
         more = f" and on {len(lost) - 1} more" if len(lost) > 1 else ""

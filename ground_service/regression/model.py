@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from ground_service.http.model import Entity, Given
 from ground_service.http.times import UtcTime
@@ -130,12 +130,6 @@ class RegressionRequest(Comparison):
         default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
     )
     policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
-    minutes: float | None = Field(
-        default=None,
-        gt=0.0,
-        le=1e5,
-        description="Sequential: add passes in the most informative order until the verdict is clear, for so long",
-    )
     placebo: int | None = Field(
         default=None,
         ge=1,
@@ -230,7 +224,16 @@ class JudgedGate(Entity):
     frames_needed: int | None
     evidence: str = Field(default="", description="Number and name of the units of the evidence")
     reason: str | None
-    waived: str | None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_waiver(cls, given: Any) -> Any:
+        """Read a gate of an earlier verdict, which could be waived: it did not count."""
+        if not isinstance(given, dict) or "waived" not in given:
+            return given
+        kept = {key: value for key, value in given.items() if key != "waived"}
+        waiver = given["waived"]
+        return {**kept, "outcome": "not judged", "reason": f"waived: {waiver}"} if waiver else kept
 
     @property
     def text(self) -> str:
@@ -320,9 +323,7 @@ class Regression(Entity):
         """Return why the verdict is not pass: failed and open gates, passes without a comparison."""
         if self.verdict == "pass":
             return []
-        gates = [
-            one for one in self.result.gates if one.outcome in ("fail", "inconclusive") and not one.waived
-        ]
+        gates = [one for one in self.result.gates if one.outcome in ("fail", "inconclusive")]
         gates.sort(key=lambda one: one.outcome != "fail")
         return [
             *(one.text for one in gates),
@@ -336,7 +337,7 @@ class Regression(Entity):
     def summary(self) -> RegressionSummary:
         """Return the regression as lists show it."""
         deciding = [gate for gate in self.result.gates if gate.outcome != "informs"]
-        counted = [gate.outcome for gate in deciding if not gate.waived]
+        counted = [gate.outcome for gate in deciding]
         return RegressionSummary(
             id=self.id,
             verdict=self.verdict,

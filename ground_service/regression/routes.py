@@ -142,9 +142,9 @@ def start_regression(
     arguments = {
         **compared(ground, request),
         "policy": request.policy,
-        **request.model_dump(include={"policy_name", "minutes", "placebo"}),
+        **request.model_dump(include={"policy_name", "placebo"}),
     }
-    in_one_job = request.workers or request.minutes or request.placebo
+    in_one_job = request.workers or request.placebo
     missing = [] if in_one_job else missing_replays(ground, arguments)
     replays = {f"{one['archive']} {one['build']}": one for one in missing}
     for job in enter_jobs(ground, replays, "regression", arguments, identity):

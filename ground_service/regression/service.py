@@ -11,15 +11,12 @@ import math
 import os
 import platform
 import re
-import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput, Stopping
@@ -40,11 +37,10 @@ from ground_service.regression.build_runs import OUTCOMES, read_performance, run
 from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
 from ground_service.regression.gates.calibration import calibrations
-from ground_service.regression.gates.core import NOT_JUDGED, ONLY_LOOK, Look, judge
+from ground_service.regression.gates.core import NOT_JUDGED, judge
 from ground_service.regression.gates.faults import first_difference
 from ground_service.regression.gates.policy import PolicyFile, load_policy
-from ground_service.regression.gates.samples import KINDS, PassFrames
-from ground_service.regression.gates.sequence import informative_order, is_clear, planned_looks
+from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.model import (
     COMPLETE,
     OK,
@@ -66,14 +62,12 @@ from ground_service.regression.replay_samples import (
     PassContext,
     ReadDownlink,
     condition_of,
-    expected_rows,
     pass_context,
     read_downlink,
 )
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store.stored_files import register_file
 from lunar.errors import LunarError
-from lunar.timescales import format_utc
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
@@ -87,7 +81,6 @@ def run_regression(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-    minutes: float | None = None,
 ) -> RegressionOutcome:
     """Fly archives with both builds, where that was not done before, and judge.
 
@@ -99,62 +92,17 @@ def run_regression(
         Number of parallel replays, each in a separate process. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
-    minutes
-        Add passes in the most informative order until the verdict is clear, for so long. Default: all passes.
     """
     if not archives:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
     with ThreadPoolExecutor(workers or os.cpu_count() or 1, "archives") as pool:
         kept = list(pool.map(lambda given: _kept(ground, given), archives))
     builds = tuple(dict.fromkeys((baseline, candidate)))
-    usable = {
-        one.digest: one for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)
-    }
-    if minutes is None:
-        fly_shards(ground, _missing(ground, usable, builds), workers=workers, progress=progress)
-        return judge_regression(ground, kept, candidate, baseline, policy)
-    archives_left = list(usable.values())
-    tracks = np.array([_tracks(ground, one) for one in archives_left]).reshape(-1, len(KINDS))
-    order = informative_order(tracks, [one.frames for one in archives_left])
-    planned: list[PassArchive | PassVerdict] = [archives_left[i] for i in order]
-    others = [one for one in kept if one.digest not in usable]
-    looks = planned_looks([archives_left[i].frames for i in order]) or {0: ONLY_LOOK}
-    size = max((workers or os.cpu_count() or 1) // len(builds), 1)
-    stops = sorted({*looks, *range(size, len(planned), size)})
-    ends, spent, told, start = time.monotonic() + 60.0 * minutes, 0.0, list[str](), 0
-    for stop in progress(iter(stops), len(stops)) if progress else stops:
-        digests = [one.digest for one in planned[start:stop]]
-        fly_shards(ground, _missing(ground, digests, builds), workers=workers)
-        look, start = looks.get(stop), stop
-        if time.monotonic() > ends:
-            look = replace(looks[max(looks)], share=1.0 - spent)
-        if look is None:
-            continue
-        spent += look.share
-        outcome = judge_regression(ground, [*planned[:stop], *others], candidate, baseline, policy, look)
-        told.append(
-            f"{outcome.verdict} after {stop} of {len(planned)} passes ({look.share:.2g} of the level)"
-        )
-        if look.last or is_clear(outcome.verdict, stop, look):
-            break
-    return replace(outcome, remarks=(*outcome.remarks, f"sequential: {', '.join(told)}"))
-
-
-def _missing(ground: Ground, digests: Iterable[str], builds: Sequence[Build]) -> list[tuple[str, Build]]:
-    shards = [(digest, build) for digest in digests for build in builds]
-    return [shard for shard in shards if not is_done(find_replay(ground, *shard))]
-
-
-def _tracks(ground: Ground, archive: PassArchive) -> list[int]:
-    """Return the number of crater tracks in each kind of terrain; 0 of a pass without frames."""
-    if archive.state != COMPLETE:
-        return [0] * len(KINDS)
-    try:
-        rows = expected_rows(_context(ground, archive.digest))
-    except (GroundError, LunarError):
-        return [0] * len(KINDS)  # the verdict states the fault
-    kinds = rows.kind[np.unique(rows.track, return_index=True)[1]]
-    return list(map(int, np.bincount(kinds, minlength=len(KINDS))))
+    usable = [one.digest for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)]
+    shards = [(digest, build) for digest in dict.fromkeys(usable) for build in builds]
+    missing = [shard for shard in shards if not is_done(find_replay(ground, *shard))]
+    fly_shards(ground, missing, workers=workers, progress=progress)
+    return judge_regression(ground, kept, candidate, baseline, policy)
 
 
 def _context(ground: Ground, digest: str) -> PassContext:
@@ -284,7 +232,6 @@ def judge_regression(
     candidate: Build,
     baseline: Build,
     policy: PolicyFile,
-    look: Look = ONLY_LOOK,
 ) -> RegressionOutcome:
     """The gates over replays that were done."""
     passes = tuple(
@@ -310,13 +257,12 @@ def judge_regression(
             f"no latency is compared on {apart} of {len(judged)} passes: the builds were not replayed at the same time"
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
-    today = format_utc(utc_now_ns())[:10]
     doubts = {
         one.metric: one.text for one in calibrations_of(ground) if not (one.calibrated or one.condition)
     }
     gates = [
         replace(gate, reason="; ".join(filter(None, (gate.reason, doubts.get(gate.name)))))
-        for gate in judge(before, after, policy.policy, imaged=whole, today=today, look=look)
+        for gate in judge(before, after, policy.policy, imaged=whole)
     ]
     remarks += doubts.values()
     rows = {name: first_difference(before[name], after[name]) for name in before}

@@ -36,12 +36,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(run, "--build BUILD", str, "candidate: build file, 'current' or identity", required=True)
     option(run, "--baseline BUILD", str, "baseline", "current")
     option(run, "--policy FILE", Path, "policy of the gates: a file, or a shipped one by name", Path("ci"))
-    option(
-        run,
-        "--minutes M",
-        float,
-        "add passes in the most informative order until the verdict is clear, for so long",
-    )
     option(run, "--junit FILE", Path, "write JUnit XML")
     option(run, "--report FILE", Path, "write the report as HTML")
     _finish(run, _run)
@@ -134,7 +128,6 @@ def _run(arguments: argparse.Namespace) -> int:
         request = {"policy": text, "policy_name": str(arguments.policy)}
     with ground_client(arguments, background=True) as service:
         request |= _comparison(service, arguments, arguments.build, arguments.baseline)
-        request["minutes"] = arguments.minutes
         job = service.wait(service.start_regression(request).id, progress=_percent())
         found = service.get_regression(job.id)
         if arguments.report:

@@ -1,10 +1,10 @@
 """Sandbox of builds: file system view, start with bubblewrap, supervision from outside, and outputs.
 
 bubblewrap makes the namespaces and a private root of read-only parts of this machine. `/tmp`, a tmpfs of limited size,
-is the only writable folder. Inside, `setpriv` and `prlimit` give the program a user without capabilities and its limits;
-the system call filter of `kernel` applies to all of them. This process opens the output folder before the program
-starts, measures memory, processor time and files of the run, ends it at a limit, and copies the outputs after every
-process of the run has ended.
+is the only writable folder. Inside, `setpriv` and `prlimit` give the program a user without capabilities and its
+limits; the system call filter of `kernel` applies to all of them. This process opens the output folder before the
+program starts, measures memory, processor time and files of the run, ends it at a limit, and copies the outputs after
+every process of the run has ended.
 """
 
 from __future__ import annotations

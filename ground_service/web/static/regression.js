@@ -14,9 +14,8 @@ async function upload(path, file) {
 
 const OUTCOMES = ["fail", "inconclusive", "not judged", "pass", "informs"];
 
-// What would decide an open gate, or why its outcome does not count.
+// What would decide an open gate.
 function remarkOf(gate) {
-  if (gate.waived) return `waived: ${gate.waived}`;
   const told = [gate.reason, gate.evidence].filter(Boolean).join(", ");
   if (gate.outcome !== "inconclusive" || gate.frames_needed == null) return told;
   return `${told}: about ${figure(gate.frames_needed)} frames decide, ${figure(gate.frames)} compared`;
