@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
 import secrets
 import select
 import shutil
@@ -40,6 +41,12 @@ PRINTED_OCTETS = 65_536
 """Number of octets kept from the end of the program's printed text."""
 
 INODES = 65_536
+_PARENT = (
+    "import os, resource, sys; status = os.spawnv(os.P_WAIT, sys.argv[1], sys.argv[1:]); "
+    "print(status, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, flush=True); sys.stdin.readline()"
+)
+"""The parent of the program: it writes its exit status and peak memory, and waits while its processor time is read."""
+
 PACKAGES = ("kernels", "lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
 """Packages that the flight code of this project needs; scenarios, migrations and tests are not visible."""
 
@@ -180,10 +187,7 @@ def _root(run: Run, users: int, groups: int) -> list[str]:
 
 
 def _inside(run: Run, user: Sequence[str]) -> list[str]:
-    """Return the command that starts the program: change the user, set the limits, write `ready`, wait for a line.
-
-    The outer shell writes the exit status and then waits for its end, so that the processor time can be read.
-    """
+    """Return the command that starts the program: change the user, set the limits, write `ready`, wait for a line."""
     limits = {
         "as": run.limits["memory_mib"] << 20,
         # The soft limit sends SIGXCPU a second before the hard limit, to distinguish it from other kills.
@@ -196,7 +200,7 @@ def _inside(run: Run, user: Sequence[str]) -> list[str]:
         "core": 0,
     }
     return [
-        *("/bin/sh", "-c", '"$@"; echo $?; read -r end', "sh"),
+        *(sys.executable, "-I", "-S", "-c", _PARENT),
         *(*user, "/usr/bin/prlimit", *(f"--{name}={value}" for name, value in limits.items()), "--"),
         *("/bin/sh", "-c", 'echo ready; read -r start; exec "$@" </dev/null >&2', "sh", *run.command),
     ]
@@ -262,14 +266,15 @@ class _Supervisor:
         wall_s = time.monotonic() - started
         if not self.cause:
             self.sample()
-        ended = not self.cause and self.messages.strip().isdigit()
+        ended = re.fullmatch(rb"(-?\d{1,3}) (\d{1,12})\n", self.messages) if not self.cause else None
+        status, peak_kib = map(int, ended.groups()) if ended else (0, 0)
         return {
             "cause": self.cause or ("" if ended else "crashed"),
-            "exit_status": int(self.messages) if ended else None,
+            "exit_status": (128 - status if status < 0 else status) if ended else None,
             "full": os.fstatvfs(self.out).f_bavail == 0,
             "wall_s": wall_s,
             "cpu_s": self.cpu_s,
-            "peak_rss_mib": self.peak_octets / (1 << 20),
+            "peak_rss_mib": max(self.peak_octets / (1 << 20), peak_kib / (1 << 10)),
         }
 
     def read(self, timeout_s: float) -> None:
@@ -292,16 +297,18 @@ class _Supervisor:
     def sample(self) -> None:
         """Measure all processes of the run; set the cause of its end at a limit."""
         processes, limit = descendants(self.process.pid), self.run.limits["memory_mib"] << 20
-        resident, cpu_s = dict.fromkeys(processes, 0), 0.0
-        for process in processes:
+        resident, cpu_s = dict[int, int](), 0.0
+        for place, process in enumerate(processes):
+            # Only the ended children of the first two, process 1 and the parent of the program, count.
+            own = place > 1
             with contextlib.suppress(OSError, IndexError, ValueError):
                 words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-                cpu_s += sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
-                resident[process] = int(words[21]) * os.sysconf("SC_PAGE_SIZE")
+                cpu_s += sum(map(int, words[11 if own else 13 : 15])) / os.sysconf("SC_CLK_TCK")
+                resident[process] = own * int(words[21]) * os.sysconf("SC_PAGE_SIZE")
         memory = sum(resident.values())
         if memory > limit:
             # Shared pages were counted for each process above; the proportional size is exact but slower.
-            memory = sum(_proportional_memory(*one) for one in resident.items())
+            memory = sum(_proportional_memory(*one) for one in resident.items() if one[1])
         self.cpu_s, self.peak_octets = max(self.cpu_s, cpu_s), max(self.peak_octets, memory)
         files = os.fstatvfs(self.out)
         if memory > limit:
