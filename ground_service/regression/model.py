@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from ground_service.http.model import Entity, Given
 from ground_service.http.times import UtcTime
+from reports.text import loss_text
 
 UNUSABLE_STATES = ("unusable", "baseline failed")
 """States of a pass that no candidate can be blamed for."""
@@ -77,6 +78,7 @@ class KeptReplay(Entity):
     cpu_s: float = 0.0
     peak_rss_mib: float = 0.0
     isolation: str = ""
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
     machine: str
     created_utc_ns: int = 0
 
@@ -130,6 +132,10 @@ class RegressionRequest(Comparison):
         default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
     )
     policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
+    repeat_baseline: bool = Field(
+        default=False,
+        description="Replay the baseline again with the candidate, so that their processor times are compared",
+    )
     placebo: int | None = Field(
         default=None,
         ge=1,
@@ -224,6 +230,9 @@ class JudgedGate(Entity):
     frames_needed: int | None
     evidence: str = Field(default="", description="Number and name of the units of the evidence")
     reason: str | None
+    relative: bool = Field(
+        default=False, description="Whether margin, bounds and resolution are shares of the baseline"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -245,7 +254,9 @@ class JudgedGate(Entity):
         parts = [f"{self.name}{place}: {self.baseline:.4g} to {self.candidate:.4g}{unit}"]
         low, high = self.change_bounds
         if self.outcome in ("fail", "inconclusive") and low is not None and high is not None:
-            parts.append(f"loss {low:.3g} to {high:.3g}, margin {self.margin:.3g}, {self.evidence}")
+            loss = [loss_text(one, self.relative) for one in (low, high, self.margin or 0.0)]
+            of_what = " of the baseline" if self.relative else ""
+            parts.append(f"loss {loss[0]} to {loss[1]}{of_what}, margin {loss[2]}, {self.evidence}")
         if self.reason:
             parts.append(self.reason)
         if self.outcome == "inconclusive" and self.frames_needed is not None:
@@ -261,6 +272,7 @@ class JudgedReplay(Entity):
     cpu_s: float
     wall_s: float
     peak_rss_mib: float
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
     outcome_shares: dict[str, dict[str, float]] | None = None
     stages_ms: dict[str, float] | None = None
     memory_mib: float | None = None
@@ -345,6 +357,7 @@ class Regression(Entity):
             candidate_title=self.result.candidate.title,
             baseline=self.result.baseline.digest,
             baseline_title=self.result.baseline.title,
+            headline=self.result.headline,
             reasons=self.reasons(),
             gates=len(deciding),
             gates_failed=counted.count("fail"),
@@ -364,6 +377,7 @@ class RegressionSummary(Entity):
     candidate_title: str = Field(description="Name, version and beginning of the identity")
     baseline: str = Field(description="Identity of the baseline build")
     baseline_title: str
+    headline: str = Field(description="First line of the verdict")
     reasons: list[str] = Field(description="Why the verdict is not pass, the most important first")
     gates: int = Field(description="Number of gates")
     gates_failed: int
