@@ -78,7 +78,7 @@ function outcomeOf({ job, verdict }) {
   const needed = verdict.frames_needed == null ? null : `${figure(verdict.frames_needed)} frames needed, ${figure(verdict.frames)} compared`;
   const reasons = [...(needed ? [needed] : []), ...verdict.reasons];
   return [
-    element("span", {}, words(verdict.headline || (verdict.gates ? counts : "No gate was judged."))),
+    element("span", {}, verdict.headline || (verdict.gates ? counts : "No gate was judged.")),
     reasons.length ? element("ul", { class: "reasons" }, reasons.map((one) => element("li", {}, words(one)))) : null,
   ].filter(Boolean);
 }
