@@ -44,6 +44,8 @@ RUN /opt/linna/bin/pip install --no-deps .
 
 FROM ${PYTHON_IMAGE}
 LABEL org.opencontainers.image.title="linna" org.opencontainers.image.licenses="Apache-2.0"
+# The sandbox of payload builds.
+RUN apt-get update && apt-get install -y --no-install-recommends bubblewrap && rm -rf /var/lib/apt/lists/*
 RUN groupadd --gid 10001 linna && useradd --uid 10001 --gid linna --create-home linna \
     && mkdir /var/lib/linna /exchange /backup && chown linna:linna /var/lib/linna /exchange /backup \
     && chmod 2770 /exchange && chmod 700 /backup

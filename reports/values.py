@@ -629,8 +629,10 @@ class RegressionGate:
         Number of compared frames, and number needed to decide the gate; None if unknown.
     evidence
         Number and name of the units.
-    reason, waived
-        The fact in words, and why its outcome is waived; empty if neither applies.
+    reason
+        The fact in words; may be empty.
+    relative
+        Whether the resolution is a share of the baseline.
     """
 
     name: str
@@ -645,7 +647,7 @@ class RegressionGate:
     frames_needed: int | None = None
     evidence: str = ""
     reason: str = ""
-    waived: str = ""
+    relative: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

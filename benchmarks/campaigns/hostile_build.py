@@ -409,7 +409,7 @@ def _runner(exchange: Path, folder: Path) -> Iterator[None]:
     runner = subprocess.Popen(
         _in_profile("runner", command, folder, exchange),
         cwd=ROOT,
-        env=_environment({}),
+        env=_environment({"LINNA_HOME": "/tmp"}),
         stdout=subprocess.DEVNULL,
     )
     try:

@@ -94,9 +94,7 @@ def regression_text(verdict: Verdict) -> str:
     deciding = [gate for gate in verdict.gates if gate.outcome in order]
     whole = {gate.name for gate in deciding if gate.outcome == FAIL and not gate.pass_name}
     for gate in sorted(deciding, key=lambda gate: order.index(gate.outcome)):
-        if gate.waived:
-            lines.append(f"waived ({gate.outcome}): {gate.waived}: {gate.text}")
-        elif not gate.passed and not (gate.pass_name and gate.name in whole):
+        if not gate.passed and not (gate.pass_name and gate.name in whole):
             # The headline names the passes on which a metric fails that fails over all of them.
             lines.append(f"{gate.outcome}: {gate.text}")
     told = ("worse", "better")
@@ -110,7 +108,17 @@ def regression_text(verdict: Verdict) -> str:
         f"{counts[NOT_JUDGED]} not judged, over {sum(one.state in JUDGED_STATES for one in verdict.passes)} of "
         f"{len(verdict.passes)} passes ({verdict.frames} frames)"
     )
-    return "\n  ".join([*lines, *verdict.remarks])
+    return "\n".join(filter(None, ("\n  ".join([*lines, *verdict.remarks]), printed_text(verdict))))
+
+
+def printed_text(verdict: Verdict | RegressionOutcome) -> str:
+    """Return the last lines of the programs that failed, each text once."""
+    found: dict[str, str] = {}
+    for one in verdict.passes:
+        for label, replay in (("candidate", one.candidate), ("baseline", one.baseline)):
+            if replay is not None and replay.printed:
+                found.setdefault(replay.printed, f"last lines of the {label} on {one.name}:")
+    return "\n".join(f"{title}\n{text}" for text, title in found.items())
 
 
 def _names(one: Verdict | RegressionOutcome) -> tuple[str, str]:
@@ -124,8 +132,7 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
 
     Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in
     the stricter one of Apache Ant (JUnit.xsd). A pass that the candidate did not finish is one failure. What is
-    inconclusive is a failure or skipped, as the policy says; a waived case is skipped with its reason. The time of a
-    pass is that of the candidate's replay.
+    inconclusive is a failure or skipped, as the policy says. The time of a pass is that of the candidate's replay.
     """
     open_kind = "skipped" if verdict.policy.inconclusive == "skip" else "failure"
     cases: list[tuple[str, str, str, str, float]] = []
@@ -140,8 +147,6 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
             continue
         kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: open_kind, NOT_JUDGED: "skipped"}[gate.outcome]
         text = f"{gate.outcome}: {gate.text}"
-        if gate.waived:
-            kind, text = "skipped", f"waived: {gate.waived}; {text}"
         cases.append((" on ".join(filter(None, (gate.name, gate.pass_name))), "gates", kind, text, 0.0))
     if not verdict.gates and all(one.state != "candidate failed" for one in verdict.passes):
         cases.append(("gates", "gates", open_kind, "inconclusive: no gate was judged", 0.0))
@@ -177,7 +182,7 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
         elif kind:
             ET.SubElement(case, kind, message=_xml(text), type=text.split(":")[0])
     ET.SubElement(suite, "system-out").text = _xml(regression_text(verdict))
-    ET.SubElement(suite, "system-err")
+    ET.SubElement(suite, "system-err").text = _xml(printed_text(verdict)) or None
     ET.indent(suite)
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -225,6 +230,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         data_sources=tuple(sources),
         remarks=(
             *(f"{one.name}: {one.state}: {one.detail}" for one in troubled),
+            *filter(None, (printed_text(outcome),)),
             *outcome.remarks,
             "A gate fails if the lower bound of the loss is above what is material, at a level of "
             f"{outcome.policy.policy.fail_level:g} for all gates together. It passes if the upper 95 % bound is below "
@@ -359,7 +365,6 @@ def _gate(gate: Gate) -> dict[str, Any]:
     texts = {
         "pass": row.pop("pass_name") or None,
         "reason": gate.reason or None,
-        "waived": gate.waived or None,
     }
     return {**row, **texts, "passed": gate.passed, "change_bounds": bounds}
 
@@ -371,7 +376,7 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
         "state": one.state,
         "detail": one.detail,
     }
-    costs = {"outcome", "detail", "cpu_s", "wall_s", "peak_rss_mib"}
+    costs = {"outcome", "detail", "cpu_s", "wall_s", "peak_rss_mib", "printed"}
     for label, replay, read in (
         ("baseline", one.baseline, one.baseline_read),
         ("candidate", one.candidate, one.candidate_read),

@@ -145,5 +145,5 @@ def _outcome(
     options: dict[str, Any] = {"workers": arguments.get("workers"), "progress": progress}
     if seed := arguments.get("placebo"):
         return run_placebo(ground, archives, baseline, policy, int(seed), **options)
-    minutes = arguments.get("minutes")
-    return run_regression(ground, archives, candidate, baseline, policy, minutes=minutes, **options)
+    repeated = bool(arguments.get("repeat_baseline"))
+    return run_regression(ground, archives, candidate, baseline, policy, repeated=repeated, **options)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from ground_service.http.model import Entity, Given
 from ground_service.http.times import UtcTime
+from reports.text import loss_text
 
 UNUSABLE_STATES = ("unusable", "baseline failed")
 """States of a pass that no candidate can be blamed for."""
@@ -77,6 +78,7 @@ class KeptReplay(Entity):
     cpu_s: float = 0.0
     peak_rss_mib: float = 0.0
     isolation: str = ""
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
     machine: str
     created_utc_ns: int = 0
 
@@ -130,11 +132,9 @@ class RegressionRequest(Comparison):
         default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
     )
     policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
-    minutes: float | None = Field(
-        default=None,
-        gt=0.0,
-        le=1e5,
-        description="Sequential: add passes in the most informative order until the verdict is clear, for so long",
+    repeat_baseline: bool = Field(
+        default=False,
+        description="Replay the baseline again with the candidate, so that their processor times are compared",
     )
     placebo: int | None = Field(
         default=None,
@@ -230,7 +230,19 @@ class JudgedGate(Entity):
     frames_needed: int | None
     evidence: str = Field(default="", description="Number and name of the units of the evidence")
     reason: str | None
-    waived: str | None
+    relative: bool = Field(
+        default=False, description="Whether margin, bounds and resolution are shares of the baseline"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_waiver(cls, given: Any) -> Any:
+        """Read a gate of an earlier verdict, which could be waived: it did not count."""
+        if not isinstance(given, dict) or "waived" not in given:
+            return given
+        kept = {key: value for key, value in given.items() if key != "waived"}
+        waiver = given["waived"]
+        return {**kept, "outcome": "not judged", "reason": f"waived: {waiver}"} if waiver else kept
 
     @property
     def text(self) -> str:
@@ -242,7 +254,9 @@ class JudgedGate(Entity):
         parts = [f"{self.name}{place}: {self.baseline:.4g} to {self.candidate:.4g}{unit}"]
         low, high = self.change_bounds
         if self.outcome in ("fail", "inconclusive") and low is not None and high is not None:
-            parts.append(f"loss {low:.3g} to {high:.3g}, margin {self.margin:.3g}, {self.evidence}")
+            loss = [loss_text(one, self.relative) for one in (low, high, self.margin or 0.0)]
+            of_what = " of the baseline" if self.relative else ""
+            parts.append(f"loss {loss[0]} to {loss[1]}{of_what}, margin {loss[2]}, {self.evidence}")
         if self.reason:
             parts.append(self.reason)
         if self.outcome == "inconclusive" and self.frames_needed is not None:
@@ -258,6 +272,7 @@ class JudgedReplay(Entity):
     cpu_s: float
     wall_s: float
     peak_rss_mib: float
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
     outcome_shares: dict[str, dict[str, float]] | None = None
     stages_ms: dict[str, float] | None = None
     memory_mib: float | None = None
@@ -320,9 +335,7 @@ class Regression(Entity):
         """Return why the verdict is not pass: failed and open gates, passes without a comparison."""
         if self.verdict == "pass":
             return []
-        gates = [
-            one for one in self.result.gates if one.outcome in ("fail", "inconclusive") and not one.waived
-        ]
+        gates = [one for one in self.result.gates if one.outcome in ("fail", "inconclusive")]
         gates.sort(key=lambda one: one.outcome != "fail")
         return [
             *(one.text for one in gates),
@@ -336,7 +349,7 @@ class Regression(Entity):
     def summary(self) -> RegressionSummary:
         """Return the regression as lists show it."""
         deciding = [gate for gate in self.result.gates if gate.outcome != "informs"]
-        counted = [gate.outcome for gate in deciding if not gate.waived]
+        counted = [gate.outcome for gate in deciding]
         return RegressionSummary(
             id=self.id,
             verdict=self.verdict,
@@ -344,6 +357,7 @@ class Regression(Entity):
             candidate_title=self.result.candidate.title,
             baseline=self.result.baseline.digest,
             baseline_title=self.result.baseline.title,
+            headline=self.result.headline,
             reasons=self.reasons(),
             gates=len(deciding),
             gates_failed=counted.count("fail"),
@@ -363,6 +377,7 @@ class RegressionSummary(Entity):
     candidate_title: str = Field(description="Name, version and beginning of the identity")
     baseline: str = Field(description="Identity of the baseline build")
     baseline_title: str
+    headline: str = Field(description="First line of the verdict")
     reasons: list[str] = Field(description="Why the verdict is not pass, the most important first")
     gates: int = Field(description="Number of gates")
     gates_failed: int

@@ -82,9 +82,7 @@ class RegressionOutcome:
     @property
     def frames_needed(self) -> int | None:
         """Number of frames that decide the inconclusive gates; None if no gate states a number."""
-        needed = [
-            gate.frames_needed for gate in self.gates if gate.frames_needed is not None and not gate.waived
-        ]
+        needed = [gate.frames_needed for gate in self.gates if gate.frames_needed is not None]
         return max(needed, default=None)
 
 

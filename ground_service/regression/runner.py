@@ -33,19 +33,21 @@ from pydantic.dataclasses import dataclass
 
 from ground_service.regression.sandbox import host
 from ground_service.regression.sandbox.host import Run, SandboxRefused
-from ground_service.regression.sandbox.runner_checks import build_remains, runner_faults
 from kernels import cache_folder
 
 DOWNLINKS = ("downlink.cadu", "downlink.packets")
 PERFORMANCE = "performance.json"
 OUTPUTS = (*DOWNLINKS, PERFORMANCE)
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 REQUEST, REPORT, PRINTED, ALIVE = "request.json", "report.json", "printed.txt", "runner.json"
 REPORT_LIMIT_OCTETS = 1 << 16
 PRINTED_LIMIT_OCTETS = 1 << 17
 POLL_S = 0.1
 HEARTBEAT_S = 2.0
+GRACE_S = 180.0
+"""Time after the time limit of a run within which the runner must publish its result."""
+
 SILENT_S = 30.0
 """Age of `runner.json` from which the runner counts as stopped."""
 
@@ -74,7 +76,6 @@ class RunReport(BaseModel):
 
     cause: Literal["", "timeout", "cpu", "memory", "disk", "crashed"] = ""
     exit_status: Annotated[int, Field(ge=0, le=255)] | None = None
-    signal: Annotated[int, Field(ge=0, le=64)] | None = None
     full: bool = False
     wall_s: Seconds = 0.0
     cpu_s: Seconds = 0.0
@@ -120,51 +121,36 @@ def run_confined(
 
 
 def _run_in_sandbox(
-    request: RunRequest,
-    staged: Path,
-    written: Path,
-    printed: Path,
-    data: Path | None,
-    mode: Literal["namespaces", "user"] = "namespaces",
+    request: RunRequest, staged: Path, written: Path, printed: Path, data: Path | None
 ) -> dict[str, Any]:
     host.make_readable(staged / "archive")
     host.make_readable(staged / "build")
-    if mode == "namespaces":
-        confined = host.protection()
-        if confined.refusal:
-            raise SandboxRefused(confined.refusal)
-        archive, folder, private = "/archive", "/build", ""
-        folders = {"archive": staged / "archive", "build": staged / "build", "kernels": cache_folder()}
-        if request.reads_data and data is not None:
-            folders["data"], data = data, Path("/data")
-        inputs = [
-            host.Part("bind", str(path.absolute()), f"/{name}")
-            for name, path in folders.items()
-            if path.is_dir()
-        ]
-        view = (*host.program_view(), *inputs)
-        home, compiled = "/home/build", {"NUMBA_CACHE_DIR": "/kernels"}
-    else:
-        archive, folder, private = str(staged / "archive"), str(staged / "build"), "{private}"
-        view, home, compiled = (), "{private}/home", {}
+    host.protection()
+    folders = {"archive": staged / "archive", "build": staged / "build", "kernels": cache_folder()}
+    variables = {**ENVIRONMENT, "NUMBA_CACHE_DIR": "/kernels"}
     if request.reads_data and data is not None:
-        compiled["LINNA_DATA"] = str(data)
+        folders["data"], variables["LINNA_DATA"] = data, "/data"
     places = {
         "{python}": sys.executable,
-        "{archive}": archive,
-        "{out}": f"{private}/out",
-        "{folder}": folder,
+        "{archive}": "/archive",
+        "{out}": host.OUT,
+        "{folder}": "/build",
     }
     run = Run(
-        mode,
         tuple(_placed(word, places) for word in request.words),
-        f"{private}/out",
-        {**environment(home, f"{private}/tmp"), **compiled},
-        dict(request.limits),
+        variables,
+        request.limits,
         request.outputs,
-        str(written.absolute()),
-        str(printed.absolute()),
-        view,
+        written.absolute(),
+        printed.absolute(),
+        (
+            *host.program_view(),
+            *(
+                host.Part("bind", str(path.absolute()), f"/{name}")
+                for name, path in folders.items()
+                if path.is_dir()
+            ),
+        ),
     )
     return host.execute(run)
 
@@ -185,7 +171,7 @@ def _run_by_runner(
             (partial / REQUEST).write_text(json.dumps(asdict(request)))
             _share(partial)
             partial.rename(job)
-            result = _awaited(exchange, identity, request.limits["wall_s"] + host.GRACE_S)
+            result = _awaited(exchange, identity, request.limits["wall_s"] + GRACE_S)
             return _taken(result, request, written, printed)
         finally:
             for place in (partial, job, exchange / "results" / identity):
@@ -194,24 +180,22 @@ def _run_by_runner(
         raise SandboxRefused(f"runner exchange {exchange}: {error.strerror}") from None
 
 
-def environment(home: str, temporary: str) -> dict[str, str]:
-    """Return the environment variables of a program: no proxies, one thread."""
-    path = [os.path.dirname(sys.executable), "/usr/local/bin", "/usr/bin", "/bin"]
-    return {
-        "PATH": ":".join(path),
-        "PYTHONPATH": str(host.package_root()),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "PYTHONHASHSEED": "0",
-        "HOME": home,
-        "TMPDIR": temporary,
-        "XDG_DATA_HOME": home,
-        "LANG": "C.UTF-8",
-        "TZ": "UTC",
-        "OMP_NUM_THREADS": "1",
-        "OMP_WAIT_POLICY": "PASSIVE",
-        "OPENBLAS_NUM_THREADS": "1",
-        "NUMBA_NUM_THREADS": "1",
-    }
+ENVIRONMENT = {
+    "PATH": ":".join([os.path.dirname(sys.executable), "/usr/local/bin", "/usr/bin", "/bin"]),
+    "PYTHONPATH": str(host.package_root()),
+    "PYTHONDONTWRITEBYTECODE": "1",
+    "PYTHONHASHSEED": "0",
+    "HOME": host.HOME,
+    "TMPDIR": host.WRITABLE,
+    "XDG_DATA_HOME": host.HOME,
+    "LANG": "C.UTF-8",
+    "TZ": "UTC",
+    "OMP_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "PASSIVE",
+    "OPENBLAS_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+"""Environment variables of a program: no proxies, one thread."""
 
 
 # The runner
@@ -236,14 +220,14 @@ def serve_exchange(
     Raises
     ------
     SandboxRefused
-        Builds cannot be isolated here, another runner serves the folder, or a build left processes or files.
+        Builds cannot be isolated here, or another runner serves the folder.
     """
-    mode = runner_mode(exchange)
+    host.protection()
     stopping = stopping or threading.Event()
     for name in ("jobs", "running", "results"):
         _make_shared(exchange / name)
     done = 0
-    with _alone(exchange), _heartbeat(exchange, mode, stopping):
+    with _alone(exchange), _heartbeat(exchange):
         for left in sorted((exchange / "running").iterdir()):
             # The runner ended during this job.
             _publish(exchange, left.name, {"cause": "crashed"}, None, ())
@@ -252,29 +236,9 @@ def serve_exchange(
             if job is None:
                 stopping.wait(POLL_S)
                 continue
-            _run_job(exchange, job, mode, data)
+            _run_job(exchange, job, data)
             done += 1
-            remains = next(build_remains(), None) if mode == "user" else None
-            if remains is not None:
-                raise SandboxRefused(f"runner: expected no processes and files of the build, found {remains}")
     return done
-
-
-def runner_mode(exchange: Path) -> Literal["namespaces", "user"]:
-    """Return how this runner isolates builds: with namespaces if possible, otherwise with a user per run.
-
-    Raises
-    ------
-    SandboxRefused
-        Neither is possible; the message states what is missing.
-    """
-    confined = host.protection()
-    if not confined.refusal:
-        return "namespaces"
-    faults = runner_faults(exchange)
-    if faults:
-        raise SandboxRefused(f"{confined.refusal}; without namespaces a runner needs: " + "; ".join(faults))
-    return "user"
 
 
 def _next_job(exchange: Path) -> Path | None:
@@ -286,11 +250,9 @@ def _next_job(exchange: Path) -> Path | None:
     return None
 
 
-def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"], data: Path | None) -> None:
+def _run_job(exchange: Path, job: Path, data: Path | None) -> None:
     with tempfile.TemporaryDirectory(prefix="runner-") as name:
         folder = Path(name)
-        # All users that can reach this folder may read it; it contains only the copies of the build.
-        folder.chmod(0o711)
         out = folder / "out"
         out.mkdir(mode=0o700)
         report: dict[str, Any]
@@ -302,7 +264,7 @@ def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"], dat
             for part in ("archive", "build"):
                 shutil.copytree(job / part, folder / part)
             outputs = request.outputs
-            report = _run_in_sandbox(request, folder, out, out / PRINTED, data, mode)
+            report = _run_in_sandbox(request, folder, out, out / PRINTED, data)
         except SandboxRefused as error:
             report = {"refused": str(error)}
         except (OSError, ValueError, TypeError, KeyError) as error:
@@ -336,10 +298,10 @@ def _alone(exchange: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _heartbeat(exchange: Path, mode: str, stopping: threading.Event) -> Iterator[None]:
+def _heartbeat(exchange: Path) -> Iterator[None]:
     ended = threading.Event()
     alive = exchange / ALIVE
-    alive.write_text(json.dumps({"version": PROTOCOL_VERSION, "mode": mode}))
+    alive.write_text(json.dumps({"version": PROTOCOL_VERSION}))
 
     def beat() -> None:
         while not ended.wait(HEARTBEAT_S):
@@ -411,7 +373,7 @@ def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> d
         printed.write_bytes(_octets(folder, PRINTED, PRINTED_LIMIT_OCTETS) or b"")
     finally:
         os.close(folder)
-    return report.model_dump(exclude={"refused"})
+    return {**report.model_dump(exclude={"refused"}), "isolation": f"runner, {report.isolation}"}
 
 
 def _octets(folder: int, name: str, limit: int) -> bytes | None:

@@ -11,15 +11,12 @@ import math
 import os
 import platform
 import re
-import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput, Stopping
@@ -40,11 +37,10 @@ from ground_service.regression.build_runs import OUTCOMES, read_performance, run
 from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
 from ground_service.regression.gates.calibration import calibrations
-from ground_service.regression.gates.core import NOT_JUDGED, ONLY_LOOK, Look, judge
+from ground_service.regression.gates.core import NOT_JUDGED, judge
 from ground_service.regression.gates.faults import first_difference
 from ground_service.regression.gates.policy import PolicyFile, load_policy
-from ground_service.regression.gates.samples import KINDS, PassFrames
-from ground_service.regression.gates.sequence import informative_order, is_clear, planned_looks
+from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.model import (
     COMPLETE,
     OK,
@@ -66,14 +62,12 @@ from ground_service.regression.replay_samples import (
     PassContext,
     ReadDownlink,
     condition_of,
-    expected_rows,
     pass_context,
     read_downlink,
 )
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store.stored_files import register_file
 from lunar.errors import LunarError
-from lunar.timescales import format_utc
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
@@ -87,7 +81,7 @@ def run_regression(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-    minutes: float | None = None,
+    repeated: bool = False,
 ) -> RegressionOutcome:
     """Fly archives with both builds, where that was not done before, and judge.
 
@@ -99,62 +93,19 @@ def run_regression(
         Number of parallel replays, each in a separate process. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
-    minutes
-        Add passes in the most informative order until the verdict is clear, for so long. Default: all passes.
+    repeated
+        Whether to replay both builds although replays are kept, so that their processor times are of the same time.
     """
     if not archives:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
     with ThreadPoolExecutor(workers or os.cpu_count() or 1, "archives") as pool:
         kept = list(pool.map(lambda given: _kept(ground, given), archives))
     builds = tuple(dict.fromkeys((baseline, candidate)))
-    usable = {
-        one.digest: one for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)
-    }
-    if minutes is None:
-        fly_shards(ground, _missing(ground, usable, builds), workers=workers, progress=progress)
-        return judge_regression(ground, kept, candidate, baseline, policy)
-    archives_left = list(usable.values())
-    tracks = np.array([_tracks(ground, one) for one in archives_left]).reshape(-1, len(KINDS))
-    order = informative_order(tracks, [one.frames for one in archives_left])
-    planned: list[PassArchive | PassVerdict] = [archives_left[i] for i in order]
-    others = [one for one in kept if one.digest not in usable]
-    looks = planned_looks([archives_left[i].frames for i in order]) or {0: ONLY_LOOK}
-    size = max((workers or os.cpu_count() or 1) // len(builds), 1)
-    stops = sorted({*looks, *range(size, len(planned), size)})
-    ends, spent, told, start = time.monotonic() + 60.0 * minutes, 0.0, list[str](), 0
-    for stop in progress(iter(stops), len(stops)) if progress else stops:
-        digests = [one.digest for one in planned[start:stop]]
-        fly_shards(ground, _missing(ground, digests, builds), workers=workers)
-        look, start = looks.get(stop), stop
-        if time.monotonic() > ends:
-            look = replace(looks[max(looks)], share=1.0 - spent)
-        if look is None:
-            continue
-        spent += look.share
-        outcome = judge_regression(ground, [*planned[:stop], *others], candidate, baseline, policy, look)
-        told.append(
-            f"{outcome.verdict} after {stop} of {len(planned)} passes ({look.share:.2g} of the level)"
-        )
-        if look.last or is_clear(outcome.verdict, stop, look):
-            break
-    return replace(outcome, remarks=(*outcome.remarks, f"sequential: {', '.join(told)}"))
-
-
-def _missing(ground: Ground, digests: Iterable[str], builds: Sequence[Build]) -> list[tuple[str, Build]]:
-    shards = [(digest, build) for digest in digests for build in builds]
-    return [shard for shard in shards if not is_done(find_replay(ground, *shard))]
-
-
-def _tracks(ground: Ground, archive: PassArchive) -> list[int]:
-    """Return the number of crater tracks in each kind of terrain; 0 of a pass without frames."""
-    if archive.state != COMPLETE:
-        return [0] * len(KINDS)
-    try:
-        rows = expected_rows(_context(ground, archive.digest))
-    except (GroundError, LunarError):
-        return [0] * len(KINDS)  # the verdict states the fault
-    kinds = rows.kind[np.unique(rows.track, return_index=True)[1]]
-    return list(map(int, np.bincount(kinds, minlength=len(KINDS))))
+    usable = [one.digest for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)]
+    shards = [(digest, build) for digest in dict.fromkeys(usable) for build in builds]
+    missing = [shard for shard in shards if repeated or not is_done(find_replay(ground, *shard))]
+    fly_shards(ground, missing, workers=workers, progress=progress, again=repeated)
+    return judge_regression(ground, kept, candidate, baseline, policy)
 
 
 def _context(ground: Ground, digest: str) -> PassContext:
@@ -176,6 +127,7 @@ def fly_shards(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
+    again: bool = False,
 ) -> None:
     """Do replays, several at a time: every one is a process, the threads here only wait for them."""
     if not shards:
@@ -187,7 +139,7 @@ def fly_shards(
 
     def replays(digest: str, builds: Sequence[Build]) -> None:
         with ThreadPoolExecutor(size, "replay") as pair:
-            list(pair.map(lambda build: do_replay(ground, digest, build), builds))
+            list(pair.map(lambda build: do_replay(ground, digest, build, again=again), builds))
 
     with ThreadPoolExecutor(max(threads // size, 1), "replays") as pool:
         futures = [pool.submit(replays, digest, builds) for digest, builds in together.items()]
@@ -201,13 +153,13 @@ def fly_shards(
             raise
 
 
-def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
-    """One build over one kept archive: done now, or what was kept of an earlier time.
+def do_replay(ground: Ground, digest: str, build: Build, *, again: bool = False) -> KeptReplay:
+    """Replay a kept archive with a build, or return what was kept of an earlier time unless `again` is set.
 
     A replay of an archive that was completed meanwhile is done again.
     """
     while True:
-        known = find_replay(ground, digest, build)
+        known = None if again else find_replay(ground, digest, build)
         if known is not None and is_done(known):
             return known
         settle_archive(ground, digest)
@@ -258,6 +210,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
             cpu_s=run.cpu_s,
             peak_rss_mib=run.peak_rss_mib,
             isolation=run.isolation,
+            printed=run.printed or None,
             machine=_machine(),
         )
         return replay, archive.manifest_sha256
@@ -284,7 +237,6 @@ def judge_regression(
     candidate: Build,
     baseline: Build,
     policy: PolicyFile,
-    look: Look = ONLY_LOOK,
 ) -> RegressionOutcome:
     """The gates over replays that were done."""
     passes = tuple(
@@ -292,7 +244,8 @@ def judge_regression(
         for one in kept
     )
     judged = [one for one in passes if one.baseline_read is not None and one.candidate_read is not None]
-    changed = changes(baseline, candidate)
+    flown = [one.context.flown for one in judged if one.context]
+    changed = changes(baseline, candidate, flown or ({},))
     remarks = [f"changed from baseline to candidate: {', '.join(changed)}"] if changed else []
     names = _unique_names(judged)
     before: dict[str, PassFrames] = {}
@@ -310,13 +263,12 @@ def judge_regression(
             f"no latency is compared on {apart} of {len(judged)} passes: the builds were not replayed at the same time"
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
-    today = format_utc(utc_now_ns())[:10]
     doubts = {
         one.metric: one.text for one in calibrations_of(ground) if not (one.calibrated or one.condition)
     }
     gates = [
         replace(gate, reason="; ".join(filter(None, (gate.reason, doubts.get(gate.name)))))
-        for gate in judge(before, after, policy.policy, imaged=whole, today=today, look=look)
+        for gate in judge(before, after, policy.policy, imaged=whole)
     ]
     remarks += doubts.values()
     rows = {name: first_difference(before[name], after[name]) for name in before}

@@ -37,10 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(run, "--baseline BUILD", str, "baseline", "current")
     option(run, "--policy FILE", Path, "policy of the gates: a file, or a shipped one by name", Path("ci"))
     option(
-        run,
-        "--minutes M",
-        float,
-        "add passes in the most informative order until the verdict is clear, for so long",
+        run, "--repeat-baseline", bool, "replay kept baselines again, so that processor times are compared"
     )
     option(run, "--junit FILE", Path, "write JUnit XML")
     option(run, "--report FILE", Path, "write the report as HTML")
@@ -123,8 +120,7 @@ def _finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespa
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from ground_service.clock import utc_now_ns
-    from ground_service.regression.documents import regression_junit, regression_text
+    from ground_service.regression.documents import regression_text
     from ground_service.regression.gates.policy import SHIPPED, load_policy
 
     request: dict[str, Any] = {}
@@ -134,40 +130,42 @@ def _run(arguments: argparse.Namespace) -> int:
         request = {"policy": text, "policy_name": str(arguments.policy)}
     with ground_client(arguments, background=True) as service:
         request |= _comparison(service, arguments, arguments.build, arguments.baseline)
-        request["minutes"] = arguments.minutes
+        request["repeat_baseline"] = arguments.repeat_baseline
         job = service.wait(service.start_regression(request).id, progress=_percent())
         found = service.get_regression(job.id)
-        if arguments.report:
-            service.get_regression_report(found.id, arguments.report)
-    if arguments.junit:
-        arguments.junit.write_text(regression_junit(found.result, utc_now_ns()), encoding="utf-8")
+        for file, form in ((arguments.report, "html"), (arguments.junit, "junit")):
+            if file:
+                service.get_regression_report(found.id, file, format=form)
     emit(arguments, {"id": found.id, **found.result.document()}, text=regression_text(found.result))
     return found.result.exit_status
 
 
 def _sandbox(arguments: argparse.Namespace) -> int:
     from ground_service.regression.runner import alive
-    from ground_service.regression.sandbox.host import REMEDY, protection
+    from ground_service.regression.sandbox.host import SandboxRefused, protection
     from ground_service.settings import load_settings
 
     exchange = load_settings().runner_exchange
-    here = protection()
-    answers = exchange is not None and alive(exchange)
+    isolation = refusal = ""
+    try:
+        isolation = protection()
+    except SandboxRefused as error:
+        refusal = str(error)
+    text = f"builds are isolated by: {isolation}"
     if exchange is not None:
-        told = f"builds run in the runner at {exchange}"
+        text = f"builds run in the runner at {exchange}"
         refusal = (
-            "" if answers else f"runner exchange {exchange}: expected a runner, found none that responds"
+            ""
+            if alive(exchange)
+            else f"runner exchange {exchange}: expected a runner, found none that responds"
         )
-    else:
-        told, refusal = f"builds are isolated by: {here.isolation}", here.refusal
-    text = f"builds are refused: {refusal}; remedy: {REMEDY}" if refusal else told
     figures = {
         "confined": not refusal,
-        "isolation": here.isolation,
+        "isolation": isolation,
         "refusal": refusal,
         "runner": str(exchange) if exchange else None,
     }
-    emit(arguments, figures, text=text)
+    emit(arguments, figures, text=f"builds are refused: {refusal}" if refusal else text)
     return 1 if refusal else 0
 
 

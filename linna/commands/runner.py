@@ -21,8 +21,8 @@ def run(arguments: argparse.Namespace) -> int:
     import logging.config
 
     from ground_service.logs import logging_config
-    from ground_service.regression.runner import alive, runner_mode, serve_exchange
-    from ground_service.regression.sandbox.host import SandboxRefused
+    from ground_service.regression.runner import alive, serve_exchange
+    from ground_service.regression.sandbox.host import SandboxRefused, protection
     from ground_service.settings import load_settings
     from linna.errors import UsageError
 
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.check:
             return checked(alive(exchange), f"a runner that serves {exchange}")
         logging.config.dictConfig(logging_config(settings.log_format))
-        print(f"builds are isolated by: {runner_mode(exchange)}", flush=True)
+        print(f"builds are isolated by: {protection()}", flush=True)
         serve_exchange(exchange, jobs=arguments.jobs, stopping=event_of_signals(), data=settings.data)
     except SandboxRefused as error:
         raise UsageError(str(error)) from None

@@ -229,8 +229,14 @@ def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     assert runner["network_mode"] == "none" and "networks" not in runner and "secrets" not in runner
     assert runner["volumes"] == ["exchange:/exchange", "${LINNA_DATA_DIR:-empty-data}:/data:ro"]
     assert set(runner["environment"]) == {"LINNA_LOG_FORMAT", "LINNA_DATA"}
-    # A user for each build, and an end to its processes; user 0 can do nothing else.
-    assert set(runner["cap_add"]) == {"SETUID", "SETGID", "KILL"} and runner["user"] == "0:10001"
+    assert "user" not in runner and "cap_add" not in runner and runner["cap_drop"] == ["ALL"]
+    assert runner["security_opt"] == [
+        "no-new-privileges:true",
+        "seccomp=deploy/runner-seccomp.json",
+        "apparmor=unconfined",
+        "systempaths=unconfined",
+    ]
+    assert "install -y --no-install-recommends bubblewrap" in DOCKERFILE.rpartition("\nFROM ")[2]
     assert all("size=" in place for place in runner["tmpfs"])
     assert runner["memswap_limit"] == runner["mem_limit"]
     (exchange,) = re.findall(r"chmod (\d+) /exchange", DOCKERFILE)

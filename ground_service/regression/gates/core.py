@@ -12,8 +12,7 @@ If both bounds hold, fail takes precedence. The level of all fail claims togethe
 gates over all passes, shared by their weights, and half for recall and precision of single passes and kinds of terrain;
 one pass has no second half. A pass needs no correction for the number of gates, since every gate must pass
 (intersection-union test). All other metrics *inform*: their changes are significant under Holm's procedure at a level
-of their own, and never decide. Claims are on the passes that were replayed. A sequential regression judges several
-times, each time at a share of the levels that was fixed beforehand (`sequence`).
+of their own, and never decide. Claims are on the passes that were replayed.
 
 References
 ----------
@@ -22,7 +21,6 @@ R. L. Berger, "Multiparameter hypothesis testing and acceptance sampling", Techn
 
 from __future__ import annotations
 
-import fnmatch
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,6 +40,7 @@ from ground_service.regression.gates.metrics import (
     MEMORY,
     PRECISION,
     RECALL,
+    RUN,
     START,
     Metric,
     metrics_of,
@@ -59,12 +58,17 @@ from ground_service.regression.gates.statistics import (
     student_quantile,
     student_upper_tail,
 )
-from reports.text import counted
+from reports.text import counted, loss_text
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
 
-COSTS = {MEMORY: "peak memory", LATENCY: "processor time of a frame", START: "processor time of the start"}
+COSTS = {
+    MEMORY: "peak memory",
+    LATENCY: "processor time of a frame",
+    START: "processor time of the start",
+    RUN: "processor time of the run",
+}
 EXACT_METRICS = (UNDECODABLE, TIMES, FRAMES, WRONG_FIXES, *COSTS)
 """Metrics that are compared without chance."""
 
@@ -90,7 +94,7 @@ FEWEST_PASSES = 10
 """Passes from which position errors are judged by their own spread; fewer inform only, except of a gross change."""
 
 START_FLOOR_S = 0.5
-"""Shorter delays of the start are tolerated."""
+"""Shorter delays of the start and of a run are tolerated."""
 
 PASSES_OF_TIMES = 5
 """Passes from which the narrower margin of processor times applies to the median of their ratios."""
@@ -133,16 +137,6 @@ class GateRule:
 
 
 @dataclass(frozen=True, slots=True)
-class Waiver:
-    """Waiver of a gate until a day (ISO, inclusive); `gate` and `pass_name` may contain wildcards."""
-
-    gate: str
-    reason: str
-    until: str
-    pass_name: str = "*"
-
-
-@dataclass(frozen=True, slots=True)
 class GatePolicy:
     """Policy for the comparison of builds.
 
@@ -158,7 +152,6 @@ class GatePolicy:
     fail_level: float
     rules: tuple[GateRule, ...]
     inconclusive: str = "failure"
-    waivers: tuple[Waiver, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +169,7 @@ class Gate:
     margin, limit
         Tolerated loss, and the baseline with this loss.
     change_low, change_high
-        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse. They are wider
-        at a look that spends a part of the level.
+        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse.
     p_value, level
         Of the test against no loss, and the level of the fail claim; NaN for exact gates.
     resolution
@@ -188,8 +180,8 @@ class Gate:
         Number and name of the units.
     reason
         The fact in words, where the figures alone do not state it.
-    waived
-        Reason of the waiver; empty if the gate is not waived.
+    relative
+        Whether margin, change and resolution are shares of the baseline.
     """
 
     name: str
@@ -209,25 +201,12 @@ class Gate:
     frames_needed: int | None = None
     evidence: str = ""
     reason: str = ""
-    waived: str = ""
+    relative: bool = False
 
     @property
     def passed(self) -> bool:
         """Whether the gate passed."""
         return self.outcome == PASS
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """Look at the passes so far: its share of all levels, frames and passes of the whole plan (0: those judged)."""
-
-    share: float = 1.0
-    frames: int = 0
-    passes: int = 0
-    last: bool = True
-
-
-ONLY_LOOK = Look()
 
 
 def judge(
@@ -236,8 +215,6 @@ def judge(
     policy: GatePolicy,
     *,
     imaged: Collection[str] | None = None,
-    today: str = "",
-    look: Look = ONLY_LOOK,
 ) -> list[Gate]:
     """Return the gates over the passes replayed by both builds: exact ones, primary ones, metrics that inform.
 
@@ -247,38 +224,35 @@ def judge(
         Frames of each pass by its name, of baseline and candidate.
     imaged
         Passes that were replayed from images; the others have no metrics that need them. None: all.
-    today
-        Day (ISO) that selects the valid waivers; empty: none are valid.
     """
     names = [name for name in before if name in after]
     if not names:
         return []
     before, after = ({name: side[name] for name in names} for side in (before, after))
     pictured = names if imaged is None else [name for name in names if name in imaged]
-    same = look.last and identical(before, after)
+    same = identical(before, after)
     metrics = {one.name: one for one in metrics_of([*before.values(), *after.values()])}
     tests = _local_tests(before, after, pictured, policy, metrics)
-    level = policy.fail_level * look.share / (2.0 if tests else 1.0)
+    level = policy.fail_level / (2.0 if tests else 1.0)
     gates = [
         _exact_gate(before, after, rule, pictured, metrics) for rule in policy.rules if rule.weight == 0.0
     ]
     for rule in policy.rules:
         if rule.weight > 0.0:
             chosen = pictured if rule.metric.startswith(NEEDS_FRAMES) else names
-            gates.append(_primary(before, after, chosen, rule, metrics, level * rule.weight, same, look))
-    local = [_decided(*test, level / len(tests), look, window=True) for test in tests]
+            gates.append(_primary(before, after, chosen, rule, metrics, level * rule.weight, same))
+    local = [_decided(*test, level / len(tests), window=True) for test in tests]
     gates += [gate for gate in local if gate.outcome == FAIL]
-    gates += _informing(before, after, names, pictured, policy, metrics, INFORM_LEVEL * look.share)
-    return [_with_waiver(gate, policy.waivers, today) for gate in gates]
+    return gates + _informing(before, after, names, pictured, policy, metrics)
 
 
 def verdict_of(gates: Sequence[Gate]) -> str:
-    """Return "fail", "pass" or (also if no gate passed) "inconclusive" over the deciding gates that are not waived."""
+    """Return "fail", "pass" or (also if no gate passed) "inconclusive" over the deciding gates."""
     counted = [gate for gate in gates if gate.outcome not in (NOT_JUDGED, INFORMS)]
-    if any(gate.outcome == FAIL and not gate.waived for gate in counted):
+    if any(gate.outcome == FAIL for gate in counted):
         return FAIL
     chance = [gate for gate in counted if gate.name not in EXACT_METRICS]
-    return PASS if chance and all(gate.passed or gate.waived for gate in counted) else INCONCLUSIVE
+    return PASS if chance and all(gate.passed for gate in counted) else INCONCLUSIVE
 
 
 def _exact_gate(
@@ -335,8 +309,8 @@ def _cost_gate(
         _, margin = rule.sizes(int(known.sum()) < PASSES_OF_TIMES)
         then = float(np.median(old[known]))
         now = then * float(np.median(new[known] / old[known]))
-    # A program that starts in a tenth of a second has no start to speak of.
-    limit = max(then * (1.0 + margin), then + START_FLOOR_S * (metric.name == START))
+    # A program that starts or runs in a tenth of a second has no time to speak of.
+    limit = max(then * (1.0 + margin), then + START_FLOOR_S * (metric.name in (START, RUN)))
     told = f"{COSTS[metric.name]} rises from {then:.4g} to {now:.4g} {metric.unit}" if now > limit else ""
     outcome = FAIL if told else PASS
     return Gate(metric.name, outcome, then, now, margin, limit, metric.unit, frames=frames, reason=told)
@@ -393,7 +367,6 @@ def _primary(
     metrics: Mapping[str, Metric],
     level: float,
     same: bool,
-    look: Look,
 ) -> Gate:
     frames = sum(len(before[name]) for name in names)
     nothing = Gate(rule.metric, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, resolution=math.inf)
@@ -407,8 +380,7 @@ def _primary(
         change = mean_change(values[0], values[1], metric.relative)
     else:
         change = ratio_change(*_sums(before, after, names, metric))
-    window = max(frames, look.frames) < WINDOW_FRAMES
-    gate = _decided("", change, metric, rule, frames, level, look, window=window)
+    gate = _decided("", change, metric, rule, frames, level, window=frames < WINDOW_FRAMES)
     if same and math.isfinite(change.baseline):
         return replace(
             gate,
@@ -429,7 +401,6 @@ def _decided(
     rule: GateRule,
     frames: int,
     level: float,
-    look: Look,
     *,
     window: bool,
 ) -> Gate:
@@ -443,6 +414,7 @@ def _decided(
     gate = Gate(
         metric.name, INCONCLUSIVE, change.baseline, change.candidate, stated, limit, metric.unit, place,
         level=level, resolution=math.inf, frames=frames, evidence=counted(change.units, metric.evidence),
+        relative=metric.relative,
     )  # fmt: skip
     if not math.isfinite(change.estimate):
         if math.isfinite(change.baseline):
@@ -455,8 +427,7 @@ def _decided(
     if freedom < 1.0:
         return replace(gate, reason=f"{change.units} {metric.evidence} have no spread")
     reach, ahead, power = (
-        student_quantile(at, min(freedom, 1e9))
-        for at in (1.0 - level, 1.0 - look.share * (1.0 - PASS_CONFIDENCE), POWER)
+        student_quantile(at, min(freedom, 1e9)) for at in (1.0 - level, PASS_CONFIDENCE, POWER)
     )
     few = metric.evidence in ("tracks", "ground cells") and change.units < FEWEST_TRACKS
     claim = max(materiality, margin) if few else materiality
@@ -483,7 +454,7 @@ def _decided(
     needed_to_pass = frames_needed(frames, error, margin - max(loss, 0.0), ahead + power)
     needed_to_fail = frames_needed(frames, error, loss - materiality, reach + power)
     known = [one for one in (needed_to_pass, needed_to_fail) if one is not None]
-    told = f"a loss of {_stated(metric, max(high, 0.0)):.3g} cannot be excluded"
+    told = f"a loss of {loss_text(_stated(metric, max(high, 0.0)), metric.relative)} cannot be excluded"
     return replace(gate, reason=told, frames_needed=min(known, default=None))
 
 
@@ -494,7 +465,6 @@ def _informing(
     pictured: Sequence[str],
     policy: GatePolicy,
     metrics: Mapping[str, Metric],
-    family_level: float,
 ) -> list[Gate]:
     """Return the metrics without a gate: values, and significance over the passes, which are the units."""
     decided = {rule.metric for rule in policy.rules}
@@ -508,7 +478,7 @@ def _informing(
         if math.isfinite(change.baseline) or math.isfinite(change.candidate):
             rows.append((metric, change, sum(len(before[name]) for name in chosen)))
     p_values = [_two_sided(change) for _, change, _ in rows]
-    levels = holm_levels(p_values, family_level)
+    levels = holm_levels(p_values, INFORM_LEVEL)
     gates = []
     for (metric, change, frames), p, level in zip(rows, p_values, levels, strict=True):
         told = ""
@@ -543,15 +513,3 @@ def _stated(metric: Metric, change: float) -> float:
     if not metric.relative:
         return change
     return math.inf if change > _LARGEST_LOG else math.expm1(change)
-
-
-def _with_waiver(gate: Gate, waivers: Sequence[Waiver], today: str) -> Gate:
-    if gate.outcome not in (FAIL, INCONCLUSIVE) or not today:
-        return gate
-    for waiver in waivers:
-        applies = fnmatch.fnmatchcase(gate.name, waiver.gate) and fnmatch.fnmatchcase(
-            gate.pass_name, waiver.pass_name
-        )
-        if applies and today <= waiver.until:
-            return replace(gate, waived=f"{waiver.reason} (until {waiver.until})")
-    return gate

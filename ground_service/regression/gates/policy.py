@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from ground_service.errors import InvalidInput, storage_error
-from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule, Waiver
+from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule
 from ground_service.regression.gates.faults import FRAMES, TIMES, UNDECODABLE
 from ground_service.toml import parse_table, read_table
 
@@ -47,15 +46,6 @@ class GateTable(_Table):
     reason: Text
 
 
-class WaiverTable(_Table):
-    """Waiver of a gate until a day."""
-
-    gate: Text
-    pass_name: Text = Field(default="*", alias="pass")
-    reason: Text
-    until: Annotated[datetime.date, Field(strict=False)]  # a TOML date, or text
-
-
 class PolicyTable(_Table):
     """Content of a policy file."""
 
@@ -64,7 +54,6 @@ class PolicyTable(_Table):
     inconclusive: Literal["failure", "skip"] = "failure"
     fail: LevelTable
     gate: list[GateTable] = Field(min_length=1)
-    waiver: list[WaiverTable] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +120,6 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
         fail_level=read.fail.level,
         rules=(*always, *(_rule(item) for item in read.gate)),
         inconclusive=read.inconclusive,
-        waivers=tuple(
-            Waiver(item.gate, item.reason, item.until.isoformat(), item.pass_name) for item in read.waiver
-        ),
     )
     return PolicyFile(policy, hashlib.sha256(octets).hexdigest(), source)
 

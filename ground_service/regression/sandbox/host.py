@@ -1,34 +1,61 @@
-"""Interface of the service to the sandbox: file system view of a build, and launcher."""
+"""Sandbox of builds: file system view, start with bubblewrap, supervision from outside, and outputs.
+
+bubblewrap makes the namespaces and a private root of read-only parts of this machine. `/tmp`, a tmpfs of limited size,
+is the only writable folder. Inside, `setpriv` and `prlimit` give the program a user without capabilities and its
+limits; the system call filter of `kernel` applies to all of them. This process opens the output folder before the
+program starts, measures memory, processor time and files of the run, ends it at a limit, and copies the outputs after
+every process of the run has ended.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import json
 import os
+import re
+import secrets
+import select
+import shutil
+import signal
 import stat
 import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-GRACE_S = 180.0
-"""Time after the time limit of a run within which its launcher must end."""
+from ground_service.regression.sandbox.kernel import seccomp_filter
+
+WRITABLE, OUT, HOME = "/tmp", "/tmp/out", "/tmp/home"
+"""The writable folder of a run, and its folders for the outputs and as home."""
+
+FIRST_BUILD_UID, BUILD_UIDS = 1_900_000_000, 1 << 27
+"""User ids of builds of a service that runs as root, outside the ranges of systemd and of user namespaces."""
+
+SETUP_S, SAMPLE_S = 30.0, 0.1
+PRINTED_OCTETS = 65_536
+"""Number of octets kept from the end of the program's printed text."""
+
+INODES = 65_536
+_PARENT = (
+    "import os, resource, sys; status = os.spawnv(os.P_WAIT, sys.argv[1], sys.argv[1:]); "
+    "print(status, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, flush=True); sys.stdin.readline()"
+)
+"""The parent of the program: it writes its exit status and peak memory, and waits while its processor time is read."""
 
 PACKAGES = ("kernels", "lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
 """Packages that the flight code of this project needs; scenarios, migrations and tests are not visible."""
 
+_DEVICES = ("null", "zero", "full", "random", "urandom")
+_NAMESPACES = ("--unshare-ipc", "--unshare-pid", "--unshare-net", "--unshare-uts", "--unshare-cgroup")
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib64", "/lib32")
 _SYSTEM_FILES = ("/etc/ld.so.cache", "/etc/alternatives", "/sys/devices/system/cpu")
-_LAUNCH = (
-    "import sys; sys.path.insert(0, sys.argv.pop(1)); "
-    "from ground_service.regression.sandbox.launcher import main; main()"
-)
 REMEDY = (
-    "permit user namespaces for this process, or run builds in the runner: "
+    "install the Debian package bubblewrap and permit user namespaces for this process, or run builds in the runner: "
     "set LINNA_RUNNER_EXCHANGE and start `linna runner` (docs/build-contract.md)"
 )
 
@@ -43,21 +70,19 @@ class SandboxRefused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Part of the file system of a run: a read-only `bind` of a path, a `link`, or a file with a `text`."""
+    """Part of the file system of a run: a read-only `bind` of a path, or a `link`."""
 
-    kind: Literal["bind", "link", "text"]
+    kind: Literal["bind", "link"]
     source: str
     target: str
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Description of a run, as read by the launcher.
+    """Description of a run.
 
     Attributes
     ----------
-    mode
-        `namespaces`, or `user` in a container that is used only as a runner.
     limits
         As in the build file; see `ground_service.regression.builds.Limits`.
     outputs
@@ -66,80 +91,282 @@ class Run:
         Folder of the caller for the outputs, and file for the end of the program's printed text.
     """
 
-    mode: Literal["namespaces", "user"]
     command: tuple[str, ...]
-    cwd: str
     environment: Mapping[str, str]
     limits: Mapping[str, int]
     outputs: tuple[str, ...]
-    deliver: str
-    printed: str
-    view: tuple[Part, ...] = field(default=())
-
-
-@dataclass(frozen=True, slots=True)
-class Protection:
-    """Isolation of builds on this machine.
-
-    Attributes
-    ----------
-    isolation
-        The parts of the sandbox in force; "" if it is refused.
-    refusal
-        Why runs are refused; "" if they are not. The remedy is `REMEDY`.
-    """
-
-    isolation: str
-    refusal: str
+    deliver: Path
+    printed: Path
+    view: tuple[Part, ...]
 
 
 def execute(run: Run) -> dict[str, Any]:
-    """Run a program in the sandbox; return the report of the launcher.
+    """Run a program in the sandbox; return cause, exit status, times, peak memory and isolation of the run.
+
+    A service that runs as root gives the program a unique user of this machine. Any other service can use only its own
+    user, in a user namespace, in which limits of processes are then counted.
 
     Raises
     ------
     SandboxRefused
         The program was not run because a protection could not be enabled.
     """
-    reading, writing = os.pipe()
+    bwrap = shutil.which("bwrap")
+    if bwrap is None:
+        raise SandboxRefused("expected the program bwrap (Debian package bubblewrap), found none")
+    root = os.geteuid() == 0
+    uid = FIRST_BUILD_UID + secrets.randbelow(BUILD_UIDS) if root else os.geteuid()
+    user = [
+        *("/usr/bin/setpriv", f"--reuid={uid}", f"--regid={uid}", "--clear-groups"),
+        *("--bounding-set=-all", "--inh-caps=-all", "--"),
+    ]
+    capabilities = ["--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--cap-add", "CAP_SETPCAP"]
+    with contextlib.ExitStack() as opened:
+        try:
+            texts = (
+                seccomp_filter(),
+                f"build:x:{uid}:{uid}::{HOME}:/bin/sh\n".encode(),
+                f"build:x:{uid}:\n".encode(),
+            )
+            files = [opened.enter_context(_file_in_memory(text)) for text in texts]
+            process = subprocess.Popen(
+                [
+                    *(bwrap, *_NAMESPACES, *(() if root else ["--unshare-user"])),
+                    *("--cap-drop", "ALL", *(capabilities if root else ())),
+                    *("--die-with-parent", "--new-session", "--clearenv", "--chdir", OUT),
+                    *(word for name, value in run.environment.items() for word in ("--setenv", name, value)),
+                    *_root(run, *files[1:]),
+                    *("--seccomp", str(files[0]), "--"),
+                    *_inside(run, user if root else []),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                env={},
+                umask=0o077,
+                pass_fds=files,
+            )
+        except OSError as error:
+            raise SandboxRefused(f"bubblewrap: {error}") from None
+        report = _Supervisor(run, opened.enter_context(process)).run_program()
+    whose = f"user {uid}" if root else f"user {uid} in a user namespace"
+    return {**report, "isolation": f"bubblewrap, private root, {whose}, system call filter"}
+
+
+@contextlib.contextmanager
+def _file_in_memory(octets: bytes) -> Iterator[int]:
+    descriptor = os.memfd_create("sandbox")
     try:
-        with subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", _LAUNCH, str(package_root()), str(writing)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            env={},
-            pass_fds=(writing,),
-            start_new_session=True,
-        ) as launcher:
-            os.close(writing)
-            writing = -1
-            try:
-                job = json.dumps({**asdict(run), "environment": dict(run.environment)}).encode()
-                _, failure = launcher.communicate(job, timeout=run.limits["wall_s"] + GRACE_S)
-            except subprocess.TimeoutExpired as error:
-                launcher.kill()
-                raise SandboxRefused(f"the launcher did not end within {error.timeout:.0f} s") from None
-            except BaseException:
-                launcher.kill()
-                raise
-        with os.fdopen(reading) as stream:
-            reading = -1
-            written = stream.read()
+        os.pwrite(descriptor, octets, 0)
+        yield descriptor
     finally:
-        for descriptor in (reading, writing):
-            if descriptor >= 0:
-                os.close(descriptor)
-    if not written:
-        lines = failure.decode(errors="replace").strip().splitlines() or ["no report"]
-        raise SandboxRefused(f"the launcher failed: {lines[-1][:200]}")
-    report: dict[str, Any] = json.loads(written)
-    if "refused" in report:
-        raise SandboxRefused(str(report["refused"]))
-    if report.get("unconfined"):
-        said = tail(Path(run.printed)).strip().splitlines() or [f"{run.command[0]} could not be started"]
-        raise SandboxRefused(said[-1][:200])
-    return report
+        os.close(descriptor)
+
+
+def _root(run: Run, users: int, groups: int) -> list[str]:
+    """Return the arguments of bubblewrap for a root with only the parts that the run needs."""
+    words = ["--proc", "/proc", "--remount-ro", "/proc"]
+    words += ["--perms", "0777", "--size", str(run.limits["folder_mib"] << 20), "--tmpfs", WRITABLE]
+    words += ["--perms", "0777", "--dir", OUT, "--perms", "0777", "--dir", HOME]
+    # bubblewrap would close a folder that it makes for a part to other users than its own.
+    for folder in (
+        "/dev",
+        "/etc",
+        *(str(one) for part in run.view for one in reversed(Path(part.target).parents[:-1])),
+    ):
+        words += ["--dir", folder]
+    words += ["--symlink", WRITABLE, "/dev/shm"]
+    for name in _DEVICES:
+        words += ["--dev-bind", f"/dev/{name}", f"/dev/{name}"]
+    for descriptor, path in ((users, "/etc/passwd"), (groups, "/etc/group")):
+        words += ["--perms", "0644", "--file", str(descriptor), path]
+    for part in run.view:
+        words += ["--symlink" if part.kind == "link" else "--ro-bind", part.source, part.target]
+    return [*words, "--remount-ro", "/"]
+
+
+def _inside(run: Run, user: Sequence[str]) -> list[str]:
+    """Return the command that starts the program: change the user, set the limits, write `ready`, wait for a line."""
+    limits = {
+        "as": run.limits["memory_mib"] << 20,
+        # The soft limit sends SIGXCPU a second before the hard limit, to distinguish it from other kills.
+        "cpu": f"{run.limits['cpu_s']}:{run.limits['cpu_s'] + 1}",
+        "fsize": run.limits["file_mib"] << 20,
+        "nofile": run.limits["open_files"],
+        "nproc": run.limits["processes"],
+        "memlock": 0,
+        "msgqueue": 0,
+        "core": 0,
+    }
+    return [
+        *(sys.executable, "-I", "-S", "-c", _PARENT),
+        *(*user, "/usr/bin/prlimit", *(f"--{name}={value}" for name, value in limits.items()), "--"),
+        *("/bin/sh", "-c", 'echo ready; read -r start; exec "$@" </dev/null >&2', "sh", *run.command),
+    ]
+
+
+class _Supervisor:
+    """Supervision of one run from outside."""
+
+    def __init__(self, run: Run, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdin and process.stdout and process.stderr
+        self.run, self.process, self.start = run, process, process.stdin
+        self.control, self.printed = process.stdout.fileno(), process.stderr.fileno()
+        self.open = {self.control, self.printed}
+        self.messages, self.tail = b"", b""
+        self.init = self.out = -1
+        self.cause, self.cpu_s, self.peak_octets = "", 0.0, 0
+
+    def run_program(self) -> dict[str, Any]:
+        """Start the program, wait for its end or a limit, end all processes and copy the outputs."""
+        try:
+            self.prepare()
+            report = self.report()
+            self.end()
+            self.deliver()
+            return report
+        finally:
+            self.end()
+            for descriptor in (self.init, self.out):
+                if descriptor >= 0:
+                    os.close(descriptor)
+
+    def prepare(self) -> None:
+        """Wait until all protections are enabled, and open the output folder."""
+        deadline = time.monotonic() + SETUP_S
+        while b"\n" not in self.messages and self.control in self.open and time.monotonic() < deadline:
+            self.read(SAMPLE_S)
+        if self.messages != b"ready\n":
+            self.drain()
+            said = self.tail.decode(errors="replace").strip().splitlines() or ["not set up in time"]
+            raise SandboxRefused(
+                "bubblewrap: " + said[-1].removeprefix("bwrap: ").partition(". See")[0][:200]
+            )
+        try:
+            child = descendants(self.process.pid)[0]
+            self.init = os.pidfd_open(child)
+            self.out = os.open(f"/proc/{child}/root{OUT}", os.O_RDONLY | os.O_DIRECTORY)
+        except (OSError, IndexError) as error:
+            raise SandboxRefused(f"bubblewrap: {error}") from None
+
+    def report(self) -> dict[str, Any]:
+        self.messages, started = b"", time.monotonic()
+        with contextlib.suppress(BrokenPipeError):
+            self.start.write(b"\n")
+        sampled = started
+        while not self.cause and self.control in self.open and b"\n" not in self.messages:
+            self.read(SAMPLE_S)
+            now = time.monotonic()
+            if now - sampled > SAMPLE_S:
+                sampled = now
+                self.sample()
+            if not self.cause and now - started > self.run.limits["wall_s"]:
+                self.cause = "timeout"
+        wall_s = time.monotonic() - started
+        if not self.cause:
+            self.sample()
+        ended = re.fullmatch(rb"(-?\d{1,3}) (\d{1,12})\n", self.messages) if not self.cause else None
+        status, peak_kib = map(int, ended.groups()) if ended else (0, 0)
+        return {
+            "cause": self.cause or ("" if ended else "crashed"),
+            "exit_status": (128 - status if status < 0 else status) if ended else None,
+            "full": os.fstatvfs(self.out).f_bavail == 0,
+            "wall_s": wall_s,
+            "cpu_s": self.cpu_s,
+            "peak_rss_mib": max(self.peak_octets / (1 << 20), peak_kib / (1 << 10)),
+        }
+
+    def read(self, timeout_s: float) -> None:
+        """Read what the shells and the program have written."""
+        for descriptor in select.select(list(self.open), [], [], timeout_s)[0]:
+            octets = os.read(descriptor, 1 << 16)
+            if not octets:
+                self.open.discard(descriptor)
+            elif descriptor == self.printed:
+                self.tail = (self.tail + octets)[-PRINTED_OCTETS:]
+            else:
+                self.messages = (self.messages + octets)[:64]
+
+    def drain(self) -> None:
+        """Read the rest of the printed text after all writers have ended."""
+        self.process.kill()
+        while self.printed in self.open and select.select([self.printed], [], [], SAMPLE_S)[0]:
+            self.read(0.0)
+
+    def sample(self) -> None:
+        """Measure all processes of the run; set the cause of its end at a limit."""
+        processes, limit = descendants(self.process.pid), self.run.limits["memory_mib"] << 20
+        resident, cpu_s = dict[int, int](), 0.0
+        for place, process in enumerate(processes):
+            # Only the ended children of the first two, process 1 and the parent of the program, count.
+            own = place > 1
+            with contextlib.suppress(OSError, IndexError, ValueError):
+                words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+                cpu_s += sum(map(int, words[11 if own else 13 : 15])) / os.sysconf("SC_CLK_TCK")
+                resident[process] = own * int(words[21]) * os.sysconf("SC_PAGE_SIZE")
+        memory = sum(resident.values())
+        if memory > limit:
+            # Shared pages were counted for each process above; the proportional size is exact but slower.
+            memory = sum(_proportional_memory(*one) for one in resident.items() if one[1])
+        self.cpu_s, self.peak_octets = max(self.cpu_s, cpu_s), max(self.peak_octets, memory)
+        files = os.fstatvfs(self.out)
+        if memory > limit:
+            self.cause = "memory"
+        elif cpu_s > self.run.limits["cpu_s"] + 1:
+            self.cause = "cpu"
+        elif files.f_files - files.f_ffree > INODES:
+            self.cause = "disk"
+
+    def end(self) -> None:
+        """Kill the first process of the namespace, and wait until the kernel has ended all others."""
+        self.process.kill()
+        if self.init >= 0:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self.init, signal.SIGKILL)
+            if not select.select([self.init], [], [], SETUP_S)[0]:
+                raise SandboxRefused("bubblewrap: processes of the run cannot be ended")
+
+    def deliver(self) -> None:
+        """Copy the outputs, only regular files of a permitted size with requested names, and the printed text."""
+        self.drain()
+        self.run.printed.write_bytes(self.tail)
+        for name in self.run.outputs:
+            try:
+                source = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=self.out)
+            except OSError:
+                continue
+            state = os.fstat(source)
+            if stat.S_ISREG(state.st_mode) and state.st_size <= self.run.limits["file_mib"] << 20:
+                with (
+                    open(source, "rb", closefd=False) as stream,
+                    (self.run.deliver / name).open("xb") as copy,
+                ):
+                    shutil.copyfileobj(stream, copy)
+            os.close(source)
+
+
+def descendants(root: int) -> list[int]:
+    """Return the descendants of a process, parents first."""
+    children: dict[int, list[int]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError, IndexError, ValueError):
+                parent = int(Path(f"/proc/{name}/stat").read_text().rpartition(")")[2].split()[1])
+                children.setdefault(parent, []).append(int(name))
+    found = list(children.get(root, ()))
+    for process in found:
+        found += children.get(process, ())
+    return found
+
+
+def _proportional_memory(process: int, resident: int) -> int:
+    """Return the proportional set size of a process in octets; `resident` if that is not readable."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) << 10
+    return resident
 
 
 def program_view() -> tuple[Part, ...]:
@@ -152,8 +379,6 @@ def program_view() -> tuple[Part, ...]:
         elif path.is_dir():
             parts.append(Part("bind", os.path.realpath(path), name))
     parts += [Part("bind", os.path.realpath(name), name) for name in _SYSTEM_FILES if Path(name).exists()]
-    parts.append(Part("text", "build:x:{uid}:{uid}::/home/build:/bin/sh\n", "/etc/passwd"))
-    parts.append(Part("text", "build:x:{uid}:\n", "/etc/group"))
     for folder in [*_python_folders(), *(package_root() / name for name in PACKAGES)]:
         for target in dict.fromkeys((str(folder), os.path.realpath(folder))):
             if os.path.isdir(target) and not _covered(target, parts):
@@ -200,8 +425,14 @@ def make_readable(folder: Path) -> None:
 
 
 @functools.cache
-def protection() -> Protection:
-    """Return how builds are isolated here: every step of the launcher refuses a run that it cannot protect."""
+def protection() -> str:
+    """Return how builds are isolated here.
+
+    Raises
+    ------
+    SandboxRefused
+        A trial run was refused, or Python did not run in it.
+    """
     limits = {
         "wall_s": 30,
         "cpu_s": 20,
@@ -214,15 +445,11 @@ def protection() -> Protection:
     with tempfile.TemporaryDirectory(prefix="sandbox-") as folder:
         printed = Path(folder) / "printed.txt"
         command = (sys.executable, "-I", "-S", "-c", "print('ready')")
-        run = Run("namespaces", command, "/out", {}, limits, (), folder, str(printed), program_view())
-        try:
-            report = execute(run)
-        except SandboxRefused as error:
-            return Protection("", error.reason)
-        if report.get("exit_status") != 0 or tail(printed).strip() != "ready":
-            said = tail(printed)[-200:].strip() or f"no text, exit status {report.get('exit_status')}"
-            return Protection("", f"Python does not run in the sandbox: {said}")
-    return Protection(str(report["isolation"]), "")
+        report = execute(Run(command, {}, limits, (), Path(folder), printed, program_view()))
+        if report["exit_status"] != 0 or tail(printed).strip() != "ready":
+            said = tail(printed)[-200:].strip() or f"no text, exit status {report['exit_status']}"
+            raise SandboxRefused(f"Python does not run in the sandbox: {said}")
+    return str(report["isolation"])
 
 
 def _python_folders() -> list[Path]:

@@ -74,7 +74,7 @@ def _refused(*_: Any, **__: Any) -> dict[str, Any]:
 def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
     def run(request: Any, staged: Path, written: Path, printed: Path, **_: Any) -> dict[str, Any]:
         printed.write_text("Traceback\nMemoryError\n")
-        return {"cause": "", "exit_status": 0, "signal": None} | changes
+        return {"cause": "", "exit_status": 0} | changes
 
     return run
 
@@ -83,9 +83,9 @@ def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
     ("run", "told"),
     [
         (_refused, "no user namespaces"),
-        (_ended(exit_status=1), "status 1, signal None: MemoryError"),
-        (_ended(exit_status=2), "status 2, signal None: MemoryError"),
-        (_ended(exit_status=None, signal=9), "signal 9"),
+        (_ended(exit_status=1), "status 1: MemoryError"),
+        (_ended(exit_status=2), "status 2: MemoryError"),
+        (_ended(exit_status=137), "status 137"),
         (_ended(cause="timeout"), "ended with timeout"),
     ],
 )
@@ -107,6 +107,13 @@ def test_the_command_checks_a_build_file(
 ) -> None:
     assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
     assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
-    assert run_command(["replay", "--check-build", write("detector.max_detections = 3")]) == 0
+    file = write("detector.max_detections = 3")
+    assert run_command(["replay", "--check-build", file]) == 0
+    text = Path(file).read_text()
+    for wrong, told in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
+        Path(file).write_text(f"{wrong}\n{text.replace('schema_version = 1', '')}")
+        capsys.readouterr()
+        assert run_command(["replay", "--check-build", file]) == 2
+        assert told in capsys.readouterr().out
     assert run_command(["replay", "--out", "x"]) == 2
     assert "expected ARCHIVE, or --check-build BUILD" in capsys.readouterr().err

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import tempfile
 import time
+import venv
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +15,7 @@ import pytest
 from ground_service.errors import InvalidInput
 from ground_service.regression.build_runs import BuildRun, run_build
 from ground_service.regression.builds import Build, changes, load_build
+from ground_service.regression.sandbox import host
 
 LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
 
@@ -41,6 +45,53 @@ def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path:
     # Four million pointers of eight octets, on top of an interpreter of some ten.
     assert 30.0 < run.peak_rss_mib < 120.0
     assert not (tmp_path / "out" / ".run").exists()
+
+
+def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host.shutil, "which", lambda name: None)
+    host.protection.cache_clear()
+    run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')")
+    assert (run.outcome, run.downlink) == ("refused", None)
+    assert run.detail.startswith(
+        "expected the program bwrap (Debian package bubblewrap), found none; remedy: "
+    )
+
+
+def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    host.protection.cache_clear()
+    monkeypatch.setattr(host, "execute", lambda run: {"exit_status": 1})
+    with pytest.raises(
+        host.SandboxRefused, match="Python does not run in the sandbox: no text, exit status 1"
+    ):
+        host.protection()
+
+
+def test_builds_run_where_python_is_installed_below_tmp() -> None:
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:
+        Path(name).chmod(0o755)
+        venv.create(name)
+        command = [f"{name}/bin/python", "-c", f"from {host.__name__} import *; print(protection())"]
+        environment = {"PYTHONPATH": str(host.package_root())}
+        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert said.stdout.startswith("bubblewrap, private root, user ")
+
+
+def test_the_processor_time_of_ended_processes_counts(fly) -> None:
+    run = fly(
+        "for _ in range(3):\n"
+        "    if os.fork() == 0:\n"
+        "        while time.process_time() < 0.1: pass\n"
+        "        os._exit(0)\n"
+        "    os.wait()\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')\n"
+    )
+    assert 0.29 < run.cpu_s < 3.0
+
+
+def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host, "INODES", 500)
+    run = fly("for k in range(1000): pathlib.Path(sys.argv[2], str(k)).touch()\ntime.sleep(2)")
+    assert run.outcome == "disk"
 
 
 def test_a_program_that_kills_itself_is_told_by_its_signal(fly) -> None:
@@ -208,6 +259,11 @@ def test_what_differs_between_two_builds_on_the_flight_code_is_named(
     own = 'parameters = "p.toml"\n'
     good = build("good", own, "flight.odometry.time_gap_s = 61.0\ndetector.score_threshold = 0.5\n")
     bad = build("bad", own, "detector.score_threshold = 0.9\n[flight]\nhousekeeping_interval_s = 30.0\n")
+    flown = [{"flight.housekeeping_interval_s": 60.0, "flight.odometry.time_gap_s": 61.0}]
+    assert changes(good, bad, flown) == [
+        "detector.score_threshold = 0.9 (baseline: 0.5)",
+        "flight.housekeeping_interval_s = 30.0 (baseline: 60.0)",
+    ]
     assert changes(good, bad) == [
         "detector.score_threshold = 0.9 (baseline: 0.5)",
         "flight.housekeeping_interval_s = 30.0 (baseline: not set)",

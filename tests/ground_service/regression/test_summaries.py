@@ -27,7 +27,6 @@ def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
         "frames": 10,
         "frames_needed": None,
         "reason": None,
-        "waived": None,
     }
     return JudgedGate(name=name, outcome=outcome, **known | values)
 
@@ -38,6 +37,7 @@ def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regressi
         baseline={"name": "old", **BUILD},
         candidate={"name": "new", **BUILD},
         policy=POLICY,
+        headline=f"{verdict}: no loss",
         frames=10,
         frames_needed=None,
         gates=gates,
@@ -51,15 +51,20 @@ def test_a_list_names_builds_and_not_only_their_hashes() -> None:
     summary = regression("pass", [gate("recall", "pass")]).summary()
     assert summary.candidate_title == "new 1.2 (abababababab)"
     assert summary.baseline_title == "old 1.2 (abababababab)"
-    assert summary.reasons == []
+    assert (summary.reasons, summary.headline) == ([], "pass: no loss")
+
+
+def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count() -> None:
+    found = regression("pass", [gate("other", "fail", waived="known"), gate("recall", "pass", waived=None)])
+    assert found.result.gates[0].text == "other: waived: known"
+    assert found.summary().gates_failed == 0
 
 
 def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_comparison() -> None:
     open_gate = gate("drift", "inconclusive", reason="too few frames")
     failed = gate("recall", "fail", pass_name="pass 1", unit="m")
-    waived = gate("other", "fail", waived="known")
     lost = {"name": "pass 2", "archive": "x", "state": "candidate failed", "detail": "exit status 4"}
-    found = regression("fail", [open_gate, failed, waived], passes=[lost])
+    found = regression("fail", [open_gate, failed], passes=[lost])
     assert found.summary().reasons == [
         "recall on pass 1: 0.9 to 0.7 m",
         "drift: 0.9 to 0.7, too few frames",
