@@ -206,6 +206,12 @@ class Operations(Connection):
     def list_ingests(self) -> Listing[ingest.Ingest]:
         """List the ingests, newest first."""
 
+    @operation("GET /implausible-packets", reads="ingest.doubts.list_implausible")
+    def list_implausible(
+        self, *, spacecraft_id: int | None = None, instance: str | None = None, ingest_id: int | None = None
+    ) -> Listing[ingest.ImplausiblePacket]:
+        """List the packets that are kept apart because their on-board time is implausible, newest first."""
+
     @operation("GET /ingests/{ingest_id}")
     def get_ingest(self, ingest_id: int) -> ingest.Ingest:
         """Show an ingest: its state and the accounting of the file."""

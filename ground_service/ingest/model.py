@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ground_service.http.model import Entity
+from ground_service.http.model import Entity, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
 
 
@@ -100,6 +100,9 @@ class IngestResult(Entity):
     packets_new: int = Field(description="Packets that were not in the archive")
     packets_joined: int = Field(description="New packets completed with earlier pieces or other recordings")
     packets_repeated: int
+    packets_implausible: int = Field(
+        default=0, description="Packets kept apart because their on-board time is implausible"
+    )
     samples: int
     crc_errors: int
     octets_skipped: int
@@ -116,6 +119,27 @@ class IngestResult(Entity):
     vehicle_ids: tuple[int, ...] = Field(default=(), description="Vehicles whose packets the file contains")
     reception: ReceivedLink | None = Field(default=None, description="null: bare packets")
     uplink: tuple[ReceivedControlWords, ...] = ()
+
+
+class ImplausibleFilter(Paging):
+    """Packets with an implausible time to list."""
+
+    spacecraft_id: SpacecraftNumber | None = None
+    instance: InstanceName | None = None
+    ingest_id: int | None = None
+
+
+class ImplausiblePacket(Entity):
+    """A packet whose on-board time is implausible: kept, but not used."""
+
+    id: int
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+    ingest_id: int
+    apid: int
+    sequence_count: int
+    time: UtcTime = Field(description="On-board time, not corrected")
+    reason: str = Field(examples=["1.1 d after all other telemetry, 1 packets agree"])
 
 
 class Ingest(Entity):

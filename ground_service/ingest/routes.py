@@ -18,7 +18,7 @@ from ground_service.http.common import (
     upload_body,
 )
 from ground_service.http.requests import operations
-from ground_service.ingest import store
+from ground_service.ingest import doubts, store
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.ingest.service import Place, enter_ingest
 from ground_service.jobs.dispatcher import DispatcherOf
@@ -102,6 +102,9 @@ async def upload_telemetry(
 
 
 add_list(ingests, "/ingests", store.list_ingests)
+
+
+add_list(ingests, "/implausible-packets", doubts.list_implausible)
 
 
 @ingests.get("/ingests/{ingest_id}")

@@ -176,25 +176,30 @@ def _known_ingest(connection: Connection, job: Job, stored: StoredFile, asked: d
     raise Conflict(OTHER_REQUEST)
 
 
-def run_ingest(ground: Ground, ingest_id: int, *, progress: Progress | None = None) -> IngestResult:
+def run_ingest(
+    ground: Ground, ingest_id: int, *, progress: Progress | None = None, judged: bool = False
+) -> IngestResult:
     """Read the piece of an ingest that was entered; a repetition changes nothing.
 
-    `progress` is called with the stored share of the file, several times for a long file.
+    `progress` is called with the stored share of the file, several times for a long file. `judged`: which packets have
+    an implausible time is known already.
     """
     with ground.database.reading() as connection:
         piece = get_piece(connection, ingest_id)
-    return _ingest(ground, piece, progress)
+    return _ingest(ground, piece, progress, judged=judged)
 
 
-def _ingest(ground: Ground, piece: Piece, progress: Progress | None = None) -> IngestResult:
+def _ingest(
+    ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False
+) -> IngestResult:
     with ground.database.listeners.held():  # one call for the whole file, not one for each batch
         try:
-            reading = Reading(ground, piece, progress)
+            reading = Reading(ground, piece, progress, judged=judged)
             reading.read()
             readings = [reading]
             for other in reading.readable_now():
                 with suppress(InvalidInput):
-                    again = Reading(ground, other)
+                    again = Reading(ground, other, judged=judged)
                     again.read()
                     readings.append(again)
             for one in readings:

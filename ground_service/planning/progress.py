@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.store import views_of_window
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
@@ -118,6 +118,7 @@ def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
         started=STARTED in events,
         stopped=STOPPED in events,
         heard_after=heard_after,
+        ended=mission_now_ns() >= window.stop.utc_ns,
         awaited=awaited,
         lost=_lost(connection, vehicle, start, stop) if frames else None,
         reported=window.pass_id is not None and store.has_report(connection, window.pass_id),

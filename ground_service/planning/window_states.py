@@ -43,6 +43,8 @@ class WindowFacts:
         Whether an event report or a verification report shows the start, and the end, of the observation.
     heard_after
         Whether telemetry from after its end has come down.
+    ended
+        Whether it has ended by the mission clock: telemetry does not fail a window before that.
     awaited
         Whether packets of its time are missing that may still come down.
     lost
@@ -62,6 +64,7 @@ class WindowFacts:
     started: bool = False
     stopped: bool = False
     heard_after: bool = False
+    ended: bool = True
     awaited: bool = False
     lost: int | None = None
     reported: bool = False
@@ -87,7 +90,7 @@ def state_of(facts: WindowFacts) -> tuple[str, str | None]:
     if facts.predecessor_failed:
         return "failed", "its predecessor failed"
     sent = bool(facts.command_states) and not {"queued", "released", "carried"} & set(facts.command_states)
-    if sent and facts.heard_after and not facts.awaited:
+    if sent and facts.heard_after and facts.ended and not facts.awaited:
         return "failed", "telemetry from after its end shows no observation"
     return ("uplinked" if sent else "approved"), None
 

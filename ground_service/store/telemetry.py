@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, bindparam, func, select
 from sqlalchemy.sql import Select
 
 from ground_service.store.repository import PACKETS, SAMPLES, within
 from lunar.arrays import IntArray
+from tmtc.dictionary import DICTIONARY
 
 
 def packet_headers(
@@ -51,6 +53,46 @@ def _apids(connection: Connection, vehicle: int) -> list[int]:
     ) is not None:
         found.append(int(apid))
     return found
+
+
+def newest_ticks(connection: Connection, vehicle: int, apids: IntArray | None = None) -> int | None:
+    """Return the greatest on-board time of the stored packets of a vehicle; None without any.
+
+    `apids` are those of packets that the dictionary does not have; None: they are looked up.
+    """
+    if apids is None:
+        found = _apids(connection, vehicle)
+    else:
+        found = sorted({*_APIDS, *np.unique(apids).tolist()})
+    row = connection.execute(_newest_query(tuple(found)), {"vehicle_id": vehicle}).one() if found else ()
+    return max((int(ticks) for ticks in row if ticks is not None and ticks >= 0), default=None)
+
+
+_APIDS = frozenset(definition.apid for definition in DICTIONARY.telemetry)
+
+
+@lru_cache(maxsize=16)
+def _newest_query(apids: tuple[int, ...]) -> Any:
+    """Return the query of the greatest on-board time of each APID, which the index has."""
+    mine = select(func.max(PACKETS.c.ticks)).where(PACKETS.c.vehicle_id == bindparam("vehicle_id"))
+    return select(*(mine.where(PACKETS.c.apid == apid).scalar_subquery() for apid in apids))
+
+
+def last_packets(connection: Connection, vehicle: int, count: int) -> IntArray:
+    """Return on-board time and id (n, 2) of at least the last `count` packets of a vehicle, newest first."""
+    found = []
+    for apid in _apids(connection, vehicle):
+        mine = PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid == apid, PACKETS.c.ticks >= 0
+        query = select(PACKETS.c.ticks, PACKETS.c.id).where(*mine).order_by(PACKETS.c.ticks.desc())
+        found += [tuple(row) for row in connection.execute(query.limit(count))]
+    return np.array(sorted(found, reverse=True), dtype=np.int64).reshape(-1, 2)
+
+
+def packets_before(connection: Connection, vehicle: int, ticks: int) -> list[int]:
+    """Return the ids of the packets of a vehicle with an on-board time before this."""
+    mine = PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid.in_(_apids(connection, vehicle))
+    query = select(PACKETS.c.id).where(*mine, PACKETS.c.ticks >= 0, PACKETS.c.ticks < ticks)
+    return [int(key) for key in connection.execute(query).scalars()]
 
 
 def packet_octets(

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
             kept = (
                 "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending", "frames_bad",
-                "symbols_corrected",
+                "symbols_corrected", "packets_implausible",
             )  # fmt: skip
             assert made.accounting is not None
             figures = made.accounting.model_dump(include=set(kept))
@@ -102,6 +102,11 @@ def _line(one: dict[str, Any]) -> str:
         f"{one['file']}: {one['packets']} packets, {one['packets_new']} new, {one['crc_errors']} damaged, "
         f"{one['frames_bad']} bad frames, {one['octets_skipped']} octets skipped"
     )
+    if one["packets_implausible"]:
+        line += (
+            f"; {one['packets_implausible']} packets with an implausible on-board time are kept apart and not used "
+            "(linna correlate implausible)"
+        )
     if one["octets_pending"]:
         line += (
             f"; {one['octets_pending']} octets of an incomplete frame or packet at the ends "
