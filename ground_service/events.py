@@ -83,6 +83,15 @@ class CorrelationChanged(Event):
     segments: int
 
 
+class ClockDoubted(Event):
+    """The clock of a station disagrees with others or with the on-board clock: its time reports do not count."""
+
+    event_kind = "clock doubted"
+    vehicle_id: int
+    station: str
+    difference_s: float
+
+
 class EphemerisAdded(Event):
     """A reference ephemeris was added or withdrawn."""
 

@@ -15,13 +15,13 @@ UNSET_CLOCK_S = 366.0 * 86_400.0
 AGREEING_PACKETS = 10
 """So many packets of one stretch are not wrong by one time stamp."""
 
-CORRELATION_RMS_NS = 2e6
-"""Largest scatter of time reports about a correlation: a hundred resolutions of the on-board clock (15 us), and more
-than the delays of a telemetry frame on board; clocks of stations that disagree scatter by more."""
+CORRELATION_RMS_NS = 100e6
+"""Largest scatter of time reports about a correlation: without an ephemeris light times are wrong by 27 ms (radii of
+Earth and orbit), clocks of stations that disagree scatter by more."""
 
-STATION_DIFFERENCE_NS = 20e6
-"""Largest difference of reception times at two stations: light times to the centre of the Earth differ by 21 ms at most
-from those to a station, clocks on GNSS time by less than a microsecond."""
+STATION_DIFFERENCE_NS = 50e6
+"""Largest difference between the reports of two stations, for the same reason: their clocks on GNSS time agree to less
+than a microsecond."""
 
 WHOLE_SECONDS = {
     1: "a leap second",

@@ -21,6 +21,7 @@ from sqlalchemy import Connection
 from ground_service.errors import PASSING, NotFound, fault_of
 from ground_service.events import (
     AutomationChanged,
+    ClockDoubted,
     CommandsSent,
     ContactEnded,
     ContactMissed,
@@ -44,7 +45,7 @@ from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments
 from ground_service.missions.timekeeping.recorrelation import recorrelate
 from ground_service.missions.timekeeping.store import vehicles_with_receptions
-from ground_service.passes.alarms.service import examine_again, examine_packets, note_implausible_times
+from ground_service.passes.alarms.service import examine_again, examine_packets, note_finding
 from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
@@ -95,9 +96,9 @@ def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
 
 
 def _after_doubt(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    event = TimesDoubted.of(logged)
-    yield "note implausible times", logged.number
-    yield "review times", event.vehicle_id
+    yield "note finding", logged.number
+    if logged.kind == TimesDoubted.event_kind:
+        yield "review times", TimesDoubted.of(logged).vehicle_id
 
 
 def _of_vehicle(work: str) -> Following:
@@ -145,6 +146,7 @@ FOLLOWING: Mapping[str, Following] = {
     TelemetryReceived.event_kind: _after_telemetry,
     TelemetryWithdrawn.event_kind: _after_telemetry,
     TimesDoubted.event_kind: _after_doubt,
+    ClockDoubted.event_kind: _after_doubt,
     ReceptionsEntered.event_kind: _of_vehicle("recorrelate"),
     CorrelationChanged.event_kind: _of_vehicle("advance windows"),
     EphemerisAdded.event_kind: _after_ephemeris,
@@ -175,10 +177,16 @@ def _review(ground: Ground, vehicle: int, _event: int) -> None:
     review_times(ground, vehicle)
 
 
-def _note_doubts(ground: Ground, number: int, _event: int) -> None:
+def _note_finding(ground: Ground, number: int, _event: int) -> None:
     [logged] = ground.read(events.read_events, number - 1, 1)
-    event = TimesDoubted.of(logged)
-    note_implausible_times(ground, event.vehicle_id, event.packets)
+    if logged.kind == TimesDoubted.event_kind:
+        times = TimesDoubted.of(logged)
+        note_finding(ground, times.vehicle_id, "implausible_time", times.packets)
+    else:
+        clock = ClockDoubted.of(logged)
+        note_finding(
+            ground, clock.vehicle_id, f"station_clock {clock.station}"[:64], value=clock.difference_s
+        )
 
 
 def _alarms_again(ground: Ground, vehicle: int, _event: int) -> None:
@@ -240,7 +248,7 @@ def _plan(ground: Ground, vehicle: int, event: int) -> str | None:
 
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "review times": _review,
-    "note implausible times": _note_doubts,
+    "note finding": _note_finding,
     "recorrelate": _recorrelate,
     "alarms again": _alarms_again,
     "alarms": _alarms,

@@ -159,14 +159,14 @@ def note_operations(ground: Ground, spacecraft_id: int, lasting: Set[str], holdi
             _update(connection, vehicle, found, names, is_operations=True)
 
 
-def note_implausible_times(ground: Ground, vehicle: int, packets: int) -> None:
-    """Raise the alarm of packets with an implausible on-board time, at the mission time."""
+def note_finding(ground: Ground, vehicle: int, name: str, count: int = 1, value: float | None = None) -> None:
+    """Raise an alarm of something implausible that was received, at the mission time."""
     with ground.database.writing() as connection:
         lock_vehicle(connection, vehicle)
         rows = store.open_alarms(connection, vehicle)
         active = {row.name for row in rows if row.source == core.OPERATIONS and row.active}
         ticks = ticks_of_utc_ns(mission_now_ns(), load_correlations(connection, vehicle))
-        found = Condition(core.OPERATIONS, "implausible_time", core.WARNING, ticks, ticks, packets)
+        found = Condition(core.OPERATIONS, name, core.WARNING, ticks, ticks, count, value)
         _update(connection, vehicle, (found,), active, is_operations=True)
 
 
