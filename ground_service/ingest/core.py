@@ -124,7 +124,7 @@ def _usual_rate(near: IntArray, step_ticks: IntArray) -> float:
 
 LONGEST_STEP = round(CLOCK_ERROR_S * TICKS_PER_SECOND)
 UNSET_TICKS = round(UNSET_CLOCK_S * TICKS_PER_SECOND)
-_SILENCE_TICKS = round(SILENCE_S * TICKS_PER_SECOND)
+LONGEST_SILENCE = round(SILENCE_S * TICKS_PER_SECOND)
 
 
 def implausible_times(
@@ -171,7 +171,7 @@ def implausible_times(
                 reason = f"{_span(last - latest)} after the mission time" if last > latest else None
             elif len(stretch) < AGREEING_PACKETS:
                 reason = f"{_span(first - reached)} after all other telemetry, {len(stretch)} packets agree"
-            elif first - reached > _SILENCE_TICKS:
+            elif first - reached > LONGEST_SILENCE:
                 reason = f"{_span(first - reached)} after all other telemetry"
         if reason is None:
             is_firm = newest is not None or len(stretch) >= AGREEING_PACKETS

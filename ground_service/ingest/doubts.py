@@ -42,9 +42,12 @@ def plausible_part(
 
     `judged`: only packets that are kept apart already are left out.
     """
-    doubted = connection.execute(select(_DOUBTED.c.digest).where(_DOUBTED.c.vehicle_id == vehicle))
-    known = {bytes(digest) for digest in doubted.scalars()}
-    doubts = {} if judged else _doubts(connection, vehicle, batch)
+    newest, is_doubted = telemetry.newest_and_doubted(connection, vehicle, batch.apid)
+    known = set()
+    if is_doubted:
+        digests = connection.execute(select(_DOUBTED.c.digest).where(_DOUBTED.c.vehicle_id == vehicle))
+        known = {bytes(digest) for digest in digests.scalars()}
+    doubts = {} if judged else _doubts(connection, vehicle, batch, newest)
     new = {k: reason for k, reason in doubts.items() if batch.digest[k] not in known}
     if not new and not known:
         return batch
@@ -57,12 +60,11 @@ def plausible_part(
     return _batch([batch.octets[k] for k in keep], batch.spacecraft_id, received)
 
 
-def _doubts(connection: Connection, vehicle: int, batch: PacketBatch) -> dict[int, str]:
+def _doubts(connection: Connection, vehicle: int, batch: PacketBatch, newest: int | None) -> dict[int, str]:
     """Return the packets of a batch with an implausible time, with the reason."""
     timed = batch.ticks[batch.ticks != NO_TICKS]
     if not timed.size:
         return {}
-    newest = telemetry.newest_ticks(connection, vehicle, batch.apid)
     if newest is not None:
         is_new = timed.max() > newest + LONGEST_STEP
         is_old = timed.min() < newest - LONGEST_STEP
@@ -159,9 +161,8 @@ def needs_review(connection: Connection, vehicle: int, first_ticks: int | None) 
     """Return whether new telemetry, from this time on, can change a judgement."""
     if first_ticks is None:
         return False
-    newest = telemetry.newest_ticks(connection, vehicle)
-    is_late = newest is not None and first_ticks < newest - LONGEST_STEP
-    return is_late or repository.find(connection, _DOUBTED, vehicle_id=vehicle) is not None
+    newest, is_doubted = telemetry.newest_and_doubted(connection, vehicle)
+    return is_doubted or (newest is not None and first_ticks < newest - LONGEST_STEP)
 
 
 def review_times(ground: Ground, vehicle: int) -> None:

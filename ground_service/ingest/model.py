@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, InstanceName, Paging, SpacecraftNumber
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
+from ground_service.text import LINE_PATTERN_JSON
 
 
 class IngestAccepted(Entity):
@@ -121,6 +122,12 @@ class IngestResult(Entity):
     uplink: tuple[ReceivedControlWords, ...] = ()
 
 
+class Withdrawal(Given):
+    """Why an ingest is withdrawn."""
+
+    reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["another flight"])
+
+
 class ImplausibleFilter(Paging):
     """Packets with an implausible time to list."""
 
@@ -146,7 +153,9 @@ class Ingest(Entity):
     """One ingest of one file."""
 
     id: int = Field(examples=[1])
-    state: str = Field(examples=["done"], description="queued, running, done or failed")
+    state: str = Field(
+        examples=["done"], description="queued, running, done, failed, withdrawing or withdrawn"
+    )
     sha256: str
     received: UtcTime
     finished: UtcTime | None

@@ -22,6 +22,7 @@ from ground_service.store.codec import pack_detections, pack_filter_states, pack
 from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
 from ground_service.store.parameters import forget_others
 from ground_service.store.rollups import add_to_rollups, forget_rollups, rebuild_rollups
+from ground_service.store.states import change_if
 from lunar.arrays import IntArray
 
 RANGE_GAP_TICKS = 600 << 16
@@ -460,6 +461,37 @@ def limit_extents(connection: Connection, vehicle: int, newest_ticks: int | None
     """Limit the extent of the ingests of a vehicle to the times of its packets."""
     later = (_INGESTS.c.vehicle_id == vehicle, _INGESTS.c.last_ticks > (newest_ticks or 0))
     connection.execute(update(_INGESTS).where(*later).values(last_ticks=newest_ticks))
+
+
+def change_ingest(connection: Connection, ingest_id: int, state: str, new: str) -> bool:
+    """Change the state of an ingest if it is `state`; return whether it was."""
+    return change_if(connection, _INGESTS, ingest_id, {"state": state}, state=new)
+
+
+def ingests_of_vehicles(connection: Connection, vehicles: Sequence[int], but: int) -> list[int]:
+    """Return the ingests, except one, that may have packets of these vehicles, oldest first."""
+    mine = _INGESTS.c.vehicle_id.in_(vehicles) | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(
+        None
+    )
+    query = select(_INGESTS.c.id).where(mine, _INGESTS.c.state == "done", _INGESTS.c.id != but)
+    return [int(key) for key in connection.execute(query.order_by(_INGESTS.c.id)).scalars()]
+
+
+def forget_rest(connection: Connection, vehicle: int, ingest_id: int) -> None:
+    """Remove what an ingest has left besides packets of a vehicle: fragments, doubts, its place, and its marks.
+
+    Telecommands that were sent after it are verified from where those before it were.
+    """
+    fragments, doubted, sent = repository.FRAGMENTS, repository.IMPLAUSIBLE_PACKETS, repository.TELECOMMANDS
+    connection.execute(delete(fragments).where(fragments.c.vehicle_id == vehicle))
+    connection.execute(delete(doubted).where(doubted.c.vehicle_id == vehicle))
+    connection.execute(update(_PIECES).where(_PIECES.c.ingest_id == ingest_id).values(stream="", waits=None))
+    mine = sent.c.vehicle_id == vehicle
+    received = select(_INGESTS.c.received_utc_ns).where(_INGESTS.c.id == ingest_id).scalar_subquery()
+    before = select(func.max(sent.c.sent_after_ticks)).where(mine, sent.c.sent_utc_ns < received)
+    known = connection.execute(before).scalar()
+    later = update(sent).where(mine, sent.c.sent_utc_ns >= received)
+    connection.execute(later.values(sent_after_ticks=-1 if known is None else known))
 
 
 def newest_ingest(connection: Connection, vehicle: int) -> int:

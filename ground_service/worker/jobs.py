@@ -25,7 +25,7 @@ from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
-from ground_service.ingest.service import apply_definition, run_ingest
+from ground_service.ingest.service import apply_definition, derive_without, run_ingest
 from ground_service.jobs import store
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
@@ -85,6 +85,10 @@ def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dic
     return {"rows": catch_up(ground, vehicle) + apply_definition(ground, vehicle)}
 
 
+def _withdraw(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    return {"ingests": derive_without(ground, int(arguments["ingest_id"]))}
+
+
 def _automation(
     ground: Ground, arguments: Mapping[str, Any], _job_id: str, notify: bool = False
 ) -> dict[str, Any]:
@@ -102,6 +106,7 @@ WORK: dict[str, Work] = {
     "nightly": nightly,
     "plan": _plan,
     "redecode": _redecode,
+    "withdrawal": _withdraw,
     "re-evaluation": _reevaluate,
     "automation": _automation,
     "notification": partial(_automation, notify=True),

@@ -93,6 +93,12 @@ COMMANDS = {
         "packets",
         "no packets with an implausible on-board time",
     ),
+    "withdraw-ingest": Command(
+        "withdraw_ingest",
+        "withdraw a received file, such as one of another flight: everything is derived again without it",
+        lambda row: f"ingest {row.id}: {row.state}",
+        options={"reason": "what is wrong with it"},
+    ),
     "run": Command(
         "run_correlation",
         "fit the segments again from the received time reports; this replaces segments entered by hand",

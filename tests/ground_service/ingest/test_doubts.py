@@ -8,16 +8,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
 from ground_service.clock import TelemetryTime, set_mission_clock
+from ground_service.contacts.commanding.service import (
+    enter_command,
+    get_command,
+    release_command,
+    take_uplink,
+)
+from ground_service.contacts.links import store as links
+from ground_service.errors import Conflict, StateConflict
 from ground_service.ground import Ground
 from ground_service.ingest.core import fits_between, implausible_times
 from ground_service.ingest.doubts import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
-from ground_service.ingest.service import ingest_file
+from ground_service.ingest.service import ingest_file, withdraw_ingest
+from ground_service.ingest.store import get_ingest
+from ground_service.missions.service import add_mission
 from ground_service.missions.store import newest_ticks
 from ground_service.passes.alarms.model import AlarmFilter
 from ground_service.passes.alarms.service import list_alarms
 from ground_service.worker.integrity import verify
+from ground_service.worker.jobs import run_job
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.archive_hash import hash_of
 from tests.ground_service.conftest import _housekeeping
@@ -159,3 +172,95 @@ def test_a_sequence_count_fits_between_its_neighbours(
     count: int, before: int | None, after: int | None, fits: bool
 ) -> None:
     assert fits_between(count, before, after) is fits
+
+
+def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground, tmp_path: Path) -> None:
+    receive(either, tmp_path, contact())
+    before, alone = hash_of(either), alarms(either)
+    foreign = contact(TICKS - 9 * DAY) + contact(TICKS + (30 << 16), 500) + report(TICKS + 60, 600, 99.0)
+    receive(either, tmp_path, foreign)
+    assert hash_of(either) != before and alarms(either) != alone
+    job = withdraw_ingest(either, 2, reason="another flight", actor="ann")
+    with pytest.raises(StateConflict, match="expected state done, found withdrawing"):
+        withdraw_ingest(either, 2, reason="another flight", actor="ann")
+    assert run_job(either, job).state == "done"
+    assert (hash_of(either), alarms(either)) == (before, alone)
+    assert either.read(get_ingest, 2).state == "withdrawn"
+    assert verify(either, rebuild=True).verdict == "intact"
+    [entry] = either.read(list_audit, AuditFilter(action="withdraw ingest", limit=9)).items
+    assert entry.detail["reason"] == "another flight"
+
+
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(
+    either: Ground, tmp_path: Path
+) -> None:
+    def verification(ticks: int, request: int) -> bytes:
+        values = {"request_id": request}
+        return DICTIONARY.pack("verification_completed", values, ticks=ticks, sequence_count=0)
+
+    receive(either, tmp_path, contact())
+    receive(either, tmp_path, verification(TICKS + HOUR // 2, 5))  # of another flight
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    request = get_command(either, key).record.request_id or 0
+    receive(either, tmp_path, verification(TICKS + HOUR // 4, request))
+    assert get_command(either, key).state == "sent"
+    run_job(either, withdraw_ingest(either, 2, reason="another flight", actor="ann"))
+    assert get_command(either, key).state == "completed"
+
+
+def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
+    set_mission_clock(lambda: NOW)
+    receive(either, tmp_path, contact())
+    old = DICTIONARY.pack("verification_completed", {"request_id": 5}, ticks=TICKS - DAY, sequence_count=0)
+    receive(either, tmp_path, old)
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    request = get_command(either, key).record.request_id or 0
+    late = {"request_id": request}
+    receive(
+        either,
+        tmp_path,
+        DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1),
+    )
+    assert get_command(either, key).state == "sent"
+
+
+def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground, tmp_path: Path) -> None:
+    fields = DICTIONARY.packet("performance").fields
+    values = {one.name: 0 for one in fields} | {"structure_id": 2, "last_command_count": 41}
+    receive(either, tmp_path, DICTIONARY.pack("performance", values, ticks=TICKS, sequence_count=0))
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    record = get_command(either, key).record
+    assert record.sequence_count == 42
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    refused = {"request_id": record.request_id, "failure_code": "out_of_sequence"}
+    receive(
+        either,
+        tmp_path,
+        DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0),
+    )
+    assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
+
+
+def test_a_station_that_the_description_does_not_have_is_refused(either: Ground, tmp_path: Path) -> None:
+    add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\n[link.stations.madrid]\n')
+    file = tmp_path / "a.packets"
+    file.write_bytes(contact())
+    with pytest.raises(Conflict, match=r"expected one of the mission description \(madrid\), found mars"):
+        ingest_file(either, file, spacecraft_id=76, station="mars")
+
+
+def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Ground) -> None:
+    given = {"owner": "a", "until_utc_ns": 15, "mission_utc_ns": 0}
+    with either.database.writing() as connection:
+        assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=0, **given)
+        links.change_link(connection, "l", "a", state="contact")
+        assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=40, **given | {"until_utc_ns": 55})
+        found = links.find_link(connection, "l")
+        assert found is not None and (found.state, found.lease_utc_ns) == ("contact", 55)
+        assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=70, **given | {"owner": "b"})
+        assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)
