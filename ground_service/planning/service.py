@@ -292,6 +292,8 @@ def change_window(
 def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -> list[int]:
     """Release telecommands that delete the activities of a window on board; return their ids.
 
+    One person can do that, as one can stop an observation.
+
     Raises
     ------
     Conflict
@@ -305,7 +307,7 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
         )
     if now >= window.stop.utc_ns:
         return []
-    approval = commanding.Approval(window.edited_by, window.decided_by)
+    approval = commanding.Approval("", actor)
     ids = [
         commanding.add_released(
             connection,
